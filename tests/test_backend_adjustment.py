@@ -9,7 +9,7 @@ import pytest
 from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping.bundle_adjustment import adjust, adjust_in_windows, log_focal_asked
+from scopemap.mapping.bundle_adjustment import adjust, adjust_in_windows, lens_residual
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
 
 LOOSE = Priors(rotation_rad=10, translation_share=10)
@@ -34,18 +34,24 @@ def test_exact_observations_and_depths_recover_exact_poses(window: int | None) -
     assert found.sigma_px == pytest.approx(0.1)  # its floor
 
 
-@pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
-def test_observations_ask_for_the_right_focal_length(factor: float) -> None:
+@pytest.mark.parametrize(
+    ("factor", "shift"),
+    [(1.0, (0, 0)), (0.9, (0, 0)), (1.1, (0, 0)), (1.0, (0.1, 0)), (1.0, (0, -0.1)), (1.05, (-0.05, 0.1))],
+)
+def test_observations_ask_for_the_right_lens(factor: float, shift: tuple[float, float]) -> None:
     rng = np.random.default_rng(11)
     T, points, observations = world(rng)
-    observations = replace(observations, pixel=observations.pixel + rng.normal(0, 0.1, observations.pixel.shape))
+    off_px = FOCAL_PX * np.array(shift)
+    seen = observations.pixel + off_px + rng.normal(0, 0.1, observations.pixel.shape)
+    points, observations = replace(points, pixel=points.pixel + off_px), replace(observations, pixel=seen)
     problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, factor * FOCAL_PX)
-    asked = log_focal_asked(problem, adjust(problem))
-    assert asked == pytest.approx(-np.log(factor), abs=0.02)
-    assert (asked == 0) == (factor == 1)
+    asked = np.array(lens_residual(problem, adjust(problem))[:3])
+    expected = np.array([-np.log(factor), *np.array(shift) / factor])
+    assert asked == pytest.approx(expected, abs=0.02)
+    assert ((asked == 0) == (expected == 0)).all()
     nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     unseen = replace(problem, observations=nothing)
-    assert np.isnan(log_focal_asked(unseen, adjust(unseen)))
+    assert np.isnan(lens_residual(unseen, adjust(unseen))).all()
 
 
 @pytest.mark.parametrize("window", [2, 3])

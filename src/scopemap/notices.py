@@ -52,8 +52,23 @@ KINDS: dict[str, _Kind] = {
     ),
     "camera-contradicted": _Kind(
         "doubtful",
-        "mapping: the views ask for another focal length than the one used ({change:+.0%}); check the calibration",
-        "The motion asks for another focal length ({change:+.0%}): depth against width is wrong. Check the calibration",
+        "mapping: the views ask for another focal length than the one used ({change:+.0%}); check the calibration, or "
+        "the tissue moves",
+        "The motion asks for another focal length ({change:+.0%}): depth against width is wrong. Check the "
+        "calibration; if it is right, the tissue moves",
+    ),
+    "camera-off-centre": _Kind(
+        "doubtful",
+        "mapping: the views ask for another principal point than the one used (by {x:+.0%} and {y:+.0%} of the focal "
+        "length); check the calibration, and whether the pictures were cut, or the tissue moves",
+        "The motion asks for another centre of the lens: shapes are skewed. Check the calibration, and whether the "
+        "pictures were cut after it; if it is right, the tissue moves",
+    ),
+    "camera-unconfirmed": _Kind(
+        "note",
+        "mapping: the views do not tell the focal length (standard deviation {sigma:.0%}): nothing but the calibration "
+        "supports it",
+        "The motion does not tell the focal length: were the calibration wrong, this result would not show it",
     ),
     "camera-at-rest": _Kind(
         "doubtful",

@@ -19,7 +19,7 @@ from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px, log_focal_asked
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px, lens_residual
 from scopemap.mapping.bundle_problem import BundleProblem, Points, Priors, State
 from scopemap.mapping.depth_correction import (
     DepthCorrectionField,
@@ -252,9 +252,9 @@ class Backend:
         graph = problem.begin
         (within, between_px), (before, _) = sigmas_px(found.state), sigmas_px(graph)
         if not refused:
-            asked = log_focal_asked(problem, found)
             correction = self._correction(chosen, worlds, found)
-            correction = replace(correction, loops=loops, depth_fields=fields, log_focal=asked)
+            residual = lens_residual(problem, found)
+            correction = replace(correction, loops=loops, depth_fields=fields, lens_residual=residual)
         elif len(worlds) > 1 and problem.start is not None:
             by_graph = self._correction(chosen, worlds, found._replace(state=graph))
             correction = replace(by_graph, loops=len(accepted), sigma_px=found.sigma_px, refused=refused)

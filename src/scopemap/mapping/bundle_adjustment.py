@@ -46,9 +46,10 @@ _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 _POINT_STEPS = 5  # of the points alone, after the keyframes
 WINDOW = 300
 """Most keyframes that are adjusted at once."""
-# Standard deviations of ln f and of the distortion where only the focal length is asked for.
-_ASKED_SIGMA = np.array([0.3, 1e-4])
-_SIGNIFICANT = 3.0
+# Prior standard deviations of ln f, of the distortion, which is held, and of the principal point over f.
+_RESIDUAL_SIGMA = np.array([0.3, 1e-4, 0.2, 0.2])
+_RESIDUAL_DEPTH = 3.0  # factor of the estimated depth's deviation there: errors of a network bend the lens, too
+_SIGNIFICANT = 5.0  # standard deviations: a right lens of a real clip had 3.4, the least noticed wrong one 6.7
 _HELD_SIGMA = 0.01  # least standard deviation of ln depth of points that an earlier window adjusted
 
 
@@ -68,6 +69,18 @@ class BundleSolution(NamedTuple):
     def sigma_px(self) -> float:
         """Robust standard deviation of the reprojection errors, px; NaN without observations."""
         return self.state.sigma_px
+
+
+class LensResidual(NamedTuple):
+    """What the observations ask of the lens: changes of ln f, and of cx and cy over f; NaN: undetermined.
+
+    A change is 0 where it is not significant. sigma : standard deviation of ln f.
+    """
+
+    log_focal: float = float("nan")
+    x: float = float("nan")
+    y: float = float("nan")
+    sigma: float = float("nan")
 
 
 def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSolution:
@@ -139,22 +152,26 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     return BundleSolution(state, _log_depth_sigma(problem, state), found.iterations)
 
 
-def log_focal_asked(problem: BundleProblem, found: BundleSolution) -> float:
-    """Return ln of the focal length that the observations ask for, all else adjusted with it, over the one used.
+def lens_residual(problem: BundleProblem, found: BundleSolution) -> LensResidual:
+    """Return what the observations ask of the lens, all else adjusted with it.
 
-    0 where it is not different by three standard deviations; NaN where it is undetermined, and with more keyframes than
-    are adjusted at once.
+    Changes are significant from five standard deviations; all is NaN where it is undetermined, and with more keyframes
+    than are adjusted at once.
     """
     if not len(problem.observations.point) or len(problem.T_camera_world) > WINDOW:
-        return float("nan")
-    free = replace(problem, start=found.state, lens=UnknownLens(problem.focal_px, _ASKED_SIGMA))
-    state = adjust(free).state
+        return LensResidual()
+    unit = np.array([1.0, 1.0, problem.focal_px, problem.focal_px])
+    points = replace(problem.points, sigma=_RESIDUAL_DEPTH * problem.points.sigma)
+    lens = UnknownLens(problem.focal_px, _RESIDUAL_SIGMA * unit)
+    free = replace(problem, start=found.state, points=points, lens=lens)
+    state = adjust(free, max_iterations=40, min_decrease=1e-4).state  # a wrong lens may be far away
     try:
-        deviation = np.sqrt(np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)[-2, -2])
-    except np.linalg.LinAlgError:  # undetermined
-        return float("nan")
-    change = float(state.lens[0] - problem.tracked.lens[0])
-    return change if abs(change) > _SIGNIFICANT * deviation else 0.0
+        covariance = np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)
+    except np.linalg.LinAlgError:
+        return LensResidual()
+    change, deviation = (state.lens - problem.tracked.lens) / unit, np.sqrt(np.diag(covariance)[-4:]) / unit
+    log_focal, _, x, y = np.where(np.abs(change) > _SIGNIFICANT * deviation, change, 0.0).tolist()
+    return LensResidual(log_focal, x, y, float(deviation[0]))
 
 
 def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
@@ -171,7 +188,7 @@ def _weights(state: State, seen: Reprojection) -> np.ndarray:
 
 def linearised(problem: BundleProblem, state: State) -> SchurModel:
     """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
-    count, lens = len(state.T_camera_world), 0 if problem.lens is None else 2
+    count, lens = len(state.T_camera_world), 0 if problem.lens is None else len(problem.lens.sigma)
     seen = reproject(problem, state)
     edges = _odometry_edges(problem, state)
     held = [6 + _PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
@@ -196,7 +213,8 @@ def _cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[
     if priors.scale > 0:
         cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
     if problem.lens is not None:
-        cost += 0.5 * (((state.lens - problem.tracked.lens) / problem.lens.sigma) ** 2).sum()
+        change = (state.lens - problem.tracked.lens)[: len(problem.lens.sigma)]
+        cost += 0.5 * ((change / problem.lens.sigma) ** 2).sum()
     return float(cost)
 
 
@@ -227,8 +245,9 @@ def _camera_blocks(problem: BundleProblem, state: State, edges: list[_OdometryEd
         information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + _PER_KEYFRAME * np.arange(len(T))
         blocks.append(CameraBlock(own, np.diag(information), information * state.log_scale))
     if problem.lens is not None:
-        information, own = problem.lens.sigma**-2.0, _PER_KEYFRAME * len(T) + np.arange(2)
-        blocks.append(CameraBlock(own, np.diag(information), information * (state.lens - problem.tracked.lens)))
+        information, own = problem.lens.sigma**-2.0, _PER_KEYFRAME * len(T) + np.arange(len(problem.lens.sigma))
+        change = (state.lens - problem.tracked.lens)[: len(own)]
+        blocks.append(CameraBlock(own, np.diag(information), information * change))
     return blocks
 
 
@@ -240,7 +259,7 @@ class _Rows(NamedTuple):
     by_camera: np.ndarray  # (N, 2, 6)
     by_host: np.ndarray  # (N, 2, 6)
     by_depth: np.ndarray  # (N, 2)
-    by_lens: np.ndarray  # (N, 2, 2), or (N, 2, 0)
+    by_lens: np.ndarray  # (N, 2, L), or (N, 2, 0)
 
 
 def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -> PointBlock:
@@ -330,7 +349,10 @@ def _retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
     own = step[:count].reshape(-1, _PER_KEYFRAME)
     twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
     T = np.stack([se3_exp(twist) @ pose for twist, pose in zip(twists, state.T_camera_world, strict=True)])
-    lens = state.lens if problem.lens is None else state.lens + step[count : count + 2]
+    lens = state.lens.copy()
+    if problem.lens is not None:
+        unknown = len(problem.lens.sigma)
+        lens[:unknown] += step[count : count + unknown]
     by_points = step[len(step) - len(state.log_depth) :]
     log_depth = state.log_depth - np.log(np.clip(1 - by_points, *_INVERSE_DEPTH_STEP))
     return State(T, state.log_scale + own[:, 6], log_depth, lens, state.sigma_px)

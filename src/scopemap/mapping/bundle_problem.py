@@ -56,7 +56,7 @@ class Priors(NamedTuple):
 
 
 class UnknownLens(NamedTuple):
-    """Prior of a lens: half_width_px of the image, standard deviations (2,) of ln f and of b; b is expected to be 0."""
+    """Prior of a lens: half_width_px of the image, standard deviations (L,) of its unknowns, the first L of `State`."""
 
     half_width_px: float
     sigma: np.ndarray
@@ -98,12 +98,15 @@ class BundleProblem:
     @property
     def tracked(self) -> State:
         """The state as tracked."""
-        count, lens = len(self.T_camera_world), np.array([np.log(self.focal_px), 0.0])
+        count, lens = len(self.T_camera_world), np.array([np.log(self.focal_px), 0.0, 0.0, 0.0])
         return State(self.T_camera_world, np.zeros(count), self.points.log_depth, lens)
 
 
 class State(NamedTuple):
-    """T_camera_world (K, 4, 4), ln of the depth scales (K,), ln of the depths (P,), lens (2,): ln f and b."""
+    """T_camera_world (K, 4, 4), ln of the depth scales (K,), ln of the depths (P,).
+
+    lens : (4,) ln f, b, and how far the principal point is from where it was taken to be, px.
+    """
 
     T_camera_world: np.ndarray
     log_scale: np.ndarray
@@ -127,7 +130,8 @@ def reproject(problem: BundleProblem, state: State) -> Reprojection:
     """Return where the points of a state are projected, against where they were observed."""
     points, observations, T = problem.points, problem.observations, state.T_camera_world
     focal, host = np.exp(state.lens[0]), points.host[observations.point]
-    rays = np.column_stack([_undistorted(problem, points.pixel, state.lens[1]) / focal, np.ones(len(points.host))])
+    centred = points.pixel - state.lens[2:]
+    rays = np.column_stack([_undistorted(problem, centred, state.lens[1]) / focal, np.ones(len(points.host))])
     in_host = (np.exp(state.log_depth)[:, None] * rays)[observations.point]
     pairs, which = np.unique(host * len(T) + observations.keyframe, return_inverse=True)
     between = T[pairs % len(T)] @ inverse(T[pairs // len(T)])
@@ -136,7 +140,7 @@ def reproject(problem: BundleProblem, state: State) -> Reprojection:
     ahead = seen[:, 2] > _LEAST_Z * np.linalg.norm(seen, axis=1)
     straight = focal * seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
     pixel = _distorted(problem, straight, state.lens[1])
-    error = np.where(ahead[:, None], pixel - observations.pixel, 0.0)
+    error = np.where(ahead[:, None], pixel - (observations.pixel - state.lens[2:]), 0.0)
     return Reprojection(error, ahead, seen, in_host, R, straight)
 
 
@@ -169,8 +173,8 @@ def jacobians(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the derivatives of pixels by twists of the observing camera and of the host (N, 2, 6), ln depth and lens.
 
-    By ln depth (N, 2); by ln f and b (N, 2, 2), (N, 2, 0) where the lens is known. Translations are in units of the
-    typical depth.
+    By ln depth (N, 2); by the lens (N, 2, L), (N, 2, 0) where it is known. Translations are in units of the typical
+    depth.
     """
     focal, b = np.exp(state.lens[0]), state.lens[1]
     z = np.where(seen.ahead, seen.point[:, 2], 1.0)
@@ -179,16 +183,16 @@ def jacobians(
     by_point[:, :, 2] = -seen.straight / z[:, None]
     by_lens = np.zeros((len(z), 2, 0))
     if problem.lens is not None:
-        pixel = seen.error + problem.observations.pixel
+        pixel = seen.error + problem.observations.pixel - state.lens[2:]
         by_straight = _by_straight(problem, pixel, b)
         by_point = by_straight @ by_point
-        in_host = problem.points.pixel[problem.observations.point]
+        in_host = problem.points.pixel[problem.observations.point] - state.lens[2:]
         by_corner = (by_point @ seen.R)[..., :2] * (seen.in_host[:, 2] / focal)[:, None, None]
         by_focal = by_straight @ seen.straight[..., None]
         by_focal -= by_corner @ _undistorted(problem, in_host, b)[..., None]
         by_b = by_corner @ (in_host * _square(problem, in_host))[..., None]
         by_b -= by_straight @ (pixel * _square(problem, pixel))[..., None]
-        by_lens = np.concatenate([by_focal, by_b], -1)
+        by_lens = np.concatenate([by_focal, by_b, np.eye(2) - by_corner], -1)[..., : len(problem.lens.sigma)]
     by_host = by_point @ seen.R
     by_depth = np.einsum("nij,nj->ni", by_host, seen.in_host)
     unit_mm = problem.unit_mm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -10,12 +11,17 @@ import numpy as np
 
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
+from scopemap.mapping.bundle_adjustment import LensResidual
 from scopemap.mapping.depth_correction import DepthCorrectionField
 from scopemap.notices import Notice
 
 _AT_REST = 1e-6  # rad
 _FOCAL_CHANGE = 0.03
-"""Of ln f, above which the views contradict the lens: with right ones up to 0.021 was asked for on phantoms."""
+"""Of ln f, above which the views contradict the lens; a focal length off by 2 % bends little."""
+_FOCAL_SIGMA = 0.05
+"""Of ln f, above which the views say too little of the lens to confirm it."""
+_POINT_CHANGE = 0.05
+"""Of the principal point over f: right lenses up to 0.03, one off by 5 % of the width 0.09 and more."""
 
 
 class TrackedPose(NamedTuple):
@@ -41,7 +47,7 @@ class FrameCorrection:
     None where it is. loops : number of accepted loop closures. depth_fields : (K,) further factors of each pixel's
     depth; (): none. S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked :
     poses as tracked by number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad.
-    log_focal : ln of the focal length that the observations ask for over the one used, as `log_focal_asked`.
+    lens_residual : what the observations ask of the lens.
     """
 
     index: np.ndarray
@@ -54,13 +60,20 @@ class FrameCorrection:
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
     tracked: Mapping[int, TrackedPose] = field(default_factory=dict)
     depth_mm: float = 1.0
-    log_focal: float = float("nan")
+    lens_residual: LensResidual = field(default_factory=LensResidual)
 
     @property
     def notices(self) -> list[Notice]:
         """What was adjusted and how well it fits, or why nothing was; and whether the views ask for another lens."""
-        other = abs(self.log_focal) > _FOCAL_CHANGE
-        return [self.notice] + [Notice("camera-contradicted", {"change": float(np.expm1(self.log_focal))})] * other
+        log_focal, x, y, sigma = self.lens_residual
+        found = [self.notice]
+        if abs(log_focal) > _FOCAL_CHANGE:
+            found.append(Notice("camera-contradicted", {"change": math.expm1(log_focal)}))
+        if math.hypot(x, y) > _POINT_CHANGE:
+            found.append(Notice("camera-off-centre", {"x": x, "y": y}))
+        if sigma > _FOCAL_SIGMA:
+            found.append(Notice("camera-unconfirmed", {"sigma": sigma}))
+        return found
 
     @property
     def notice(self) -> Notice:

@@ -202,6 +202,9 @@ def _of_adjustment(run: Result) -> list[Reason]:
                 f"The adjustment turned keyframes by up to {values['rotation_deg']:.0f} degrees: tracking drifts less."
             )
             found.append(Reason("adjusted-far", "doubtful", text))
+        if notice.code == "mapping-without-observations":
+            text = "The camera hardly moved, or nothing was found again: no other view confirms depth and path."
+            found.append(Reason("depth-unconfirmed", "doubtful", text))
         if notice.code == "depth-triangulated":
             count, keyframes = values["triangulated"], values["keyframes"]
             if count <= LEAST_TRIANGULATED * keyframes:

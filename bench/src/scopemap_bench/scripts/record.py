@@ -35,13 +35,15 @@ TABLES: dict[str, tuple[str, str]] = {
     "depth": (f"{SCRIPT}.depth_without_download --data DATA --size 320x256", ""),
     "methods": (f"{PLAN} real-and-phantom --data DATA --out OUT/methods", "methods/tables/overview.md"),
     "ablations": (f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations", "ablations/tables/overview.md"),
-    "robustness": (f"{SCRIPT}.robustness --kills 16 --failures 6 --videos 6", ""),
+    "verdicts": (f"{SCRIPT}.verdicts --data DATA --out OUT/verdicts", ""),
     "long-runs": (
-        f"{SCRIPT}.long_runs --frames 300 1200 --live DATA/endoscopy/video/laparoscopy_rvim.mp4 --minutes 0.5",
+        f"{SCRIPT}.long_runs --frames 300 1200 --live DATA/endoscopy/video/laparoscopy_rvim.mp4 --minutes 0.5"
+        f" && {SCRIPT}.robustness --kills 16 --failures 6 --videos 6",
         "",
     ),
 }
-"""By name: the command, whose DATA and OUT are folders, and the file below OUT that holds the table; "": printed."""
+"""By name: the command (or several, joined by &&), whose DATA and OUT are folders, and the file below OUT that holds
+the table; "": printed."""
 
 
 def git(*arguments: str) -> str:
@@ -52,13 +54,15 @@ def git(*arguments: str) -> str:
 def record(name: str, data: Path, out: Path, commit: str) -> None:
     """Make a table and write it to bench/results/; raises `SystemExit` where its command fails."""
     command, file = TABLES[name]
-    words = [word.replace("DATA", str(data)).replace("OUT", str(out)) for word in shlex.split(command)]
-    words = [sys.executable if word == "python" else word for word in words]
-    started = time.monotonic()
-    run = subprocess.run(words, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    if run.returncode != 0:
-        sys.exit(f"record: {command} failed with exit code {run.returncode}\n{run.stdout}")
-    table = (out / file).read_text(encoding="utf-8") if file else run.stdout
+    started, printed = time.monotonic(), []
+    for part in command.split(" && "):
+        words = [word.replace("DATA", str(data)).replace("OUT", str(out)) for word in shlex.split(part)]
+        words = [sys.executable if word == "python" else word for word in words]
+        run = subprocess.run(words, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        printed.append(run.stdout)
+        if run.returncode != 0:
+            sys.exit(f"record: {part} failed with exit code {run.returncode}\n{run.stdout}")
+    table = (out / file).read_text(encoding="utf-8") if file else "\n".join(printed)
     table = re.sub(r"\A# .*\n+", "", table).strip()
     date = datetime.now(UTC).date().isoformat()
     text = f"# {name}\n\nCommit {commit}, {date}, by\n\n    {command}\n\n{table}\n"

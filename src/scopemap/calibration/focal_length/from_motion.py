@@ -54,7 +54,7 @@ def adjust_window(window: Window, assumed_focal_px: float) -> WindowFit | None:
     """Return the fit to a window from the best start, None where undetermined; ln f has a prior of deviation 1."""
     problem = _problem(window, assumed_focal_px)
     starts = [np.log(window.half_width_px / np.tan(np.radians(fov_deg) / 2)) for fov_deg in _START_FOV_DEG]
-    states = [problem.tracked._replace(lens=np.array([log_focal, 0.0])) for log_focal in starts]
+    states = [problem.tracked._replace(lens=np.array([log_focal, 0.0, 0.0, 0.0])) for log_focal in starts]
     states = [_adjusted(window, problem, state, _NO_DISTORTION_SIGMA, _FIRST)[1] for state in states]
     best = min(states, key=lambda state: state.sigma_px)
     problem, state = _adjusted(window, problem, best, _DISTORTION_SIGMA, _THEN)
