@@ -170,12 +170,12 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 40 lines for a contradicted lens and its verdict, 100 for checksums of checkpoints, 20 for damaged results.
-    "core": (lambda: _total(MODULES), 30_010),
-    "core, net": (lambda: _net(MODULES), 18_490),
+    # 40 lines for a contradicted lens, 100 for checksums of checkpoints, 140 for damaged results and a run's input.
+    "core": (lambda: _total(MODULES), 30_150),
+    "core, net": (lambda: _net(MODULES), 18_580),
     "bench": (lambda: _total(BENCH_MODULES), 11_030),  # 30 for the metric consistency, which no figure showed
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 30_690),  # those of both
+    "tests": (lambda: _total(TESTS), 30_810),  # those of both
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 12_980),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

@@ -10,9 +10,10 @@ from typing import Any
 from scopemap.config import Config
 from scopemap.estimators import largest_depth_mm
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.io.checksums import input_checksum, write_checksums
+from scopemap.io.checksums import write_checksums
 from scopemap.io.depth_maps import DepthWriter
 from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
+from scopemap.io.run_input import stated_input
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline
@@ -87,8 +88,8 @@ def reconstruct(
                 with closing(Checkpoints(folder, identity, run, _kept_with(observers))) as checkpoints:
                     run.track(observers, checkpoints)
             result = run.result(notices)
-        content = result.provenance["input_content"] = input_checksum(sequence.path)
-        changes = input_changes(identity, content, sequence.path)
+        result.provenance.update(stated_input(sequence.path, None if out is None else Path(out)))
+        changes = input_changes(identity, result.provenance["input_content"], sequence.path)
         result.provenance["notices"] += [notice.as_json() for notice in changes]
         del run, pipeline  # with their keyframes and volumes: a long run has none to spare when it writes
         if folder is not None and write_depth is not None:
