@@ -20,7 +20,7 @@ from scopemap.io.checkpoint import CHECKPOINT
 from scopemap.io.result_folder import LOCK, UNFINISHED
 from scopemap.odometry import Step
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.runner.checkpoints import check_resumable, discard_unfinished, identity_of
+from scopemap.runner.checkpoints import can_resume, check_resumable, discard_unfinished, identity_of
 
 # Seconds, and sums of files that hold some.
 _OF_ITS_TIME = {"provenance.json", "SHA256SUMS"}
@@ -152,16 +152,100 @@ def test_an_input_that_changes_while_it_is_read_is_told(folder: Path, tmp_path: 
         assert kept == warned(result.provenance)
 
 
-def test_a_damaged_checkpoint_is_one_sentence(folder: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def killed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("killed") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scopemap.runner.checkpoints._LEAST_S", 0.0)
+        patch.setattr("scopemap.runner.checkpoints._SHARE", 1.0)
+        _kill(folder, out, "default", FRAMES - 1)
+    return out
+
+
+def _flip(file: Path, at: int) -> None:
+    content = bytearray(file.read_bytes())
+    content[at] ^= 1
+    file.write_bytes(content)
+
+
+_DATABASE_DAMAGE = {
+    "blobs": "update blobs set bytes = zeroblob(length(bytes))",
+    "a missing blob": "delete from blobs where hash in (select hash from blobs limit 1)",
+    "states": "update states set tree = zeroblob(length(tree))",
+    "the last frame": "update facts set value = value + 1 where name = 'last'",
+    "facts": "update facts set value = zeroblob(9)",
+}
+
+
+@pytest.mark.parametrize("damage", _DATABASE_DAMAGE)
+def test_a_damaged_database_is_never_resumed_from(damage: str, folder: Path, killed: Path, tmp_path: Path) -> None:
+    identity, out, found = identity_of(open_sequence(folder), Config()), tmp_path / "run", list[str]()
+    shutil.copytree(killed, out)
+    assert can_resume(out / UNFINISHED, identity, found)
+    with closing(sqlite3.connect(out / UNFINISHED / CHECKPOINT)) as database, database:
+        database.execute(_DATABASE_DAMAGE[damage])
+    assert not can_resume(out / UNFINISHED, identity, found)
+    assert "checkpoint.sqlite is damaged" in found[0]
+    with pytest.raises(InputError, match=r"is damaged; --no-resume begins a new one"):
+        check_resumable(out, open_sequence(folder), Config())
+
+
+def test_a_flipped_byte_of_any_stored_file_is_noticed(folder: Path, killed: Path, tmp_path: Path) -> None:
+    identity = identity_of(open_sequence(folder), Config())
+    names = {file.name for file in (killed / UNFINISHED / "stored_frames").iterdir()}
+    assert {"frames", "frame_entries", "frame_table", "frame_texts", "tracked_poses"} <= names
+    for name in names:
+        out = shutil.copytree(killed, tmp_path / name)
+        file, found = out / UNFINISHED / "stored_frames" / name, list[str]()
+        with file.open("ab") as stream:
+            stream.write(b"put in after the checkpoint")
+        assert can_resume(out / UNFINISHED, identity, found)
+        if file.stat().st_size > 100:
+            for at in (0, file.stat().st_size // 4):
+                _flip(file, at)
+                assert not can_resume(out / UNFINISHED, identity, found), (name, at)
+                _flip(file, at)
+            assert f"the stored frames {file} are damaged" in found[0]
+            file.unlink()
+            assert not can_resume(out / UNFINISHED, identity, found), name
+
+
+@pytest.mark.parametrize("name", ["stored_frames/frames", CHECKPOINT])
+def test_a_run_with_a_damaged_checkpoint_begins_anew_and_says_so(
+    name: str, folder: Path, killed: Path, whole: tuple[str, Path], tmp_path: Path
+) -> None:
+    preset, wanted = whole
+    if preset != "default":
+        pytest.skip("the killed run is of the default preset")
+    out, seen, told = shutil.copytree(killed, tmp_path / "run"), list[int](), list[str]()
+    file = out / UNFINISHED / name
+    if name == CHECKPOINT:
+        file.write_bytes(file.read_bytes()[:3000])
+    else:
+        _flip(file, 5000)
+    result = _run(
+        *(folder, out, preset),
+        observers=(lambda step: seen.append(step.frame.index),),
+        progress=lambda doing, done, total: told.append(doing),
+    )
+    assert seen == list(range(FRAMES))
+    assert _bytes(out) == _bytes(wanted)
+    (notice,) = [one for one in result.provenance["notices"] if one["code"] == "checkpoint-damaged"]
+    assert name.split("/")[-1] in notice["text"]
+    assert told[0].startswith("beginning anew: ")
+
+
+def test_stored_frames_that_are_damaged_while_a_run_works_end_it(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    _kill(folder, out, "realtime", 5)
-    file = out / UNFINISHED / CHECKPOINT
-    with closing(sqlite3.connect(file)) as database, database:
-        database.execute("update blobs set bytes = zeroblob(length(bytes))")
-    with pytest.raises(InputError, match=r"the checkpoint .* is damaged"):
-        _run(folder, out, "realtime")
-    file.write_bytes(file.read_bytes()[:3000])
-    assert _run(folder, out, "realtime").provenance["resumed_after_frame"] is None
+
+    def damage(step: Step) -> None:
+        if step.frame.index == FRAMES - 2:
+            _flip(out / UNFINISHED / "stored_frames" / "frames", 5000)
+
+    with pytest.raises(InputError, match="the stored frames are damaged") as caught:
+        _run(folder, out, "default", observers=(damage,))
+    assert "--no-resume begins anew" in caught.value.__notes__[0]
+    assert _run(folder, out, "default").provenance["resumed_after_frame"] is None
 
 
 def test_observers_are_resumed_and_saved_with_the_result(folder: Path, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ KINDS: dict[str, _Kind] = {
     "input-note": _Kind("info", "{text}"),
     "input-warning": _Kind("note", "{text}"),
     "input-changed": _Kind("note", "the input {path} changed while it was read: this may be a part of it"),
+    "checkpoint-damaged": _Kind("info", "a killed run here could not be resumed, and this one began anew: {reason}"),
     "input-interlaced": _Kind(
         "doubtful",
         "the pictures are interlaced: their even and odd rows were taken at two times, and edges that move look like "

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import trimesh
 
 from scopemap.actions.inputs import open_truth
 from scopemap.cameras.camera import PinholeCamera
@@ -25,7 +24,7 @@ from scopemap.frame import Frame, Truth
 from scopemap.geometry.se3 import inverse, se3, transform
 from scopemap.io.depth_maps import DepthReader
 from scopemap.io.reference import read_reference, reference_trajectory
-from scopemap.io.run_folder import RunFolder
+from scopemap.io.run_folder import RunFolder, read_mesh
 from scopemap.io.sequence import Sequence as Frames
 from scopemap.masking.masker import Masker
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -207,8 +206,7 @@ def _middle(frames: Frames) -> list[tuple[Frame, Truth | None]]:
 
 def _draw_mesh(run: FinishedRun, frames: Frames, file: Path) -> bool:
     """Draw a run's mesh with its camera path, and the true one where it is known; False where there is no mesh."""
-    mesh_file, reference = run.folder / "mesh.ply", reference_trajectory(frames)
-    mesh = trimesh.load_mesh(mesh_file, process=False) if mesh_file.is_file() else trimesh.Trimesh()
+    mesh, reference = read_mesh(run.folder / "mesh.ply"), reference_trajectory(frames)
     if not len(mesh.faces):
         return False
     estimate = read_trajectory(run.folder)

@@ -19,6 +19,7 @@ from scopemap.geometry.align import AlignMode, Similarity
 from scopemap.io.depth_maps import DepthReader
 from scopemap.io.opening import open_sequence
 from scopemap.io.reference import reference_trajectory
+from scopemap.io.run_folder import read_mesh
 from scopemap.io.sequence import Sequence
 from scopemap.masking.masker import Masker
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -87,10 +88,7 @@ def surface_figures_of(
     file = run / "mesh.ply"
     if not file.is_file():
         return {}
-    try:
-        mesh = trimesh.load_mesh(file, process=False)
-    except Exception as error:  # trimesh raises whatever its parsers raise
-        raise InputError(f"cannot read the mesh {file}: {error}") from error
+    mesh = read_mesh(file)
     true_surface = read_true_surface(truth) if isinstance(truth, Path) else _seen_surface(truth)
     if true_surface is None:
         return {}

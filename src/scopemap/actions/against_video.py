@@ -84,12 +84,12 @@ class RunFrames:
     Raises `InputError` where the run has no surface, kept no depth, or its input is not there any more.
     """
 
-    def __init__(self, run: Path) -> None:
+    def __init__(self, run: Path, source: Path | None = None) -> None:
         folder = RunFolder(run)
         fusion = folder.config.fusion
         if fusion.voxel_mm is None or not fusion.enabled:
             raise InputError(f"the run {run} has no surface that could be compared with its video")
-        (sequence, mask), depth = open_input(run), folder.depth
+        (sequence, mask), depth = open_input(run, source), folder.depth
         if not depth.present:
             raise InputError(f"the run {run} kept no depth maps")
         self._run, self._fusion, self._store = run, fusion.model_copy(update={"every": 1}), FrameStore(run)
@@ -153,13 +153,14 @@ class RunFrames:
         return render_points(points_mm, other.rgb[known], frame.camera, _pose(frame))
 
 
-def held_out_agreement(run: Path) -> SurfaceAgreement:
+def held_out_agreement(run: Path, source: Path | None = None) -> SurfaceAgreement:
     """Return the agreement of a run's surface with its video; every tenth tracked frame is kept out of fusion.
 
-    LPIPS is measured where its weights are present. Raises `InputError` where the run has no surface, kept no depth,
+    source : where its input is now; else it is looked for. LPIPS is measured where its weights are present. Raises
+    `InputError` where the run has no surface, kept no depth,
     its input is not there any more, or too few of its frames are tracked.
     """
-    with closing(RunFrames(run)) as frames:
+    with closing(RunFrames(run, source)) as frames:
         return frames.agreement()
 
 

@@ -5,20 +5,27 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
+
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config, InputSettings
 from scopemap.errors import CalibrationError, InputError, SettingsError
 from scopemap.frame import Frame
+from scopemap.io.decoding import read_decoded
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import OF_UNKNOWN_VIEWS
 from scopemap.io.run_folder import RunFolder
+from scopemap.io.run_input import find_input
 from scopemap.io.sequence import Sequence
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
-from scopemap.report.frame_pictures import FramePictures
+from scopemap.report.frame_pictures import WHOLLY_USABLE, FramePictures
 from scopemap.trajectory.trajectory import SKIPPED
 
 _SAME_CAMERA_PX = 0.01
+_MOST_ENLARGED = 1.25
+"""Size of the frames over that of the pictures which a run kept, 320 px wide at most."""
 
 
 def open_truth(run: Path, truth: Path) -> Sequence:
@@ -56,33 +63,60 @@ def is_camera_of(run: Path, sequence: Sequence) -> bool:
     )
 
 
-def open_input(run: Path) -> tuple[Sequence, Masker]:
+def open_input(run: Path, given: Path | None = None) -> tuple[Sequence, Masker]:
     """Return the input of a run, rectified as the run had it, and what masks its frames as the run did.
 
-    Raises `InputError` where the input is gone or gives another camera.
+    given : where it is now; else it is looked for. Raises `InputError` as `find_input`, and where it gives another
+    camera.
     """
-    folder = RunFolder(run)
-    source, config = Path(folder.provenance.get("input", "")), folder.config
-    if not source.exists():
-        raise InputError(f"the input {source} of the run {run} is not there any more")
+    source, config = find_input(run, given), RunFolder(run).config
     sequence = open_truth(run, source)
     if not is_camera_of(run, sequence):
         raise InputError(f"the input {source} of the run {run} gives another camera now")
     return sequence, Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
 
 
-def frames_again(run: Path, indices: set[int]) -> Iterator[Frame]:
-    """Yield the frames with these numbers from the input of the run, rectified and masked. Raises as `open_input`."""
-    sequence, mask = open_input(run)
+def frames_again(run: Path, indices: set[int], given: Path | None = None) -> Iterator[Frame]:
+    """Yield the frames with these numbers from the input of the run, rectified and masked. Raises as `open_input`.
+
+    Where the input is gone, and the run kept pictures of all these frames that need little enlarging, they are used.
+    """
+    try:
+        sequence, mask = open_input(run, given)
+    except InputError as fault:
+        if given is not None:
+            raise
+        yield from _kept_frames(run, indices, fault)
+        return
     for frame in sequence.frames():
         if frame.index in indices:
             yield mask(frame)
 
 
+def _kept_frames(run: Path, indices: set[int], fault: InputError) -> Iterator[Frame]:
+    """Yield frames by the pictures that a run kept. Raises `fault` where these are smaller or of fewer frames."""
+    folder = RunFolder(run)
+    kept = RunFolder(run.parent.parent) if run.parent.name == "maps" else folder
+    if missing := len(indices - set(kept.pictured)):
+        raise InputError(f"{fault}; frames/ has no picture of {missing} of the {len(indices)} frames") from None
+    camera = folder.camera
+    for row in folder.frames.rows[np.isin(folder.frames["index"], list(indices))]:
+        index = int(row["index"])
+        picture, levels = read_decoded(kept.picture_file(index)), read_decoded(kept.mask_file(index))
+        if picture is None or levels is None or camera.width > _MOST_ENLARGED * picture.shape[1]:
+            raise InputError(f"{fault}; frames/ has no picture of frame {index} that is large enough") from None
+        rgb = cv2.resize(picture, (camera.width, camera.height))[..., ::-1]
+        mask = cv2.resize(levels, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+        yield Frame(
+            index, float(row["time_s"]), np.ascontiguousarray(rgb), camera, mask == WHOLLY_USABLE, name=str(row["name"])
+        )
+
+
 def keep_pictures_again(run: Path) -> None:
     """Write the pictures of a run that kept none, from its input. Raises `InputError` where that is not possible."""
     frames, pictures = RunFolder(run).checked().frames, FramePictures(timed=False)
-    for frame in frames_again(run, set(frames["index"][frames["status"] != SKIPPED].tolist())):
+    indices, (sequence, mask) = set(frames["index"][frames["status"] != SKIPPED].tolist()), open_input(run)
+    for frame in (mask(frame) for frame in sequence.frames() if frame.index in indices):
         pictures.put(frame.index, frame.rgb, frame.valid)
     pictures.save(run)
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from scopemap.actions.export.exported_run import ExportedRun, read_exported
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import InputError, SettingsError, reporting
 from scopemap.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
 
 _DRAWS, _TAIL_PERCENT = 2000, 2.5
@@ -144,11 +144,12 @@ def _depth_errors(run: ExportedRun, frame: int, pixels: np.ndarray, depth_mm: np
 
 
 def _drawn(run: ExportedRun) -> _Errors:
-    camera, scale = run.provenance["camera"], run.provenance.get("scale") or {}
-    focal = float(camera.get("focal_sigma_px") or 0.0) / run.camera.fx
-    if camera.get("origin") == "assumed":
-        focal = max(focal, _ASSUMED_FOCAL_ERROR)
-    kind: Literal["measured", "calibrated"] = "measured" if scale.get("measured") else "calibrated"
+    with reporting(f"cannot read what {run.path}/provenance.json says of camera and scale"):
+        camera, scale = run.provenance["camera"], run.provenance.get("scale") or {}
+        focal = float(camera.get("focal_sigma_px") or 0.0) / run.camera.fx
+        if camera.get("origin") == "assumed":
+            focal = max(focal, _ASSUMED_FOCAL_ERROR)
+        kind: Literal["measured", "calibrated"] = "measured" if scale.get("measured") else "calibrated"
     generator = np.random.default_rng(0)
     normal = generator.standard_normal((3, _DRAWS))
     return _Errors(normal[0], 1 + focal * normal[1], np.exp(_SCALE_ERROR[kind] * normal[2]), generator)

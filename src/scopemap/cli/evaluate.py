@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from scopemap.cli.figures import show
-from scopemap.cli.options import Align, AsJson, Unit, advanced
+from scopemap.cli.options import Align, AsJson, InputNow, Unit, advanced
 from scopemap.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def evaluate(
         Path | None, typer.Option(help="True poses: a trajectory file, or an input that comes with poses.")
     ] = None,
     against_video: AgainstVideo = False,
+    source: InputNow = None,
     align: AlignBy = "sim3",
     align_first: AlignFirst = None,
     unit: OfUnit = "mm",
@@ -66,7 +67,7 @@ def evaluate(
     form = output_form(as_json=as_json, as_csv=as_csv, quiet=quiet)
     if truth is None and not against_video:
         raise typer.BadParameter("needed for all figures but those of --against-video", param_hint="--truth")
-    figures = against_own_video(trajectory) if against_video else {}
+    figures = against_own_video(trajectory, source) if against_video else {}
     if truth is not None:
         from scopemap.evaluation.poses import match, pose_report
         from scopemap.io.reference import read_reference
@@ -91,11 +92,11 @@ def output_form(*, as_json: bool, as_csv: bool, quiet: bool) -> OutputForm:
     return "json" if as_json else "csv" if as_csv else "line" if quiet else "table"
 
 
-def against_own_video(run: Path) -> dict[str, Any]:
+def against_own_video(run: Path, source: Path | None = None) -> dict[str, Any]:
     """Return the agreement of a run's surface with its own video, which is written into the run's folder, too."""
     from scopemap.actions.against_video import held_out_agreement
 
-    agreement = held_out_agreement(run)
+    agreement = held_out_agreement(run, source)
     agreement.save(run / "against_video")
     return {"against_video": agreement.figures()}
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from scopemap.cli.figures import print_json
-from scopemap.cli.options import AsJson, Quiet, Unit
+from scopemap.cli.options import AsJson, InputNow, Quiet, Unit
 
 To = Literal[
     "nerfstudio", "colmap", "endogslam", "endonerf", "gaussians", "pointcloud", "ply", "obj", "stl", "glb",
@@ -26,13 +26,14 @@ def export(
     axes: Annotated[
         Literal["lps", "ras", "opencv", "gltf"] | None, typer.Option(help="Axes of ply, obj and stl; default: lps.")
     ] = None,
+    source: InputNow = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Write a run in the layout of another tool: its tracked frames, surface and depth."""
     from scopemap.actions.export.formats import export_run
 
-    scale = export_run(run, to, out, units, axes)
+    scale = export_run(run, to, out, units, axes, source=source)
     if as_json:
         print_json({"out": str(out), "format": to, "scale": scale})
     elif not quiet:

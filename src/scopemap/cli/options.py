@@ -25,6 +25,10 @@ RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.
 Input = Annotated[
     Path, typer.Argument(metavar="INPUT", help="A video file, a folder of images, the folder of a data set's sequence.")
 ]
+InputNow = Annotated[
+    Path | None,
+    typer.Option("--input", metavar="PATH", help="Where the run's input is now, if it is not found where it was."),
+]
 PresetName = Annotated[
     Literal["default", "paper", "paper-strict", "realtime"] | None,
     typer.Option(

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Collection, Iterator
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from threading import Lock
-from typing import IO
+from typing import IO, Any
 
 import cv2
 import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import InputError
+from scopemap.errors import InputError, reporting
 from scopemap.frame import REGIONS, Frame, Rows
 
 # ln of millimetres in 16 bits: 0.0001 mm (standard deviations are small) to 34 m in steps of 0.03 %; 0 = unknown.
 _LOG_STEP, _MIN_MM = 3e-4, 1e-4
 _MAX_CODE = 65535
+_CHECKED_AT_ONCE = 1 << 20
 # Colours only paint the mesh: JPEG takes a fifth of the time and half of the space of a lossless format.
 _COLOUR_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
@@ -34,42 +36,58 @@ _ENTRY = np.dtype(
         ("T_world_camera", np.float64, (4, 4)),
         ("offset", np.int64),
         ("sizes", np.int64, (5,)),
+        ("crc", np.uint32),
         ("median_depth_mm", np.float64),
         ("nonrigidity", np.float32, REGIONS),
         ("quality", np.float64),
     ]
 )
-"""Small data of a frame, the number of its camera, and its images: offset in the file, sizes in bytes (0: none)."""
+"""Small data of a frame, the number of its camera, and its images: offset in the file, sizes (0: none), CRC-32."""
 
 
-class StoredRows(Rows):
-    """Rows in a file of a frame store, which is created with the first; one thread at a time may use them."""
+class StoredFile:
+    """A file of a frame store, created with its first bytes; `size` and `crc` are of all that was put in.
+
+    Raises `InputError` where the folder is full or read-only, and where what is read is not what was put in.
+    """
 
     NOT_IN_CHECKPOINT = ("_store",)
-    """Not in a checkpoint: a store holds its tables."""
+    """Not in a checkpoint: a store holds its files."""
 
-    def __init__(self, kind: np.dtype, store: FrameStore, name: str) -> None:
-        super().__init__(kind)
-        self._store, self._name = store, name
+    def __init__(self, store: FrameStore, name: str) -> None:
+        self.name, self.size, self.crc = name, 0, 0
+        self._store = store
         self._file: IO[bytes] | None = None
 
-    def append(self, rows: np.ndarray) -> None:
-        """Put rows (n,) of the kind in. Raises `InputError` where the folder is full or read-only."""
+    def append(self, content: bytes) -> None:
+        """Put bytes in behind those that it has."""
         with self._store.storing():
             if self._file is None:
-                self._file = self._store.opened(self._name, "w+b")
-            self._file.seek(self._count * self._kind.itemsize)
-            self._file.write(self._raw(rows).tobytes())
+                self._file = self._store.opened(self.name, "w+b")
+            self._file.seek(self.size)
+            self._file.write(content)
             self._file.flush()
-        self._count += len(rows)
+        self.size, self.crc = self.size + len(content), zlib.crc32(content, self.crc)
 
-    def read(self, first: int = 0, count: int | None = None) -> np.ndarray:
-        """Return `count` rows from the row `first` on; None: all of them."""
+    def clear(self) -> None:
+        """Forget all that was put in."""
+        self.size = self.crc = 0
+
+    def read(self, start: int, size: int) -> bytes:
+        """Return `size` bytes from `start` on; where they are all, by their checksum."""
         if self._file is None:
-            return np.zeros(0, self._kind)
-        self._file.seek(first * self._kind.itemsize)
-        size = (self._count - first if count is None else count) * self._kind.itemsize
-        return np.frombuffer(bytearray(self._file.read(size)), self._kind)
+            return b""
+        self._file.seek(start)
+        found = self._file.read(size)
+        self.check(len(found) == size and (size < self.size or zlib.crc32(found) == self.crc))
+        return found
+
+    def check(self, is_whole: bool) -> None:
+        """Raise `InputError` unless what was read is whole."""
+        if not is_whole:
+            raise InputError(
+                f"the stored frames are damaged ({self.name}): the disk gives back other bytes than it got"
+            )
 
     def sync(self) -> None:
         """Have the disk hold what was put in."""
@@ -77,15 +95,53 @@ class StoredRows(Rows):
             os.fsync(self._file.fileno())
 
     def reopen(self) -> None:
-        """Open the file of the rows that these were restored from; rows put in later are cut off."""
-        if self._count:
-            self._file = self._store.reopened(self._name, self._count * self._kind.itemsize)
+        """Open the file that this one was restored from; what was put in later is cut off."""
+        if self.size:
+            self._file = self._store.opened(self.name, "r+b")
+            self._file.truncate(self.size)
 
     def close(self) -> None:
         """Close the file."""
         if self._file is not None:
             with suppress(OSError):  # a full disk, which `append` has told
                 self._file.close()
+
+
+def check_stored(folder: Path, files: Iterable[Mapping[str, Any]]) -> None:
+    """Raise `InputError` unless a store's folder holds these files: name, size and crc of each `StoredFile`.
+
+    What follows after `size` bytes does not count.
+    """
+    for facts in files:
+        crc, left = 0, int(facts["size"])
+        file = folder / facts["name"]
+        with reporting(f"cannot read the stored frames {file}"):
+            if left:
+                with file.open("rb") as stream:
+                    while left and (part := stream.read(min(left, _CHECKED_AT_ONCE))):
+                        crc, left = zlib.crc32(part, crc), left - len(part)
+        if left or crc != facts["crc"]:
+            raise InputError(f"the stored frames {file} are damaged")
+
+
+class StoredRows(Rows):
+    """Rows in a file of a frame store, which is created with the first; one thread at a time may use them."""
+
+    def __init__(self, kind: np.dtype, file: StoredFile) -> None:
+        super().__init__(kind)
+        self._file = file
+
+    def append(self, rows: np.ndarray) -> None:
+        """Put rows (n,) of the kind in. Raises `InputError` where the folder is full or read-only."""
+        if not self._count:
+            self._file.clear()  # `keep` puts all in again
+        self._file.append(self._raw(rows).tobytes())
+        self._count += len(rows)
+
+    def read(self, first: int = 0, count: int | None = None) -> np.ndarray:
+        """Return `count` rows from the row `first` on; None: all. Raises `InputError` where they are damaged."""
+        size = (self._count - first if count is None else count) * self._kind.itemsize
+        return np.frombuffer(bytearray(self._file.read(first * self._kind.itemsize, size)), self._kind)
 
 
 class FrameStore:
@@ -96,17 +152,16 @@ class FrameStore:
     deleted then.
     """
 
-    NOT_IN_CHECKPOINT = ("_folder", "_tables", "_known")
+    NOT_IN_CHECKPOINT = ("_folder", "_files", "_known")
     """Not in a checkpoint: a run may go on under another name of its folder, and who made a table holds its state."""
 
     def __init__(self, folder: Path | None = None, advice: str = "", name: str = "") -> None:
         self._folder, self._name = Path(tempfile.gettempdir() if folder is None else folder), name
         self._advice = f", {advice}" if advice else ""
-        self._file: IO[bytes] | None = None
-        self._tables: list[StoredRows] = []
+        self._images = StoredFile(self, "frames")
+        self._files = [self._images]
         self._entries = self.table("frame_entries", _ENTRY)
         self._cameras: list[PinholeCamera] = []
-        self._end = 0
         self._known: tuple[np.ndarray, dict[int, int]] | None = None
         self._reading = Lock()
 
@@ -116,8 +171,8 @@ class FrameStore:
 
     def table(self, name: str, kind: np.dtype) -> StoredRows:
         """Return new rows of a kind in a file of that name."""
-        self._tables.append(StoredRows(kind, self, name))
-        return self._tables[-1]
+        self._files.append(StoredFile(self, name))
+        return StoredRows(kind, self._files[-1])
 
     def put(self, frame: Frame) -> None:
         """Store a frame. Raises `InputError` where the folder is full or read-only."""
@@ -128,24 +183,19 @@ class FrameStore:
             np.packbits(np.zeros_like(frame.valid) if frame.highlights is None else frame.highlights).tobytes(),
             *(_encoded(mm).tobytes() for mm in (frame.depth_mm, frame.depth_sigma_mm) if mm is not None),
         ]
-        with self.storing():
-            if self._file is None:
-                self._file = self.opened("frames", "w+b")
-            self._file.seek(self._end)
-            self._file.write(b"".join(parts))
-            self._file.flush()
+        content, offset = b"".join(parts), self._images.size
+        self._images.append(content)
         if frame.camera not in self._cameras:
             self._cameras.append(frame.camera)
         entry = np.zeros(1, _ENTRY)
-        entry["index"], entry["time_s"], entry["offset"] = frame.index, frame.time_s, self._end
+        entry["index"], entry["time_s"], entry["offset"] = frame.index, frame.time_s, offset
         entry["camera"], entry["median_depth_mm"] = self._cameras.index(frame.camera), _median_depth_mm(frame)
         entry["sizes"][0, : len(parts)] = [len(part) for part in parts]
-        entry["quality"] = frame.quality
+        entry["quality"], entry["crc"] = frame.quality, zlib.crc32(content)
         entry["nonrigidity"] = np.nan if frame.nonrigidity is None else frame.nonrigidity
         if frame.T_world_camera is not None:
             entry["has_pose"], entry["T_world_camera"] = True, frame.T_world_camera
         self._entries.append(entry)
-        self._end += int(entry["sizes"].sum())
         self._known = None
 
     @contextmanager
@@ -167,26 +217,13 @@ class FrameStore:
 
     def sync(self) -> None:
         """Have the disk hold what was stored. Raises `OSError` where it cannot."""
-        if self._file is not None:
-            os.fsync(self._file.fileno())
-        for table in self._tables:
-            table.sync()
+        for file in self._files:
+            file.sync()
 
     def reopen(self) -> None:
         """Open the files of the store that this one was restored from; what was put in later is cut off."""
-        for table in self._tables:
-            table.reopen()
-        if len(self):
-            self._file = self.reopened("frames", self._end)
-
-    def reopened(self, name: str, size: int) -> IO[bytes]:
-        """Open a restored file of the store, cut off after so many bytes; raises `InputError` where it has fewer."""
-        file = self.opened(name, "r+b")
-        if (found := file.seek(0, os.SEEK_END)) < size:
-            file.close()
-            raise InputError(f"the stored frames in {self._folder} are damaged: {name} has {found} of {size} bytes")
-        file.truncate(size)
-        return file
+        for file in self._files:
+            file.reopen()
 
     def frame(self, index: int) -> Frame:
         """Return the frame with this number; any thread may call it."""
@@ -207,11 +244,8 @@ class FrameStore:
 
     def close(self) -> None:
         """Close the files."""
-        if self._file is not None:
-            with suppress(OSError):  # a full disk, which `put` has told
-                self._file.close()
-        for table in self._tables:
-            table.close()
+        for file in self._files:
+            file.close()
 
     def _index(self) -> tuple[np.ndarray, dict[int, int]]:
         """Return the entries of all frames, and the place of each by its number."""
@@ -222,12 +256,15 @@ class FrameStore:
             return self._known
 
     def _read(self, entry: np.void) -> Frame:
-        assert self._file is not None
-        camera = self._cameras[entry["camera"]]
+        camera, sizes = self._cameras[entry["camera"]], entry["sizes"].tolist()
         shape = (camera.height, camera.width)
         with self._reading:
-            self._file.seek(int(entry["offset"]))
-            parts = [np.frombuffer(self._file.read(size), np.uint8) for size in entry["sizes"].tolist() if size]
+            content = self._images.read(int(entry["offset"]), sum(sizes))
+        self._images.check(zlib.crc32(content) == entry["crc"])
+        ends = np.cumsum(sizes).tolist()
+        parts = [
+            np.frombuffer(content, np.uint8, size, end - size) for size, end in zip(sizes, ends, strict=True) if size
+        ]
         colours, valid, highlights, depth, *sigma = parts
         return Frame(
             int(entry["index"]),

@@ -32,7 +32,7 @@ create table if not exists facts (name text primary key, value text not null);
 create table if not exists states (name text primary key, tree text not null);
 create table if not exists blobs (hash blob, part integer, bytes blob not null, primary key (hash, part));
 """
-_DIGESTS = "digests"
+_DIGESTS, _SUM = "digests", "sum"
 _PART_BYTES = 64 << 20  # SQLite's blobs end at 1 GB
 _OWN = "scopemap."
 _OUTSIDE: dict[str, Any] = {"outside": True}
@@ -64,15 +64,14 @@ class SavedState:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Facts as committed last; {} where nothing was."""
+        """Facts as committed last; {} where nothing was. Raises `InputError` where they are damaged."""
         if not self._file.is_file():
             return {}
         with self._reported():
-            rows = self._database.execute("select * from facts").fetchall()
-        try:
-            return {name: json.loads(value) for name, value in rows}
-        except ValueError:
-            raise InputError(f"the checkpoint {self._file} is damaged") from None
+            rows = dict(self._database.execute("select * from facts").fetchall())
+        if rows and rows.pop(_SUM, None) != _sum_of(rows):
+            raise self._damaged()
+        return {name: json.loads(value) for name, value in rows.items()}
 
     def put(self, part: str, value: object) -> None:
         """Write the state of a part, to be committed with the others."""
@@ -90,8 +89,10 @@ class SavedState:
         started = time.perf_counter()
         with self._writing, self._reported():
             facts = facts | {_DIGESTS: self._digests}
-            rows = [(name, json.dumps(value)) for name, value in facts.items()]
-            self._database.executemany("insert or replace into facts values (?, ?)", rows)
+            rows = {name: json.dumps(value) for name, value in facts.items()}
+            rows[_SUM] = _sum_of(rows)
+            self._database.execute("delete from facts")
+            self._database.executemany("insert into facts values (?, ?)", rows.items())
             known = {row[0] for row in self._database.execute("select distinct hash from blobs")}
             old = [(key,) for key in known - self._hashes]
             self._database.executemany("delete from blobs where hash = ?", old)
@@ -101,10 +102,21 @@ class SavedState:
 
     def restore(self, part: str, value: object) -> Any:
         """Return the committed state of a part, with what is not stored from `value`, whose objects are changed."""
-        with self._reported():
-            (tree,) = self._database.execute("select tree from states where name = ?", (part,)).fetchone() or ("",)
-        self._check(tree.encode(), self.facts[_DIGESTS].get(part, ""))
-        return _Reader(self._blob).value(json.loads(tree), value)
+        return _Reader(self._blob).value(self._tree(part), value)
+
+    def check(self, kind: type) -> list[dict[str, Any]]:
+        """Return the attributes of all objects of one of scopemap's classes, by name, as JSON holds them.
+
+        Raises `InputError` where anything in the checkpoint is damaged.
+        """
+        name, blobs, found = _name_of(kind), set[str](), []
+        for part in self.facts[_DIGESTS]:
+            for node in _nodes(self._tree(part)):
+                blobs |= {node[key] for key in ("blob", "bytes") if key in node}
+                found += [node["attributes"]] if node.get("of") == name else []
+        for blob in blobs:
+            self._blob(blob)
+        return found
 
     def close(self) -> None:
         """Close the file."""
@@ -135,9 +147,19 @@ class SavedState:
         self._check(content, name)
         return content
 
+    def _tree(self, part: str) -> Any:
+        with self._reported():
+            row = self._database.execute("select tree from states where name = ?", (part,)).fetchone()
+        tree = str(row[0]) if row else ""
+        self._check(tree.encode(), self.facts[_DIGESTS].get(part, ""))
+        return json.loads(tree)
+
     def _check(self, content: bytes, digest: str) -> None:
         if _digest(content).hex() != digest:
-            raise InputError(f"the checkpoint {self._file} is damaged")
+            raise self._damaged()
+
+    def _damaged(self) -> InputError:
+        return InputError(f"the checkpoint {self._file} is damaged")
 
     @contextmanager
     def _reported(self) -> Iterator[None]:
@@ -148,6 +170,19 @@ class SavedState:
                 with suppress(sqlite3.Error):
                     self._opened.rollback()
             raise InputError(f"cannot write or read the checkpoint {self._file}: {error}") from None
+
+
+def _nodes(tree: Any) -> Iterator[dict[str, Any]]:
+    """Yield what `_Writer` has made of each object in a tree."""
+    if isinstance(tree, dict):
+        yield tree
+        tree = [part for key, item in tree.items() for part in (item.values() if key == "attributes" else [item])]
+    for part in tree if isinstance(tree, list) else ():
+        yield from _nodes(part)
+
+
+def _sum_of(rows: dict[str, str]) -> str:
+    return _digest(repr(sorted(rows.items())).encode()).hex()
 
 
 def _digest(content: bytes | memoryview) -> bytes:

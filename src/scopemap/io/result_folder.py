@@ -65,7 +65,9 @@ def result_folder(
             _put_in_place(unfinished, folder)
         except BaseException as error:
             if is_committed(unfinished / CHECKPOINT):
-                error.add_note(f"a checkpoint is kept in {folder}: the same command resumes from there")
+                error.add_note(
+                    f"a checkpoint is kept in {folder}: the same command resumes from there, --no-resume begins anew"
+                )
             else:
                 shutil.rmtree(unfinished, ignore_errors=True)
                 if is_new:

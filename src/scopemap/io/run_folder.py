@@ -20,6 +20,7 @@ from scopemap.trajectory.formats.folders import read_frames, submap_folders
 from scopemap.trajectory.frame_table import FrameTable
 
 _SCALE_NOT_STATED = "scale unknown (the run does not state it): sizes are a guess, compare shapes"
+_MOST_PX = 1 << 15
 
 
 class RunFolder:
@@ -78,18 +79,7 @@ class RunFolder:
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
         """The surface with its vertices' attributes; empty where there is no mesh.ply or no face."""
-        file = self.path / "mesh.ply"
-        if not file.is_file():
-            return trimesh.Trimesh()
-        with reporting(f"cannot read {file}"):
-            mesh = trimesh.load(file, process=False)
-            if not isinstance(mesh, trimesh.Trimesh):
-                return trimesh.Trimesh()
-            # trimesh leaves properties that it does not know in the raw table.
-            vertices = mesh.metadata["_ply_raw"]["vertex"]["data"]
-            for name in {"confidence", "moving"} & set(vertices.dtype.names):
-                mesh.vertex_attributes[name] = np.array(vertices[name])
-        return mesh
+        return read_mesh(self.path / "mesh.ply")
 
     @cached_property
     def camera(self) -> PinholeCamera:
@@ -97,7 +87,11 @@ class RunFolder:
         with reporting(f"{self.path}/provenance.json does not state the camera"):
             facts = self.provenance["camera"]
             fx, fy, cx, cy = (float(facts[name]) for name in ("fx", "fy", "cx", "cy"))
-            return PinholeCamera(fx, fy, cx, cy, int(facts["width"]), int(facts["height"]))
+            width, height = int(facts["width"]), int(facts["height"])
+            possible = min(fx, fy) > 0 and np.isfinite([fx, fy, cx, cy]).all()
+            if not (possible and 0 < width <= _MOST_PX and 0 < height <= _MOST_PX):
+                raise ValueError(f"it is of {width}x{height} px with a focal length of {fx:g} px")
+            return PinholeCamera(fx, fy, cx, cy, width, height)
 
     @property
     def source_camera_file(self) -> Path | None:
@@ -143,3 +137,25 @@ class RunFolder:
         with reporting(f"cannot read {file}"):
             rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
             return {int(row["index"]): (float(row["sharpness"]), float(row["ms"])) for row in rows}
+
+
+def read_mesh(file: Path) -> trimesh.Trimesh:
+    """Return the surface in a PLY file with its vertices' attributes; empty where there is no file or no face.
+
+    Raises `InputError` where it is damaged.
+    """
+    if not file.is_file():
+        return trimesh.Trimesh()
+    with reporting(f"cannot read {file}"):
+        mesh = trimesh.load(file, process=False)
+        if not isinstance(mesh, trimesh.Trimesh):
+            return trimesh.Trimesh()
+        # trimesh leaves properties that it does not know in the raw table.
+        vertices = mesh.metadata["_ply_raw"]["vertex"]["data"]
+        for name in {"confidence", "moving"} & set(vertices.dtype.names):
+            mesh.vertex_attributes[name] = np.array(vertices[name])
+        if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+            raise ValueError("it is damaged: a face has a vertex that is not there")
+        if not np.isfinite(mesh.vertices).all():
+            raise ValueError("it is damaged: a vertex is nowhere")
+    return mesh

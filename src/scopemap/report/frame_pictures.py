@@ -23,7 +23,9 @@ _MOST = 64
 _MOST_MEASURES = 100_000
 _LONGEST_SIDE_PX = 320
 _QUALITY = 80
-_USABLE, _INSTRUMENT = 255, 90
+WHOLLY_USABLE = 255
+"""Level of the usable pixels in a picture's mask."""
+_INSTRUMENT = 90
 _COLUMNS = ("index", "sharpness", "ms")
 _MEASURE = np.dtype(list(zip(_COLUMNS, (np.int64, np.float64, np.float64), strict=True)))
 
@@ -57,7 +59,7 @@ class FramePictures:
         sharpness = float(cv2.meanStdDev(laplacian, mask=mask)[1][0, 0])
         if self._count % self._every == 0:
             small = shrunk(rgb, _LONGEST_SIDE_PX)
-            levels = mask * np.uint8(_USABLE)
+            levels = mask * np.uint8(WHOLLY_USABLE)
             if instruments is not None:
                 levels[instruments] = _INSTRUMENT
             levels = shrunk(levels, _LONGEST_SIDE_PX, cv2.INTER_NEAREST)

@@ -18,6 +18,7 @@ from scopemap.errors import ScopemapError
 from scopemap.geometry.align import align_trajectories
 from scopemap.io.reference import read_reference
 from scopemap.io.run_folder import RunFolder
+from scopemap.io.run_input import places_of_input
 from scopemap.notices import notices_of
 from scopemap.report.losses import losses
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, simplified
@@ -197,9 +198,9 @@ def _maps(
 
 def _truth(run: RunFolder) -> dict[str, Any] | None:
     """Return the true camera positions of the result's frames, moved and scaled onto it; None where none are known."""
-    source, frames = run.provenance.get("input", ""), run.frames.only(run.frames.tracked)
+    frames = run.frames.only(run.frames.tracked)
     try:
-        reference = read_reference(Path(source)) if source and Path(source).is_dir() else None
+        reference = next((read_reference(place) for place in places_of_input(run.path) if place.is_dir()), None)
         return None if reference is None else _aligned(reference, frames["index"], frames["T_world_camera"])
     except ScopemapError:  # no poses, or too few or too straight a path to be aligned
         return None

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from scopemap.config import Config
 from scopemap.errors import InputError, reporting
-from scopemap.io.checkpoint import CHECKPOINT, SavedState, is_committed
+from scopemap.fusion.frame_store import StoredFile, check_stored
+from scopemap.io.checkpoint import CHECKPOINT, SavedState
 from scopemap.io.checksums import input_checksum
-from scopemap.io.result_folder import UNFINISHED
+from scopemap.io.result_folder import STORED, UNFINISHED
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline
@@ -82,6 +83,10 @@ class Checkpoints:
 
     def restore(self) -> tuple[int, bool]:
         """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
+        with reporting("cannot resume from the checkpoint; --no-resume begins anew"):
+            return self._restored()
+
+    def _restored(self) -> tuple[int, bool]:
         pipeline, facts = self._run.pipeline, self._file.facts
         for stage, owner in pipeline.stages.items():
             for name, value in self._file.restore(stage, self._stage(stage)).items():
@@ -92,8 +97,7 @@ class Checkpoints:
         self._run.sequence.choice.skipped.update(found["skipped"])
         if facts["complete"]:
             self._run.sequence.source.warnings[:] = found["warnings"]
-        with reporting("cannot resume with the stored frames"):
-            pipeline.fusion.store.reopen()
+        pipeline.fusion.store.reopen()
         return int(facts["last"]), bool(facts["complete"])
 
     def close(self) -> None:
@@ -146,19 +150,35 @@ def input_changes(identity: dict[str, Any], content: dict[str, Any], path: Path)
     return [] if before == content else [Notice("input-changed", {"path": str(path)})]
 
 
-def can_resume(folder: Path, identity: dict[str, Any]) -> bool:
-    """Return whether a folder holds a checkpoint of a run that would have the same result."""
-    return is_committed(folder / CHECKPOINT) and not _differences(folder, identity)
+def can_resume(folder: Path, identity: dict[str, Any], damage: list[str]) -> bool:
+    """Return whether a folder holds a whole checkpoint of a run that would have the same result.
+
+    `damage` takes why one is not whole: the run then begins anew.
+    """
+    if not (folder / CHECKPOINT).is_file():
+        return False
+    try:
+        with reporting(f"cannot read the checkpoint in {folder}"), closing(SavedState(folder / CHECKPOINT)) as file:
+            if not file.facts or _differences(file.facts, identity):
+                return False
+            check_stored(folder / STORED, file.check(StoredFile))
+    except InputError as fault:
+        damage.append(str(fault))
+        return False
+    return True
 
 
 def check_resumable(out: Path, sequence: Sequence, config: Config) -> None:
-    """Raise `InputError` with the difference where a run in `out` was ended that would have another result."""
+    """Raise `InputError` where what a killed run left in `out` is damaged, or with what makes the result another."""
     if not (out / UNFINISHED / CHECKPOINT).is_file():
         return
-    other = _differences(out / UNFINISHED, identity_of(sequence, config))
-    if other:
+    identity, found = identity_of(sequence, config), list[str]()
+    if not can_resume(out / UNFINISHED, identity, found) and not found:
+        with closing(SavedState(out / UNFINISHED / CHECKPOINT)) as file:
+            found = _differences(file.facts, identity)
+    if found:
         raise InputError(
-            f"cannot resume the run in {out}: {'; '.join(other[:_SHOWN_DIFFERENCES])}; --no-resume begins a new one"
+            f"cannot resume the run in {out}: {'; '.join(found[:_SHOWN_DIFFERENCES])}; --no-resume begins a new one"
         )
 
 
@@ -168,10 +188,8 @@ def discard_unfinished(out: Path) -> None:
         (out / UNFINISHED / CHECKPOINT).unlink()
 
 
-def _differences(folder: Path, identity: dict[str, Any]) -> list[str]:
-    """Return in words in what a run that was ended in a folder differs from one with this identity."""
-    file = SavedState(folder / CHECKPOINT)
-    before = file.facts.get("identity", identity)
-    file.close()
+def _differences(facts: dict[str, Any], identity: dict[str, Any]) -> list[str]:
+    """Return in words in what a run with these facts of its checkpoint differs from one with this identity."""
+    before = facts.get("identity", identity)
     names = [name for name in sorted({*before, *identity}) if before.get(name) != identity.get(name)]
     return [f"{name} was {before.get(name)}, is {identity.get(name)}" for name in names]

@@ -10,10 +10,12 @@ from typing import Any
 from scopemap.config import Config
 from scopemap.estimators import largest_depth_mm
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.io.checksums import input_checksum, write_checksums
+from scopemap.io.checksums import write_checksums
 from scopemap.io.depth_maps import DepthWriter
 from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
+from scopemap.io.run_input import stated_input
 from scopemap.io.sequence import Sequence
+from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
@@ -40,7 +42,8 @@ def reconstruct(
     """Turn a sequence into poses, depth and a surface.
 
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
-    result. Observers that are methods of an object with an attribute `NOT_IN_CHECKPOINT` are resumed and saved with it.
+    result; where that is damaged it begins anew, which a notice says. Observers that are methods of an object with an
+    attribute `NOT_IN_CHECKPOINT` are resumed and saved with it.
 
     The settings in the result are the resolved ones: the TSDF parameters are numbers.
     Of several submaps the one with most frames is the result, and `others` holds the others.
@@ -64,10 +67,14 @@ def reconstruct(
     if out is not None:
         refuse_own_input(Path(out), sequence, config)
         check_result_folder(Path(out), overwrite=overwrite)  # before the input is hashed
-    identity = {} if out is None else identity_of(sequence, config, tracker)
-    with result_folder(out, overwrite=overwrite, can_resume=partial(can_resume, identity=identity)) as folder:
+    identity, damage = {} if out is None else identity_of(sequence, config, tracker), list[str]()
+    resumes = partial(can_resume, identity=identity, damage=damage)
+    with result_folder(out, overwrite=overwrite, can_resume=resumes) as folder:
+        for reason in damage:
+            progress(f"beginning anew: {reason}", 0, 0)
         store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
         sequence, config, estimators, notices = prepare(sequence, config, clock.timed, progress)
+        notices = [Notice("checkpoint-damaged", {"reason": reason}) for reason in damage] + notices
         write_depth = None if folder is None else DepthWriter(folder, largest_depth_mm(config, estimators))
         writers: tuple[FrameWriter, ...] = () if write_depth is None else (write_depth,)
         if folder is not None and config.tracking.camera_at_rest:
@@ -81,8 +88,8 @@ def reconstruct(
                 with closing(Checkpoints(folder, identity, run, _kept_with(observers))) as checkpoints:
                     run.track(observers, checkpoints)
             result = run.result(notices)
-        content = result.provenance["input_content"] = input_checksum(sequence.path)
-        changes = input_changes(identity, content, sequence.path)
+        result.provenance.update(stated_input(sequence.path, None if out is None else Path(out)))
+        changes = input_changes(identity, result.provenance["input_content"], sequence.path)
         result.provenance["notices"] += [notice.as_json() for notice in changes]
         del run, pipeline  # with their keyframes and volumes: a long run has none to spare when it writes
         if folder is not None and write_depth is not None:

@@ -18,7 +18,7 @@ from scopemap.estimators import OwnEstimators
 from scopemap.flow.estimator import OwnFlow
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.io.checksums import input_checksum
+from scopemap.io.run_input import stated_input
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import ASSUMED_RATE_HZ, Source
 from scopemap.odometry import Step
@@ -136,7 +136,7 @@ class Reconstructor:
         self._refuse_closed()
         try:
             result = self._run.result(self._notices)
-            result.provenance["input_content"] = input_checksum(self._sequence.path)
+            result.provenance.update(stated_input(self._sequence.path, None))
             return result
         finally:
             self.close()

@@ -23,7 +23,7 @@ from scopemap.cli.evaluate import (
     warn_of,
 )
 from scopemap.cli.figures import show
-from scopemap.cli.options import AsJson
+from scopemap.cli.options import AsJson, InputNow
 from scopemap.errors import CalibrationError, InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def evaluate(
         ),
     ] = None,
     against_video: AgainstVideo = False,
+    source: InputNow = None,
     align: AlignBy = "sim3",
     align_first: AlignFirst = None,
     unit: OfUnit = "mm",
@@ -86,9 +87,9 @@ def evaluate(
     if truth is None:
         if not against_video or depth or consistency or protocol or icp or paper_units:
             raise typer.BadParameter("needed for all figures but those of --against-video", param_hint="--truth")
-        show(against_own_video(trajectory), form)
+        show(against_own_video(trajectory, source), form)
         return
-    own = against_own_video(trajectory) if against_video else {}
+    own = against_own_video(trajectory, source) if against_video else {}
     estimate = read_trajectory(trajectory, unit=unit, kind=kind)
     reference = read_reference(truth, unit=truth_unit or unit, kind=truth_kind)
     if reference is None:

@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from scopemap.errors import InputError
-from scopemap.io.run_folder import RunFolder
+from scopemap.geometry.rendering import vertex_colours
+from scopemap.io.run_folder import RunFolder, read_mesh
 from scopemap.trajectory.formats.folders import read_run, submap_folders
 from scopemap.trajectory.formats.text import text_lines
 from scopemap.trajectory.trajectory import Trajectory
@@ -71,9 +71,9 @@ def _points(mesh_file: Path, submap: Trajectory) -> np.ndarray:
     """Return rows number x y z r g b error of the mesh's vertices; without a mesh of the camera centres."""
     points = submap.positions_mm[submap.tracked]
     colours = np.zeros(points.shape)
-    mesh = trimesh.load_mesh(mesh_file, process=False) if mesh_file.is_file() else None
-    if mesh is not None and len(mesh.vertices) and isinstance(mesh.visual, trimesh.visual.ColorVisuals):
-        points, colours = mesh.vertices, mesh.visual.vertex_colors[:, :3]
+    mesh = read_mesh(mesh_file)
+    if len(mesh.vertices):
+        points, colours = mesh.vertices, vertex_colours(mesh)[:, :3]
     rows = np.linspace(0, len(points) - 1, min(len(points), _MOST_POINTS)).astype(np.int64)
     return np.column_stack([np.arange(1, len(rows) + 1), points[rows], colours[rows], np.zeros(len(rows))])
 

@@ -18,7 +18,11 @@ from scopemap.trajectory.trajectory import Trajectory
 
 
 class ExportedRun(RunFolder):
-    """The folder of a run to be exported, or of one of its submaps."""
+    """The folder of a run to be exported, or of one of its submaps; `source`: where its input is, None: looked for."""
+
+    def __init__(self, path: Path | str, source: Path | None = None) -> None:
+        super().__init__(path)
+        self.source = source
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -31,12 +35,12 @@ class ExportedRun(RunFolder):
         return np.asarray(self.mesh.vertices, np.float64).reshape(-1, 3), vertex_colours(self.mesh)[:, :3]
 
     def tracked_frames(self) -> Iterator[Frame]:
-        """Yield the tracked frames in order, rectified and masked, read from the run's input again.
+        """Yield the tracked frames in order, rectified and masked, as `frames_again` has them.
 
         Raises `InputError` where the input is gone, or has not all of them any more.
         """
         missing = set(self.trajectory.indices.tolist())
-        for frame in frames_again(self.path, missing.copy()):
+        for frame in frames_again(self.path, missing.copy(), self.source):
             missing.discard(frame.index)
             yield frame
         if missing:
@@ -48,9 +52,9 @@ class ExportedRun(RunFolder):
         return self.depth.present and all(map(self.depth.has, self.trajectory.indices.tolist()))
 
 
-def read_exported(folder: Path) -> ExportedRun:
+def read_exported(folder: Path, source: Path | None = None) -> ExportedRun:
     """Read a run's folder, or that of a submap, `maps/N`. Raises `InputError` where it is none or has no pose."""
-    run = ExportedRun(folder)
+    run = ExportedRun(folder, source)
     run.checked()
     if not len(run.trajectory):
         raise InputError(f"{folder}: no frame was tracked, so there is nothing to export")

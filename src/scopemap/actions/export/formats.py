@@ -58,12 +58,20 @@ FORMATS: dict[str, ExportFormat] = {
 }
 
 
-def export_run(folder: Path, name: str, out: Path, unit: Unit | None = None, axes: Axes | None = None) -> str:
+def export_run(
+    folder: Path,
+    name: str,
+    out: Path,
+    unit: Unit | None = None,
+    axes: Axes | None = None,
+    *,
+    source: Path | None = None,
+) -> str:
     """Write the run in `folder` as the format with this name, and return what is known of its scale, in words.
 
-    unit, axes : None for the format's own. Frames that are lost or in another submap are left out. Raises
-    `SettingsError` for units and axes that the format does not have, `InputError` where `out` is there already, cannot
-    be written, or the run lacks what the format needs.
+    unit, axes : None for the format's own. source : where the run's input is now; else it is looked for. Frames that
+    are lost or in another submap are left out. Raises `SettingsError` for units and axes that the format does not have,
+    `InputError` where `out` is there already, cannot be written, or the run lacks what the format needs.
     """
     form = FORMATS[name]
     for option, given, possible in (("units", unit, form.units), ("axes", axes, form.axes)):
@@ -73,7 +81,7 @@ def export_run(folder: Path, name: str, out: Path, unit: Unit | None = None, axe
         raise InputError(f"cannot write {out}: its name must end in {form.ending}")
     if out.is_file() or (out.is_dir() and (form.ending or any(out.iterdir()))):
         raise InputError(f"{out} exists; give another name with --out")
-    run = read_exported(folder)
+    run = read_exported(folder, source)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         # An export that fails or is stopped leaves nothing.
