@@ -170,14 +170,14 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 20 lines for a lens that the views contradict, 20 for the verdict on the adjustment.
-    "core": (lambda: _total(MODULES), 29_890),
-    "core, net": (lambda: _net(MODULES), 18_420),
-    "bench": (lambda: _total(BENCH_MODULES), 11_030),  # 30 for the metric consistency, which no figure showed
+    # 20 lines for a lens that the views contradict, 20 for the verdict on the adjustment, 70 for what `help` shows.
+    "core": (lambda: _total(MODULES), 29_960),
+    "core, net": (lambda: _net(MODULES), 18_445),
+    "bench": (lambda: _total(BENCH_MODULES), 11_060),  # 30 for the metric consistency, 30 for its public names
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 30_540),  # those of both
+    "tests": (lambda: _total(TESTS), 30_600),  # those of both
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
-    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 12_940),
+    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 12_980),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),
     "settings": (lambda: len(setting_names()), 45),
 }
@@ -392,7 +392,7 @@ def test_every_function_says_what_it_returns() -> None:
 
 
 def test_public_names() -> None:
-    assert 0 < len(scopemap.__all__) <= 12
+    assert 0 < len(scopemap.__all__) <= 13  # with `evaluate_poses`, which the quick start uses
     assert len(set(scopemap.__all__)) == len(scopemap.__all__)
     for name in scopemap.__all__:
         assert getattr(scopemap, name) is not None

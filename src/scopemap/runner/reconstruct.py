@@ -12,6 +12,7 @@ from scopemap.estimators import largest_depth_mm
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.io.checksums import input_checksum, write_checksums
 from scopemap.io.depth_maps import DepthWriter
+from scopemap.io.opening import open_sequence
 from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
 from scopemap.io.sequence import Sequence
 from scopemap.pipeline import Pipeline
@@ -28,8 +29,8 @@ _NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is st
 
 
 def reconstruct(
-    sequence: Sequence,
-    config: Config | None = None,
+    sequence: Sequence | Path | str,
+    config: Config | str | None = None,
     *,
     out: Path | str | None = None,
     overwrite: bool = False,
@@ -37,7 +38,7 @@ def reconstruct(
     progress: Progress = lambda doing, done, total: None,
     tracker: FrameTracker | None = None,
 ) -> Reconstruction:
-    """Turn a sequence into poses, depth and a surface.
+    """Turn a sequence, or a video, into poses, depth and a surface.
 
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
     result. Observers that are methods of an object with an attribute `NOT_IN_CHECKPOINT` are resumed and saved with it.
@@ -48,8 +49,8 @@ def reconstruct(
 
     Parameters
     ----------
-    sequence : from `open_sequence`.
-    config : settings, by default the preset `default`.
+    sequence : from `open_sequence`; or the path of a video or folder that is opened with the settings' `input`.
+    config : settings, or the name of a preset; by default the preset `default`.
     out : folder for the result; None keeps it in memory, without depth maps. Where the run fails it stays as it was.
     overwrite : replace an earlier run there, once the new one is whole.
     observers : called with each `Step`, whose pose and depth are as tracked, before the back end; one that returns
@@ -59,7 +60,9 @@ def reconstruct(
     progress : called before the first frame and after the last one.
     """
     clock = Clock()
-    config = config or Config()
+    config = Config.chosen(config)
+    if isinstance(sequence, Path | str):
+        sequence = open_sequence(sequence, settings=config.input)
     plan = memory_plan(config, sequence)
     if out is not None:
         refuse_own_input(Path(out), sequence, config)
