@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_fo
 from scopemap.io.sequence import Sequence
 from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
+from scopemap.report.notebook import in_notebook, notebook_progress
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import memory_plan
@@ -35,7 +36,7 @@ def reconstruct(
     out: Path | str | None = None,
     overwrite: bool = False,
     observers: tuple[Observer, ...] = (),
-    progress: Progress = lambda doing, done, total: None,
+    progress: Progress | None = None,
     tracker: FrameTracker | None = None,
 ) -> Reconstruction:
     """Turn a sequence, or a video, into poses, depth and a surface.
@@ -57,16 +58,34 @@ def reconstruct(
         True ends the run early, with the frames that were read until then.
     tracker : replaces the one of `config.tracking`; its keyframes are adjusted, too, unless `config.mapping.method` is
         "none".
-    progress : called before the first frame and after the last one.
+    progress : called before the first frame and after the last one; None: a notebook shows how far the run is.
     """
-    clock = Clock()
     config = Config.chosen(config)
     if isinstance(sequence, Path | str):
         sequence = open_sequence(sequence, settings=config.input)
+    folder = None if out is None else Path(out)
+    with ExitStack() as stack:
+        if progress is None and in_notebook():
+            observe, progress = stack.enter_context(notebook_progress(sequence.count))
+            observers += (observe,)
+        progress = progress or (lambda doing, done, total: None)
+        return _reconstruct(sequence, config, folder, overwrite, observers, progress, tracker)
+
+
+def _reconstruct(
+    sequence: Sequence,
+    config: Config,
+    out: Path | None,
+    overwrite: bool,
+    observers: tuple[Observer, ...],
+    progress: Progress,
+    tracker: FrameTracker | None,
+) -> Reconstruction:
+    clock = Clock()
     plan = memory_plan(config, sequence)
     if out is not None:
-        refuse_own_input(Path(out), sequence, config)
-        check_result_folder(Path(out), overwrite=overwrite)  # before the input is hashed
+        refuse_own_input(out, sequence, config)
+        check_result_folder(out, overwrite=overwrite)  # before the input is hashed
     identity = {} if out is None else identity_of(sequence, config, tracker)
     with result_folder(out, overwrite=overwrite, can_resume=partial(can_resume, identity=identity)) as folder:
         store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
