@@ -12,8 +12,7 @@ import tempfile
 from pathlib import Path
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap_bench.phantom.spec import PhantomSpec
-from scopemap_bench.phantom.writer import write_phantom
+from scopemap_bench import PhantomSpec, write_phantom
 
 
 def main(source: Path, out: Path) -> None:

@@ -12,10 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from scopemap import open_sequence, read_trajectory, reconstruct
-from scopemap.evaluation.poses import evaluate_poses
-from scopemap_bench.phantom.spec import PhantomSpec
-from scopemap_bench.phantom.writer import write_phantom
+from scopemap import evaluate_poses, open_sequence, read_trajectory, reconstruct
+from scopemap_bench import PhantomSpec, write_phantom
 
 
 def main(run: Path, truth: Path) -> None:

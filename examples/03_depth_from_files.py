@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap_bench.phantom.spec import PhantomSpec
-from scopemap_bench.phantom.writer import write_phantom
+from scopemap_bench import PhantomSpec, write_phantom
 
 
 def write_depth(frames: Path, folder: Path) -> None:

@@ -15,6 +15,7 @@ from front_door import call, refused
 from result_files import batch_rows, compared_files
 from tiny_phantom import write_tiny
 
+import scopemap.cli.batch as batch_command
 from scopemap.cli.batch import videos_of
 from scopemap.io.inputs import named_inputs
 from scopemap.report.batch_page import BatchRow, write_batch_page
@@ -200,3 +201,15 @@ def test_the_page_escapes_names_and_asks_no_network(tmp_path: Path) -> None:
     assert 'src="a%22b/summary.png"' in page
     assert page.index("<h2>b</h2>") < page.index("<h2>a&quot;b</h2>")
     assert "3 videos: 1 waiting, 1 done, 1 failed (1 good)" in page
+
+
+def test_a_pipe_is_told_what_begins_what_runs_and_what_ends(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batch_command, "_SECONDS_BETWEEN_LINES", 0.2)  # by default every minute
+    assert call("batch", folder / "colon 0", "--out", tmp_path / "out", *QUICK) == 0
+    first, *between, last = capfd.readouterr().err.splitlines()
+    assert first == "colon_0: started (1 left)"
+    assert re.fullmatch(r"colon_0: [a-z ]+, 4 of 4 frames, \d+ s \(0 left\)", last)
+    assert between
+    assert all(re.fullmatch(r"running: colon_0 for \d+ s", line) for line in between)

@@ -85,14 +85,14 @@ def test_lost_frames_and_those_of_other_maps_are_counted_apart(capfd: pytest.Cap
             observers[0](step)  # type: ignore[arg-type]
     out, err = capfd.readouterr()
     assert out == ""
-    line = r"frame 6 of 6: [\d.]+ frames/s, about \d+ s left, ok, 1 lost, 2 in other maps so far"
+    line = r"frame 6 of 6: about \d+ s left, ok, 1 lost, 2 in other maps so far"
     assert re.fullmatch(line, err.splitlines()[-1])
     with run_progress(10, silent=True) as shown:
         assert shown.observers == ()
 
 
 @pytest.mark.parametrize("total", [100, None])
-def test_progress_comes_now_and_then_and_preparing_slows_no_rate(
+def test_progress_comes_now_and_then_and_preparing_takes_no_time_of_the_rest(
     total: int | None, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = SimpleNamespace(now=0.0)
@@ -105,5 +105,5 @@ def test_progress_comes_now_and_then_and_preparing_slows_no_rate(
     of, left = (" of 100", "about 64 s left, ") if total else ("", "")
     assert capfd.readouterr().err.splitlines() == [
         f"frame 1{of}: lost: too dark",
-        f"frame 21{of}: 2.0 frames/s, {left}lost: too dark",
+        f"frame 21{of}: {left}lost: too dark",
     ]

@@ -61,6 +61,8 @@ def test_the_notebook_runs_and_is_kept_without_outputs(tmp_path: Path, monkeypat
     NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = [output for cell in cells for output in cell.outputs]
     assert any("data:image/jpeg;base64," in output.get("data", {}).get("text/html", "") for output in shown)
+    lines = [output.get("data", {}).get("text/plain", "") for output in shown if output.output_type == "display_data"]
+    assert "24 frames done" in lines  # the progress of the run, which nobody asked for
     said = "".join(output.get("text", "") for output in shown)
     assert re.search(r"24 of 24 frames, path \d+\.\d", said)
     assert re.search(r"position error 0\.\d+ mm after Sim\(3\)", said)

@@ -6,6 +6,7 @@ import json
 import os
 import re
 from base64 import b64decode
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,14 @@ import pytest
 import trimesh
 from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, draw_run, drawn_result, pose_of, tube
 
+from scopemap.cli.run import _time_words
 from scopemap.io.run_folder import RunFolder
 from scopemap.report.frame_pictures import FramePictures
+from scopemap.report.notebook import in_one_line
 from scopemap.report.page import page_html, write_comparison, write_report
 from scopemap.report.page_data import page_data, shown_meshes
 from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
+from scopemap.report.verdict import frames_per_s
 
 
 @pytest.fixture(scope="module")
@@ -221,8 +225,22 @@ def test_only_json_numbers_are_written() -> None:
 
 
 @pytest.mark.usefixtures("page")  # writes summary.png
+def test_prompt_and_report_tell_one_speed(folder: Path) -> None:
+    result = drawn_result(name="video.mp4")
+    result.provenance["seconds"] = {"total": 20.0, "compile kernels": 8.0}
+    result.provenance["resumed_after_frame"] = None
+    assert frames_per_s(result) == 24 / 12
+    assert _time_words(result) == "time: 20.0 s, 2.0 frames/s"
+    run = RunFolder(folder)
+    assert page_data(run, shown_meshes(run, 1000))["frames_per_s"] == frames_per_s(run)
+    result.provenance["resumed_after_frame"] = int(result.frames["index"][11])
+    assert frames_per_s(result) == 1.0
+    assert frames_per_s(replace(result, provenance={})) is None
+
+
 def test_a_result_shows_itself_in_a_notebook_and_in_one_line(folder: Path) -> None:
     result = drawn_result(name="<b>video</b>.mp4")
+    assert repr(result) == in_one_line(result)
     assert repr(result) == (
         "<Reconstruction, doubtful: 14 of 24 frames in one map; scale unknown; surface covers 94 % of what was seen>"
     )

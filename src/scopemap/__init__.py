@@ -1,7 +1,14 @@
 """scopemap: from a monocular endoscope video to camera poses and a tissue surface.
 
->>> from scopemap import Config, open_sequence, reconstruct
->>> result = reconstruct(open_sequence("video.mp4"), Config(), out="result")
+>>> from scopemap import Config, evaluate_poses, open_sequence, read_trajectory, reconstruct
+>>> sequence = open_sequence("video.mp4", camera="calibration.yaml", frames="0:500")  # the camera where it is known
+>>> result = reconstruct(sequence, Config.load("default"), out="result")  # or reconstruct("video.mp4")
+>>> print(result, result.trajectory.path_length_mm)  # the verdict; poses camera to world, mm
+>>> result.mesh.export("surface.stl")
+>>> print(evaluate_poses(result.trajectory, read_trajectory("truth.txt"), "sim3")["ate_rmse_mm"])
+
+A result is opened again by `RunFolder("result")`; `Reconstructor` takes frames one at a time. The command line is
+`scopemap`; docs/ has the rest. Phantoms with exact truth: `from scopemap_bench import PhantomSpec, write_phantom`.
 """
 
 from __future__ import annotations
@@ -84,6 +91,7 @@ if TYPE_CHECKING:
     from scopemap.config import Config
     from scopemap.depth.custom import OwnDepth
     from scopemap.errors import ScopemapError
+    from scopemap.evaluation.poses import evaluate_poses
     from scopemap.frame import Frame
     from scopemap.io.opening import open_sequence
     from scopemap.io.run_folder import RunFolder
@@ -103,6 +111,7 @@ __all__ = [
     "ScopemapError",
     "Trajectory",
     "__version__",
+    "evaluate_poses",
     "open_sequence",
     "read_trajectory",
     "reconstruct",
@@ -117,6 +126,7 @@ _HOMES = {
     "RunFolder": "io.run_folder",
     "ScopemapError": "errors",
     "Trajectory": "trajectory.trajectory",
+    "evaluate_poses": "evaluation.poses",
     "open_sequence": "io.opening",
     "read_trajectory": "trajectory.formats.opening",
     "reconstruct": "runner.reconstruct",
@@ -137,3 +147,8 @@ def __getattr__(name: str) -> Any:
         import_module("scopemap.report.notebook")  # results then show their verdict
 
     return getattr(import_module(f"scopemap.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names: by them `dir`, `help` and completion show what is imported only when asked for."""
+    return sorted(__all__)

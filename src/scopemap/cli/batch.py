@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from scopemap.runner.engines import Engine
     from scopemap.runner.forecast import Forecast
 
+_SECONDS_BETWEEN_LINES, _MOST_NAMED = 60.0, 8
 _COLUMNS = ("name", "preset", "config", "dataset", "camera", "fov", "frames", "size")
 
 
@@ -268,12 +271,14 @@ def _row_line(row: BatchRow) -> str:
 def _lines(*, silent: bool) -> Iterator[Callable[[str, str, int, bool], None]]:
     """Yield what shows a video on stderr: its name, line, how many are left, and whether it begins.
 
-    One line where a video ends; at a terminal below them those that are running, and a bar.
+    A line where a video begins or ends, and every minute those that are running; at a terminal a line where one ends,
+    and below these the others, and a bar.
     """
     if silent:
         yield lambda name, line, left, begins: None
     elif not sys.stderr.isatty():
-        yield lambda name, line, left, begins: None if begins else typer.echo(f"{line} ({left} left)", err=True)
+        with _plain_lines() as show:
+            yield show
     else:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -296,6 +301,33 @@ def _lines(*, silent: bool) -> Iterator[Callable[[str, str, int, bool], None]]:
                 bar.update(task, description=", ".join(running), completed=done, total=done + left)
 
             yield show
+
+
+@contextmanager
+def _plain_lines() -> Iterator[Callable[[str, str, int, bool], None]]:
+    """Yield what `_lines` does where there is no terminal: a log, a pipe."""
+    began_s, ended = dict[str, float](), threading.Event()
+
+    def show_plain(name: str, line: str, left: int, begins: bool) -> None:
+        began_s.pop(name, None)
+        if begins:
+            began_s[name] = time.monotonic()
+        typer.echo(f"{line} ({left} left)", err=True)
+
+    def tell() -> None:
+        while not ended.wait(_SECONDS_BETWEEN_LINES):
+            since = [f"{name} for {_span(time.monotonic() - began)}" for name, began in list(began_s.items())]
+            if since:
+                more = f" and {len(since) - _MOST_NAMED} more" * (len(since) > _MOST_NAMED)
+                typer.echo(f"running: {', '.join(since[:_MOST_NAMED])}{more}", err=True)
+
+    teller = threading.Thread(target=tell, name="tell", daemon=True)
+    teller.start()
+    try:
+        yield show_plain
+    finally:
+        ended.set()
+        teller.join()
 
 
 @contextmanager

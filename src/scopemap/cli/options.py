@@ -114,9 +114,10 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_slice(text: str) -> slice:
-    """Return the slice of "A:B:S", a Python slice over the input's frames; A, B and S may be left out."""
-    _matched(text, r"(-?\d{1,15})?:(-?\d{1,15})?(:\d{0,15})?", "frames", "START:STOP or START:STOP:STEP such as 0:100")
-    return slice(*(int(part) if part else None for part in text.split(":")))
+    """Return the slice of "A:B:S", as `slice_of` reads it."""
+    from scopemap.io.frame_choice import slice_of
+
+    return slice_of(text)
 
 
 Frames = Annotated[

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
 import typer
+
+from scopemap.report.run_state import RunState, of_all
 
 if TYPE_CHECKING:
     from scopemap.odometry import Step
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 
 _SECONDS_BETWEEN_LINES = 10.0
 _COMPILING = "compiling kernels, once"
-# Time per frame after the last one (adjustment, fusion, writing) over that until then, typical of the default preset.
-_SHARE_AFTERWARDS = 0.5
 
 
 class RunProgress(NamedTuple):
@@ -36,20 +35,16 @@ def run_progress(total: int | None, *, silent: bool) -> Iterator[RunProgress]:
     if silent:
         yield RunProgress((), lambda doing, done, total: None)
         return
-    state = _State(total)
+    state = RunState(total)
     with _display("tracking", "preparing") as show:
 
         def observe(step: Step) -> None:
             state.add(step)
-            show("tracking", state.done, total, f"{state.speed}{state.text}", state.line)
+            show("tracking", state.done, total, f"{state.time_left}{state.text}", state.line)
 
         def progress(doing: str, done: int, frames: int) -> None:
-            if doing == "resuming":
-                state.resume(done)
-                show(doing, done, total, "", f"resuming after {done} frames")
-                return
-            line = f"{doing} frame {done} of {frames}" if frames else doing
-            show(doing, done, frames or None, "", line)
+            line = state.words(doing, done, frames)
+            show(doing, done, total if doing == "resuming" else frames or None, "", line)
 
         yield RunProgress((observe,), progress)
 
@@ -61,7 +56,7 @@ def count_progress(doing: str, done: str, *, silent: bool) -> Iterator[Callable[
         yield None
         return
     with _display(doing) as show:
-        yield lambda count, total: show(doing, count, total, "", f"{done} {count}{_of(total)} frames")
+        yield lambda count, total: show(doing, count, total, "", f"{done} {count}{of_all(total)} frames")
 
 
 @contextmanager
@@ -123,51 +118,3 @@ def _kernels_told(tell: Callable[[str], None]) -> Iterator[None]:
 
     with event.install_listener("numba:compile", Teller()):
         yield
-
-
-def _of(total: int | None) -> str:
-    return f" of {total}" if total else ""
-
-
-class _State:
-    """Counts frames as they pass."""
-
-    def __init__(self, total: int | None) -> None:
-        self.started, self.done, self.lost, self.text = time.perf_counter(), 0, 0, ""
-        self._total, self._first = total, 1
-        self._maps = Counter[int]()
-
-    @property
-    def speed(self) -> str:
-        """Frames per second since the first one, without start-up, and the time left until the result is written.
-
-        "" before the second one.
-        """
-        if self.done <= self._first:
-            return ""
-        rate = (self.done - self._first) / max(time.perf_counter() - self.started, 1e-9)
-        frames_left = max(self._total - self.done, 0) + _SHARE_AFTERWARDS * self._total if self._total else 0
-        left = f", about {frames_left / rate:.0f} s left" if self._total else ""
-        return f"{rate:.1f} frames/s{left}, "
-
-    @property
-    def line(self) -> str:
-        return f"frame {self.done}{_of(self._total)}: {self.speed}{self.text}"
-
-    def resume(self, done: int) -> None:
-        """Go on after so many frames."""
-        self.done, self._first = done, done + 1
-
-    def add(self, step: Step) -> None:
-        if self.done < self._first:
-            self.started = time.perf_counter()
-        self.done += 1
-        if step.track.status == "lost":
-            self.lost += 1
-            self.text = f"lost: {step.track.reason}"
-        else:
-            self._maps[step.track.map] += 1
-            elsewhere = self._maps.total() - max(self._maps.values())
-            counts = ((self.lost, "lost"), (elsewhere, "in other maps"))
-            counted = ", ".join(f"{count} {words}" for count, words in counts if count)
-            self.text = "ok" + (f", {counted} so far" if counted else "")

@@ -226,10 +226,11 @@ def _map_lines(frames: FrameTable) -> list[str]:
 
 def _time_words(result: Reconstruction) -> str:
     """Return how long the run took and its frames per second; of a resumed one since then."""
+    from scopemap.report.verdict import frames_per_s
+
     seconds, after = result.provenance["seconds"]["total"], result.provenance["resumed_after_frame"]
-    done = len(result.frames) if after is None else int((result.frames["index"] > after).sum())
     since = "" if after is None else f" since it was resumed after frame {after}"
-    return f"time: {seconds:.1f} s{since}, {done / seconds:.1f} frames/s"
+    return f"time: {seconds:.1f} s{since}, {frames_per_s(result) or 0.0:.1f} frames/s"
 
 
 def compiling_words(seconds: float) -> str:
@@ -238,7 +239,7 @@ def compiling_words(seconds: float) -> str:
         return ""
     is_cached = os.environ.get("NUMBA_CACHE_DIR") != ""
     kept = "once" if is_cached else "every time: set NUMBA_CACHE_DIR to a folder to keep them"
-    return f"; {seconds:.1f} s of it to compile kernels, {kept}"
+    return f"; {seconds:.1f} s of it, which the frames/s leave out, to compile kernels, {kept}"
 
 
 def _surface(figures: dict[str, float]) -> str:

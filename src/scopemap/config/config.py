@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from pydantic import Field, ValidationError
 
@@ -79,6 +79,15 @@ class Config(Settings):
         except ValidationError as error:
             found = [item for item in error.errors() if item["type"] != "default_factory_not_called"]
             raise SettingsError("; ".join(map(explain, found))) from None
+
+    @classmethod
+    def chosen(cls, config: Config | str | None) -> Config:
+        """Return settings as they are, those of the preset of that name, or the defaults. Raises `SettingsError`."""
+        if isinstance(config, cls):
+            return config
+        if config is None or isinstance(config, str):
+            return cls.load(cast("Preset | None", config))
+        raise SettingsError(f"{str(config)[:_QUOTED]} holds no settings: give a Config, or the name of a preset")
 
     def toml(self) -> str:
         """Return all settings as TOML text that `load` reads back; settings of None are left out."""

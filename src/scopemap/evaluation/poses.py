@@ -7,6 +7,7 @@ Poses are camera to world, (N, 4, 4) float64, mm, matched row by row. Definition
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.spatial import cKDTree
 from scopemap.errors import AlignmentError
 from scopemap.geometry.align import AlignMode, Similarity, align_trajectories
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory, path_length_mm
 
 MIN_MATCHED = 3
@@ -208,10 +210,19 @@ def _too_few(estimate: Trajectory, reference: Trajectory, found: int) -> str:
 
 
 def evaluate_poses(
-    estimate: Trajectory, reference: Trajectory, align: AlignMode, *, first: int | None = None
+    estimate: Trajectory | Path | str, reference: Trajectory | Path | str, align: AlignMode, *, first: int | None = None
 ) -> dict[str, Any]:
-    """Return the `pose_report` of `estimate` against `reference`; raises as `match`."""
-    return pose_report(match(estimate, reference, align, first=first))
+    """Return the errors of a trajectory against the true one, by name: `ate_rmse_mm`, `rotation_mean_deg`, `rpe_10_mm`.
+
+    All names are in the docstring of `pose_report`. Raises `AlignmentError` where too few frames match, or where these
+    determine no alignment, and what `read_trajectory` does.
+
+    estimate, reference : trajectories, or what `read_trajectory` reads: files, folders of runs or of data sets.
+    align : what is fitted first, "none", "origin" (the first frames), "se3", "sim3" or "scale" (the size alone).
+    first : fit on so many tracked frames; None: on all.
+    """
+    read = (one if isinstance(one, Trajectory) else read_trajectory(one) for one in (estimate, reference))
+    return pose_report(match(*read, align, first=first))
 
 
 def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -11,9 +12,11 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from scopemap.errors import SettingsError
 from scopemap.frame import is_constant
 from scopemap.io.source import SourceFrame
 
+_SLICE = re.compile(r"(-?\d{1,15})?:(-?\d{1,15})?(:\d{0,15})?")
 LEAST_DIFFERENCE = 0.5
 """Mean absolute difference below which a frame repeats another, grey levels of 255: what lossy coding leaves."""
 
@@ -63,6 +66,19 @@ class FrameChoice:
             else:
                 taken, last = due, frame
                 yield frame
+
+
+def slice_of(frames: slice | str | None) -> slice:
+    """Return the slice of "A:B:S", a Python slice over the input's frames; A, B and S may be left out, None: all.
+
+    Raises `SettingsError`.
+    """
+    if frames is None or isinstance(frames, slice):
+        return frames or slice(None)
+    if not isinstance(frames, str) or not _SLICE.fullmatch(frames):
+        expected = "expected START:STOP or START:STOP:STEP such as 0:100, in Python a slice, too"
+        raise SettingsError(f"cannot read the frames '{str(frames)[:80]}': {expected}")
+    return slice(*(int(part) if part else None for part in frames.split(":")))
 
 
 def mean_difference(one: np.ndarray, other: np.ndarray) -> float:

@@ -20,7 +20,7 @@ from scopemap.io.datasets.colmap import ColmapFolder
 from scopemap.io.datasets.dicom import Dicom
 from scopemap.io.datasets.rosbag import RosBag
 from scopemap.io.decoding import most_pixels
-from scopemap.io.frame_choice import FrameChoice
+from scopemap.io.frame_choice import FrameChoice, slice_of
 from scopemap.io.images import ImageFolder
 from scopemap.io.prepared import UNKNOWN_MAKE, of_one_view, prepared
 from scopemap.io.sequence import Sequence
@@ -56,18 +56,30 @@ def open_sequence(
     camera: Path | str | None = None,
     fov_deg: float | None = None,
     size: tuple[int, int] | None = None,
-    frames: slice | None = None,
+    frames: slice | str | None = None,
     settings: InputSettings | None = None,
 ) -> Sequence:
     """Return the frames of a video file, a folder of images or a data set's folder, rectified to a pinhole camera.
 
-    `dataset` names the reader (`readers`; `rosbag:TOPIC` the topic, too), None: the first that recognises it. The
-    camera comes from the calibration file `camera`, else from the data set, else it is a pinhole with horizontal field
-    of view `fov_deg`, None: 70 deg until a run estimates it. `size` is the working size (width, height), px; None: by
-    `settings.longest_side_px`. `frames` selects positions in the input. Raises `InputError` and `CalibrationError`.
+    Raises `InputError`, `CalibrationError` and `SettingsError`.
+
+    Parameters
+    ----------
+    path : of the file or folder.
+    dataset : name of the reader (`scopemap datasets list`; `rosbag:TOPIC` names the topic, too), None: the first that
+        recognises it.
+    camera : calibration file, or the numbers "fx fy cx cy [k1 k2 p1 p2 [k3]]", px of the input's pictures; None: the
+        data set's own, else a pinhole by `fov_deg`.
+    fov_deg : horizontal field of view of an unknown camera, degrees; None: 70 until a run estimates it.
+    size : working size (width, height), px; None: by `settings.longest_side_px`.
+    frames : which frames, by their positions in the input, a slice or "0:100:2"; None: all.
+    settings : how the input is read, by default `Config().input`.
     """
-    if frames is not None and frames.step is not None and frames.step <= 0:
+    frames = slice_of(frames)
+    if frames.step is not None and frames.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {frames.step}")
+    if size is not None and not (isinstance(size, tuple | list) and len(size) == 2):
+        raise InputError(f"the working size {str(size)[:80]!r} is none: give (width, height), such as (320, 256)")
     with _errors_of_the_system(path):
         reader = _reader(Path(path), dataset)
     sequence = sequence_of(reader, camera=camera, fov_deg=fov_deg, size=size, frames=frames, settings=settings)

@@ -23,7 +23,7 @@ from scopemap.notices import notices_of
 from scopemap.report.losses import losses
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, simplified
 from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.report.verdict import Result, scale_is_known, scale_source, verdict
+from scopemap.report.verdict import Result, frames_per_s, scale_is_known, scale_source, verdict
 from scopemap.trajectory.frame_table import NOT_USED
 from scopemap.trajectory.trajectory import Trajectory
 
@@ -77,6 +77,7 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
         "scale_known": scale_is_known(run.provenance),
         "scale_source": scale_source(run.provenance),
         "notes": [notice.text for notice in notices_of(run.provenance) if notice.level == "info"],
+        "frames_per_s": frames_per_s(run),
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "frames": _frames(run),
         "depth_range": [near_mm, far_mm],

@@ -77,6 +77,17 @@ def frames_in_result(frames: FrameTable) -> tuple[int, int]:
     return int(np.sum(frames.place == 0)), int(np.sum(frames.place != NOT_USED))
 
 
+def frames_per_s(result: Result) -> float | None:
+    """Return the frames per second of the whole run, without compiling kernels; None where its time is unknown.
+
+    Start-up, adjustment and fusion count, too; of a resumed run the frames and the time since then.
+    """
+    seconds, after = result.provenance.get("seconds", {}), result.provenance.get("resumed_after_frame")
+    passed_s = seconds.get("total", 0.0) - seconds.get("compile kernels", 0.0)
+    done = int(np.sum(result.frames["index"] > (-1 if after is None else after)))
+    return done / passed_s if passed_s > 0 else None
+
+
 def scale_is_known(provenance: dict[str, Any]) -> bool:
     """Return whether sizes were measured or anchored to a given range; predicted millimetres are a guess."""
     return bool((provenance.get("scale") or {}).get("known"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,14 @@ from scopemap.estimators import largest_depth_mm
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.io.checksums import write_checksums
 from scopemap.io.depth_maps import DepthWriter
+from scopemap.io.opening import open_sequence
 from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
 from scopemap.io.run_input import stated_input
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
+from scopemap.report.notebook import in_notebook, notebook_progress
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import memory_plan
@@ -30,16 +32,16 @@ _NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is st
 
 
 def reconstruct(
-    sequence: Sequence,
-    config: Config | None = None,
+    sequence: Sequence | Path | str,
+    config: Config | str | None = None,
     *,
     out: Path | str | None = None,
     overwrite: bool = False,
     observers: tuple[Observer, ...] = (),
-    progress: Progress = lambda doing, done, total: None,
+    progress: Progress | None = None,
     tracker: FrameTracker | None = None,
 ) -> Reconstruction:
-    """Turn a sequence into poses, depth and a surface.
+    """Turn a sequence, or a video, into poses, depth and a surface.
 
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
     result; where that is damaged it begins anew, which a notice says. Observers that are methods of an object with an
@@ -51,22 +53,42 @@ def reconstruct(
 
     Parameters
     ----------
-    sequence : from `open_sequence`.
-    config : settings, by default the preset `default`.
+    sequence : from `open_sequence`; or the path of a video or folder that is opened with the settings' `input`.
+    config : settings, or the name of a preset; by default the preset `default`.
     out : folder for the result; None keeps it in memory, without depth maps. Where the run fails it stays as it was.
     overwrite : replace an earlier run there, once the new one is whole.
     observers : called with each `Step`, whose pose and depth are as tracked, before the back end; one that returns
         True ends the run early, with the frames that were read until then.
     tracker : replaces the one of `config.tracking`; its keyframes are adjusted, too, unless `config.mapping.method` is
         "none".
-    progress : called before the first frame and after the last one.
+    progress : called before the first frame and after the last one; None: a notebook shows how far the run is.
     """
+    config = Config.chosen(config)
+    if isinstance(sequence, Path | str):
+        sequence = open_sequence(sequence, settings=config.input)
+    folder = None if out is None else Path(out)
+    with ExitStack() as stack:
+        if progress is None and in_notebook():
+            observe, progress = stack.enter_context(notebook_progress(sequence.count))
+            observers += (observe,)
+        progress = progress or (lambda doing, done, total: None)
+        return _reconstruct(sequence, config, folder, overwrite, observers, progress, tracker)
+
+
+def _reconstruct(
+    sequence: Sequence,
+    config: Config,
+    out: Path | None,
+    overwrite: bool,
+    observers: tuple[Observer, ...],
+    progress: Progress,
+    tracker: FrameTracker | None,
+) -> Reconstruction:
     clock = Clock()
-    config = config or Config()
     plan = memory_plan(config, sequence)
     if out is not None:
-        refuse_own_input(Path(out), sequence, config)
-        check_result_folder(Path(out), overwrite=overwrite)  # before the input is hashed
+        refuse_own_input(out, sequence, config)
+        check_result_folder(out, overwrite=overwrite)  # before the input is hashed
     identity, damage = {} if out is None else identity_of(sequence, config, tracker), list[str]()
     resumes = partial(can_resume, identity=identity, damage=damage)
     with result_folder(out, overwrite=overwrite, can_resume=resumes) as folder:

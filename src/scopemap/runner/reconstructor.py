@@ -19,6 +19,8 @@ from scopemap.flow.estimator import OwnFlow
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.io.run_input import stated_input
+from scopemap.io.checksums import input_checksum
+from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import ASSUMED_RATE_HZ, Source
 from scopemap.odometry import Step
@@ -41,7 +43,8 @@ class Reconstructor:
     ...     result = reconstructor.result()
 
     source : the camera of the pictures, a pinhole or with a lens (`read_calibration`), or a `Sequence` from
-        `open_sequence` whose frames come from `frames()`. config : by default the preset `default`.
+        `open_sequence`, or the path of what it opens, whose frames come from `frames()`. config : settings, or the name
+        of a preset, by default `default`.
     depth : depth estimator in place of the one of the settings: `OwnDepth(function, kind)`.
     flow : function of two pictures (H, W, 3) uint8 that returns the flow (H, W, 2) float, px, for that of the settings.
     progress : called with what is done before the first frame and in `result`, frames done, all frames (0: no count).
@@ -53,8 +56,8 @@ class Reconstructor:
 
     def __init__(
         self,
-        config: Config | None,
-        source: Sequence | CameraModel,
+        config: Config | str | None,
+        source: Sequence | Path | str | CameraModel,
         *,
         depth: DepthEstimator | None = None,
         flow: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
@@ -63,11 +66,16 @@ class Reconstructor:
     ) -> None:
         if depth is not None and not hasattr(depth, "estimate"):
             raise SettingsError("depth is no estimator: state the kind of your function's values, OwnDepth(f, kind)")
-        config, clock = _with_own(config or Config(), depth=depth is not None, flow=flow is not None), Clock()
+        chosen = Config.chosen(config)
+        if isinstance(source, Path | str):
+            source = open_sequence(source, settings=chosen.input)
+        self.config, clock = _with_own(chosen, depth=depth is not None, flow=flow is not None), Clock()
         self._pushed = not isinstance(source, Sequence)
-        sequence = source if isinstance(source, Sequence) else _sequence_of(source, config)
+        sequence = source if isinstance(source, Sequence) else _sequence_of(source, self.config)
         own = OwnEstimators(depth, None if flow is None else OwnFlow(flow))
-        self._sequence, self.config, estimators, self._notices = prepare(sequence, config, clock.timed, progress, own)
+        self._sequence, self.config, estimators, self._notices = prepare(
+            sequence, self.config, clock.timed, progress, own
+        )
         self._store = FrameStore()
         self._pipeline = Pipeline(self.config, estimators, self._store)
         plan, kept = memory_plan(self.config, self._sequence), KeptMaps(limits or Limits())

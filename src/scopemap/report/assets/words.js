@@ -36,7 +36,7 @@ function writeDetails(run) {
     ["Picture", `${run.camera.width} × ${run.camera.height} px, focal length ${run.camera.fx.toFixed(1)} px`],
     ["Depth by", estimators.depth], ["Scale", run.scale_known ? run.scale_source : `unknown: ${run.scale_source}`], ["Flow by", estimators.flow],
     ["Surface", `${mesh.all_faces.toLocaleString("en")} triangles (here ${(bytesOf(mesh.faces).byteLength / 12).toLocaleString("en")})`],
-    ["Time", seconds ? `${seconds.toFixed(0)} s, ${(facts.frames / seconds).toFixed(1)} frames per second` : null],
+    ["Time", seconds ? `${seconds.toFixed(0)} s${run.frames_per_s ? `, ${run.frames_per_s.toFixed(1)} frames/s` : ""}` : null],
     ["Machine", facts.machine],
     ["True path", run.truth ? `known; RMS distance ${(100 * run.truth.error_share).toFixed(1)} % of the path's length, after alignment with scale` : null],
   ];

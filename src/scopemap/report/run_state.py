@@ -1,0 +1,66 @@
+"""How far a run is, in words: of the progress at the prompt and in a notebook."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from scopemap.odometry import Step
+
+# Time per frame after the last one (adjustment, fusion, writing) over that until then, typical of the default preset.
+_SHARE_AFTERWARDS = 0.5
+
+
+def of_all(total: int | None) -> str:
+    """Return " of" so many; "" where their number is unknown."""
+    return f" of {total}" if total else ""
+
+
+class RunState:
+    """Counts the frames of a run as they pass; total : how many there are, None: nobody knows."""
+
+    def __init__(self, total: int | None) -> None:
+        self.started, self.done, self.lost, self.text = time.perf_counter(), 0, 0, ""
+        self._total, self._first = total, 1
+        self._maps = Counter[int]()
+
+    @property
+    def time_left(self) -> str:
+        """The time until the result is written; "" before the second frame, and where no number of frames is known.
+
+        Frames per second are told once, of the whole run: those of tracking alone are more.
+        """
+        if self.done <= self._first or not self._total:
+            return ""
+        rate = (self.done - self._first) / max(time.perf_counter() - self.started, 1e-9)
+        frames_left = max(self._total - self.done, 0) + _SHARE_AFTERWARDS * self._total
+        return f"about {frames_left / rate:.0f} s left, "
+
+    @property
+    def line(self) -> str:
+        """The last frame, the time left, and how tracking goes."""
+        return f"frame {self.done}{of_all(self._total)}: {self.time_left}{self.text}"
+
+    def words(self, doing: str, done: int, frames: int) -> str:
+        """Return what is done outside of tracking, as `Progress` is called with it; a resumed run counts on."""
+        if doing == "resuming":
+            self.done, self._first = done, done + 1
+            return f"resuming after {done} frames"
+        return f"{doing} frame {done} of {frames}" if frames else doing
+
+    def add(self, step: Step) -> None:
+        """Count the next frame."""
+        if self.done < self._first:
+            self.started = time.perf_counter()
+        self.done += 1
+        if step.track.status == "lost":
+            self.lost += 1
+            self.text = f"lost: {step.track.reason}"
+        else:
+            self._maps[step.track.map] += 1
+            elsewhere = self._maps.total() - max(self._maps.values())
+            counts = ((self.lost, "lost"), (elsewhere, "in other maps"))
+            counted = ", ".join(f"{count} {words}" for count, words in counts if count)
+            self.text = "ok" + (f", {counted} so far" if counted else "")
