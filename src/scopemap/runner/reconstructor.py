@@ -18,9 +18,8 @@ from scopemap.estimators import OwnEstimators
 from scopemap.flow.estimator import OwnFlow
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
-from scopemap.io.run_input import stated_input
-from scopemap.io.checksums import input_checksum
 from scopemap.io.opening import open_sequence
+from scopemap.io.run_input import stated_input
 from scopemap.io.sequence import Sequence
 from scopemap.io.source import ASSUMED_RATE_HZ, Source
 from scopemap.odometry import Step
