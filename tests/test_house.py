@@ -170,14 +170,16 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 20 lines for a lens that the views contradict, 20 for the verdict on the adjustment, 55 for averaged depth.
-    "core": (lambda: _total(MODULES), 29_945),
-    "core, net": (lambda: _net(MODULES), 18_445),
-    "bench": (lambda: _total(BENCH_MODULES), 11_030),  # 30 for the metric consistency, which no figure showed
+    # Issue 32: 90 for a lens that the views contradict, the verdict, averaged depth, cameras at rest. Issue 33: 350 for
+    # depth of stereo pairs, 270 for checksums of checkpoints and inputs found from anywhere, 150 for Python and prompt.
+    "core": (lambda: _total(MODULES), 30_850),
+    "core, net": (lambda: _net(MODULES), 19_010),
+    # 30 for the metric consistency, 90 for two phantoms, 195 for the table of verdicts.
+    "bench": (lambda: _total(BENCH_MODULES), 11_320),
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 30_570),  # those of both; 40 for averaged depth
+    "tests": (lambda: _total(TESTS), 31_660),  # those of all of these; 230 for the network that no command may ask for
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
-    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 12_945),
+    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 13_140),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),
     "settings": (lambda: len(setting_names()), 45),
 }
