@@ -170,7 +170,7 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 90 for lens, verdict, depth and keyframes at rest, 350 for stereo, 420 for checksums, inputs found anywhere, Python.
+    # 90 for lens, verdict, depth and keyframes at rest, 350 for stereo, 420 for checksums, inputs found again, Python.
     "core": (lambda: _total(MODULES), 30_850),
     "core, net": (lambda: _net(MODULES), 19_010),
     "bench": (lambda: _total(BENCH_MODULES), 11_320),  # 90 for two phantoms, 195 for the table of verdicts

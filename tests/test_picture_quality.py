@@ -14,6 +14,7 @@ from drawn_surfaces import LENIENT, plane_frame
 from plane_scene import CAMERA, EVERYWHERE
 
 from scopemap.config import MaskSettings, TrackingSettings
+from scopemap.config.tracking import TRACKING
 from scopemap.frame import Frame
 from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.masking.masker import Masker
@@ -86,20 +87,29 @@ def test_an_unclear_frame_moves_the_surface_little(weighted: bool, mean_mm: floa
 
 
 def test_an_unclear_frame_waits_for_a_clear_one_to_become_the_keyframe_but_not_for_long() -> None:
-    settings = TrackingSettings(keyframe_every=3)
-
-    def keyframes(qualities: list[float]) -> list[int]:
-        tracker, found = Tracker(settings), list[int]()
-        for n, quality in enumerate(qualities):
-            view = plane_scene.see(plane_scene.pose(at_mm=(0.5 * n, 0.0, 0.0)))
-            frame = Frame(n, n / 30, view.rgb, CAMERA, EVERYWHERE, view.depth_mm, quality=quality)
-            track = tracker.track(frame)
-            assert track.status != "lost"
-            frame = replace(frame, T_world_camera=track.T_world_camera)
-            if tracker.needs_keyframe() and tracker.insert_keyframe(frame, measured=True):
-                found.append(n)
-        return found
-
     assert keyframes([1.0] * 8) == [0, 3, 6]
     assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.9, 1.0, 1.0]) == [0, 5]
     assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5]) == [0, 6]
+
+
+def test_a_camera_at_rest_needs_no_other_keyframe() -> None:
+    assert keyframes([1.0] * 8, step_mm=0.02) == [0]
+
+
+def test_every_nth_frame_is_a_keyframe_in_the_paper() -> None:
+    paper = {name: TRACKING["paper"][name] for name in ("min_keyframe_motion", "keyframe_patience")}
+    assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5], step_mm=0.02, **paper) == [0, 3, 6]
+
+
+def keyframes(qualities: list[float], step_mm: float = 0.5, **constants: float) -> list[int]:
+    """Return the frames that become keyframes, of every third, where the camera moves by `step_mm` a frame."""
+    tracker, found = Tracker(chosen(TrackingSettings, keyframe_every=3, **constants)), list[int]()
+    for n, quality in enumerate(qualities):
+        view = plane_scene.see(plane_scene.pose(at_mm=(step_mm * n, 0.0, 0.0)))
+        frame = Frame(n, n / 30, view.rgb, CAMERA, EVERYWHERE, view.depth_mm, quality=quality)
+        track = tracker.track(frame)
+        assert track.status != "lost"
+        frame = replace(frame, T_world_camera=track.T_world_camera)
+        if tracker.needs_keyframe() and tracker.insert_keyframe(frame, measured=True):
+            found.append(n)
+    return found
