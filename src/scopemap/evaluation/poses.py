@@ -221,8 +221,8 @@ def evaluate_poses(
     align : what is fitted first, "none", "origin" (the first frames), "se3", "sim3" or "scale" (the size alone).
     first : fit on so many tracked frames; None: on all.
     """
-    read = (one if isinstance(one, Trajectory) else read_trajectory(one) for one in (estimate, reference))
-    return pose_report(match(*read, align, first=first))
+    one, other = (path if isinstance(path, Trajectory) else read_trajectory(path) for path in (estimate, reference))
+    return pose_report(match(one, other, align, first=first))
 
 
 def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
