@@ -75,7 +75,9 @@ class TrackingSettings(StageSettings):
     camera_at_rest: bool = Field(
         False, description="the camera does not move: poses stay the first one, every frame has a surface (surfaces/)"
     )
-    keyframe_every: int = Field(10, ge=1, description="every n-th frame becomes a keyframe, once the camera has moved (the paper: 2)")
+    keyframe_every: int = Field(
+        10, ge=1, description="every n-th frame becomes a keyframe, once the camera has moved (the paper: 2)"
+    )
     constants: TrackingConstants = constants_of(TrackingConstants(), TRACKING)
 
 
