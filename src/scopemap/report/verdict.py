@@ -61,6 +61,12 @@ class Verdict:
         """good, doubtful or not usable."""
         return WORDS[self.level]
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What provenance.json says of it: `level`, `word`, and `code` and `level` of each of its `reasons`."""
+        reasons = [{"code": reason.code, "level": reason.level} for reason in self.reasons]
+        return {"level": self.level, "word": self.word, "reasons": reasons}
+
 
 def verdict(run: Result) -> Verdict:
     """Return the verdict on a run, from its frames and its provenance."""
@@ -70,6 +76,12 @@ def verdict(run: Result) -> Verdict:
     reasons = sorted(found, key=lambda reason: order.index(reason.level))
     level: Level = next((reason.level for reason in reasons if reason.level in ("bad", "doubtful")), "good")
     return Verdict(level, _advice(run, level), _sentence(run), reasons)
+
+
+def state_verdict(result: Reconstruction) -> None:
+    """Put the verdicts on a result and its other submaps into their provenance."""
+    for part in result.submaps:
+        part.provenance["verdict"] = verdict(part).facts
 
 
 def frames_in_result(frames: FrameTable) -> tuple[int, int]:
