@@ -170,12 +170,12 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 40 lines for a lens, 100 for checkpoints' checksums, 140 for damaged results and a run's input, 40 for its verdict.
-    "core": (lambda: _total(MODULES), 30_190),
-    "core, net": (lambda: _net(MODULES), 18_600),
+    # 40 lines for a lens, 100 for checkpoints' checksums, 140 for a damaged result, a run's input, 50 for its verdict.
+    "core": (lambda: _total(MODULES), 30_200),
+    "core, net": (lambda: _net(MODULES), 18_610),
     "bench": (lambda: _total(BENCH_MODULES), 11_030),  # 30 for the metric consistency, which no figure showed
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 30_830),  # those of both
+    "tests": (lambda: _total(TESTS), 30_850),  # those of both
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 13_000),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

@@ -32,7 +32,7 @@ VIEWS: dict[str, Callable[[Reconstruction], str]] = {}
 
 
 class StatedVerdict(NamedTuple):
-    """The verdict on a result: the level of its worst reason (good, doubtful, bad), and the codes of all, worst first."""
+    """The verdict on a result: the level (good, doubtful, bad) and the codes of its reasons, worst first."""
 
     level: str
     codes: tuple[str, ...]

@@ -94,6 +94,10 @@ def scale_is_known(provenance: dict[str, Any]) -> bool:
     return bool((provenance.get("scale") or {}).get("known"))
 
 
+def _scale_is_stated(provenance: dict[str, Any]) -> bool:
+    return bool((provenance.get("scale") or {}).get("stated"))
+
+
 def scale_source(provenance: dict[str, Any]) -> str:
     """Return what the scale comes from, in words."""
     return str((provenance.get("scale") or {}).get("source", "unknown"))
@@ -109,6 +113,8 @@ def _advice(run: Result, level: Level) -> str:
     if level == "bad":
         return "Do not use this result."
     use = "The shape can be used." if level == "good" else "Use it with care: read the cautions first."
+    if _scale_is_stated(run.provenance):
+        return f"{use} Sizes rest on your {scale_source(run.provenance)}: check a length that you know."
     if scale_is_known(run.provenance):
         return f"{use} Sizes are known (by {scale_source(run.provenance)})."
     return f"{use} Sizes are unknown: compare shapes, do not measure."
@@ -118,7 +124,8 @@ def _sentence(run: Result) -> str:
     inside, used = frames_in_result(run.frames)
     surface = run.provenance.get("surface") or {}
     parts = [f"{inside} of {used} frames in one map"]
-    parts.append("scale known" if scale_is_known(run.provenance) else "scale unknown")
+    known = "scale as you stated it" if _scale_is_stated(run.provenance) else "scale known"
+    parts.append(known if scale_is_known(run.provenance) else "scale unknown")
     if not len(run.mesh.faces):
         parts.append("no surface")
     elif "coverage_mean" in surface:
