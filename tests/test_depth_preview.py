@@ -72,6 +72,7 @@ def test_a_scale_that_is_a_guess_is_said_everywhere(result: Reconstruction, out:
     assert result.provenance["scale"] == {
         "known": False,
         "measured": False,
+        "stated": False,
         "source": "millimetres as scopenet gives them",
     }
     assert scale_words(result.provenance["scale"]) == UNKNOWN
@@ -99,10 +100,12 @@ def test_what_is_anchored_is_known(images: Sequence, settings: dict[str, object]
     config = Config.load(settings={"input.focal": "assume", "fusion.enabled": False, **settings})
     facts = reconstruct(images, config).provenance["scale"]
     assert facts["known"] is known
-    assert scale_words(facts).startswith("scale: near-far 5:80 mm" if known else "scale unknown (")
+    assert scale_words(facts).startswith(
+        "scale: sizes rest on the stated near-far 5:80 mm" if known else "scale unknown ("
+    )
 
 
 def test_depth_of_a_run_of_unknown_scale_is_not_measured(images: Sequence, result: Reconstruction, out: Path) -> None:
     settings = {"input.focal": "assume", "fusion.enabled": False, "depth.backend": f"files:{out / 'depth'}"}
     facts = reconstruct(images, Config.load(settings=settings)).provenance["scale"]
-    assert facts == {"known": False, "measured": False, "source": "measured depth of unknown unit"}
+    assert facts == {"known": False, "measured": False, "stated": False, "source": "measured depth of unknown unit"}

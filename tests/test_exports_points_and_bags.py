@@ -153,6 +153,10 @@ def test_dicom_of_known_scale_has_its_unit(tmp_path: Path) -> None:
     data = pydicom.dcmread(exported(known, "dicom", tmp_path / "surface.dcm"))
     assert data.MeasurementUnitsCodeSequence[0].CodeValue == "mm"
     assert data.ContentDescription == "scale known"
+    stated = draw_run(tmp_path / "stated", scale={"known": True, "stated": True, "source": "near-far 10:80 mm"})
+    data = pydicom.dcmread(exported(stated, "dicom", tmp_path / "stated.dcm"))
+    assert data.ContentDescription == "scale as stated"
+    assert "sizes rest on the stated near-far 10:80 mm" in data.ImageComments
 
 
 def test_endonerf(run: Path, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from scopemap.io.depth_maps import DEPTH_SCALE_MM, DepthReader, DepthWriter
 from scopemap.io.run_folder import RunFolder
 from scopemap.io.sequence import Sequence
 from scopemap.odometry import Step
+from scopemap.report.verdict import verdict
 from scopemap.trajectory.formats.opening import read_trajectory
 
 COLUMNS = "index time_s name status reason map keyframe residual inlier_share correlation overlap iterations"
@@ -173,6 +174,17 @@ def test_provenance(run: _Run) -> None:
     parts = told["seconds"]
     assert {"read", "preprocess", "match", "track", "fuse", "total"} <= set(parts)
     assert parts["total"] >= max(parts["track"], parts["fuse"])
+
+
+def test_the_verdict_is_a_field_and_that_of_the_report(run: _Run) -> None:
+    found, stated = verdict(RunFolder(run.out)), run.result.verdict
+    assert stated is not None
+    assert stated == (found.level, tuple(reason.code for reason in found.reasons))
+    facts = json.loads((run.out / "provenance.json").read_text())["verdict"]
+    assert (facts["level"], facts["word"]) == (found.level, found.word)
+    assert stated.level == "bad"
+    assert {"code": "frames-too-few", "level": "bad"} in facts["reasons"]
+    assert replace(run.result, provenance={}).verdict is None
 
 
 def test_a_result_in_memory_can_be_saved_later(run: _Run, tmp_path: Path) -> None:

@@ -59,6 +59,15 @@ def test_a_whole_run_is_good_and_its_sizes_are_unknown() -> None:
     assert found.advice == "The shape can be used. Sizes are unknown: compare shapes, do not measure."
 
 
+def test_sizes_by_a_range_that_was_typed_are_not_called_known() -> None:
+    scale = {"known": True, "measured": False, "stated": True, "source": "near-far 10:80 mm"}
+    found = verdict(run_of([0] * 100, scale=scale))
+    assert "; scale as you stated it; " in found.sentence
+    assert "Sizes rest on your near-far 10:80 mm: check a length that you know." in found.advice
+    found = verdict(run_of([0] * 100, scale=scale | {"stated": False, "measured": True, "source": "measured depth"}))
+    assert "Sizes are known (by measured depth)." in found.advice
+
+
 def notices(*found: Notice) -> dict[str, Any]:
     return {"notices": [notice.as_json() for notice in found]}
 

@@ -229,6 +229,8 @@ def scale_words(scale: Mapping[str, Any]) -> str:
     """Return what is known of a result's scale in words, from "scale" of its provenance; "" where that is empty."""
     if not scale:
         return ""
+    if scale.get("stated"):
+        return f"scale: sizes rest on the stated {scale['source']}"
     if scale["known"]:
         return f"scale: {scale['source']}"
     return f"scale unknown ({scale['source']}): sizes are a guess, compare shapes"

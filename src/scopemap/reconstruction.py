@@ -12,7 +12,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -29,6 +29,13 @@ from scopemap.trajectory.trajectory import SKIPPED, Trajectory, write_tum
 
 VIEWS: dict[str, Callable[[Reconstruction], str]] = {}
 """How a result shows itself, "line" and "html": `scopemap.report.notebook` adds both, since a result knows no page."""
+
+
+class StatedVerdict(NamedTuple):
+    """The verdict on a result: the level (good, doubtful, bad) and the codes of its reasons, worst first."""
+
+    level: str
+    codes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,12 @@ class Reconstruction:
 
     def _repr_html_(self) -> str | None:
         return VIEWS["html"](self) if "html" in VIEWS else None
+
+    @property
+    def verdict(self) -> StatedVerdict | None:
+        """Whether it can be trusted, as the report says it; None where no run has stated it."""
+        facts = self.provenance.get("verdict")
+        return facts and StatedVerdict(facts["level"], tuple(reason["code"] for reason in facts["reasons"]))
 
     @property
     def trajectory(self) -> Trajectory:

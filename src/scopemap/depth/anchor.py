@@ -58,7 +58,7 @@ class AnchoredDepth:
 
     reference : metric estimator for anchors other than the range and the estimate itself. conversion : of the sequence;
     None until it is fitted. description : the source of the scale. is_measured : whether depth needs no anchor.
-    scale_is_known : whether it is measured, or anchored to a range or by Depth Pro.
+    scale_is_known : whether it is measured, or anchored to a range or by Depth Pro. is_stated : whether to a range.
     """
 
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
@@ -67,7 +67,7 @@ class AnchoredDepth:
         self.reference = reference
         self.conversion: AffineDisparity | DepthScale | None = None
         self.description = "not anchored: no usable frame yet"
-        self.scale_is_known = self.is_measured = False
+        self.scale_is_known = self.is_measured = self.is_stated = False
         self._frames_held = 0
 
     @property
@@ -142,8 +142,8 @@ class AnchoredDepth:
         network = (
             self._settings.backend if source == "estimate" else self.reference.name if source == "reference" else ""
         )
-        self.is_measured = estimate.kind == "measured"
-        self.scale_is_known = self.is_measured or source == "near-far" or network == "depth-pro"
+        self.is_measured, self.is_stated = estimate.kind == "measured", source == "near-far"
+        self.scale_is_known = self.is_measured or self.is_stated or network == "depth-pro"
         return first_mm, ""
 
     def _source(self, estimate: DepthEstimate) -> Literal["estimate", "near-far", "factor", "reference"]:

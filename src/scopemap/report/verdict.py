@@ -61,6 +61,12 @@ class Verdict:
         """good, doubtful or not usable."""
         return WORDS[self.level]
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What provenance.json says of it: `level`, `word`, and `code` and `level` of each of its `reasons`."""
+        reasons = [{"code": reason.code, "level": reason.level} for reason in self.reasons]
+        return {"level": self.level, "word": self.word, "reasons": reasons}
+
 
 def verdict(run: Result) -> Verdict:
     """Return the verdict on a run, from its frames and its provenance."""
@@ -70,6 +76,12 @@ def verdict(run: Result) -> Verdict:
     reasons = sorted(found, key=lambda reason: order.index(reason.level))
     level: Level = next((reason.level for reason in reasons if reason.level in ("bad", "doubtful")), "good")
     return Verdict(level, _advice(run, level), _sentence(run), reasons)
+
+
+def state_verdict(result: Reconstruction) -> None:
+    """Put the verdicts on a result and its other submaps into their provenance."""
+    for part in result.submaps:
+        part.provenance["verdict"] = verdict(part).facts
 
 
 def frames_in_result(frames: FrameTable) -> tuple[int, int]:
@@ -93,6 +105,10 @@ def scale_is_known(provenance: dict[str, Any]) -> bool:
     return bool((provenance.get("scale") or {}).get("known"))
 
 
+def _scale_is_stated(provenance: dict[str, Any]) -> bool:
+    return bool((provenance.get("scale") or {}).get("stated"))
+
+
 def scale_source(provenance: dict[str, Any]) -> str:
     """Return what the scale comes from, in words."""
     return str((provenance.get("scale") or {}).get("source", "unknown"))
@@ -108,6 +124,8 @@ def _advice(run: Result, level: Level) -> str:
     if level == "bad":
         return "Do not use this result."
     use = "The shape can be used." if level == "good" else "Use it with care: read the cautions first."
+    if _scale_is_stated(run.provenance):
+        return f"{use} Sizes rest on your {scale_source(run.provenance)}: check a length that you know."
     if scale_is_known(run.provenance):
         return f"{use} Sizes are known (by {scale_source(run.provenance)})."
     return f"{use} Sizes are unknown: compare shapes, do not measure."
@@ -117,7 +135,8 @@ def _sentence(run: Result) -> str:
     inside, used = frames_in_result(run.frames)
     surface = run.provenance.get("surface") or {}
     parts = [f"{inside} of {used} frames in one map"]
-    parts.append("scale known" if scale_is_known(run.provenance) else "scale unknown")
+    known = "scale as you stated it" if _scale_is_stated(run.provenance) else "scale known"
+    parts.append(known if scale_is_known(run.provenance) else "scale unknown")
     if not len(run.mesh.faces):
         parts.append("no surface")
     elif "coverage_mean" in surface:

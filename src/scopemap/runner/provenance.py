@@ -108,12 +108,14 @@ def provenance_of(
 
 
 def scale_facts(estimators: Estimators) -> dict[str, bool | str]:
-    """Return `known`, whether the scale of a run is measured or anchored, `measured`, and its `source` in words."""
+    """Return `known`, whether the scale of a run is measured or anchored, `measured`, `stated` (a range that its user
+    gave), and its `source` in words.
+    """
     depth, anchor = estimators.depth, estimators.anchor
     guessed = anchor.is_measured and not getattr(depth, "scale_is_known", True)
     source = anchor.description + (" of unknown unit" if guessed else "")
     known = anchor.scale_is_known and not guessed
-    return {"known": known, "measured": known and anchor.is_measured, "source": source}
+    return {"known": known, "measured": known and anchor.is_measured, "stated": anchor.is_stated, "source": source}
 
 
 def estimators_provenance(estimators: Estimators) -> dict[str, str]:

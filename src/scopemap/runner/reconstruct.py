@@ -20,6 +20,7 @@ from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
 from scopemap.report.notebook import in_notebook, notebook_progress
+from scopemap.report.verdict import state_verdict
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import memory_plan
@@ -113,6 +114,7 @@ def _reconstruct(
         result.provenance.update(stated_input(sequence.path, None if out is None else Path(out)))
         changes = input_changes(identity, result.provenance["input_content"], sequence.path)
         result.provenance["notices"] += [notice.as_json() for notice in changes]
+        state_verdict(result)
         del run, pipeline  # with their keyframes and volumes: a long run has none to spare when it writes
         if folder is not None and write_depth is not None:
             progress("writing", 0, 0)

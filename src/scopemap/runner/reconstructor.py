@@ -25,6 +25,7 @@ from scopemap.io.source import ASSUMED_RATE_HZ, Source
 from scopemap.odometry import Step
 from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
+from scopemap.report.verdict import state_verdict
 from scopemap.runner.memory import memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import Limits, scale_facts
@@ -144,6 +145,7 @@ class Reconstructor:
         try:
             result = self._run.result(self._notices)
             result.provenance.update(stated_input(self._sequence.path, None))
+            state_verdict(result)
             return result
         finally:
             self.close()

@@ -68,7 +68,8 @@ def _dataset(run: ExportedRun, unit: tuple[str, str]) -> Any:
     data.Manufacturer = data.ManufacturerModelName = "scopemap"
     data.DeviceSerialNumber, data.SoftwareVersions = "none", __version__
     data.BurnedInAnnotation, data.DocumentTitle = "NO", "surface, research only"
-    data.ContentDescription = "scale known" if run.scale_known else "scale unknown: do not measure"
+    known = "scale as stated" if (run.provenance.get("scale") or {}).get("stated") else "scale known"
+    data.ContentDescription = known if run.scale_known else "scale unknown: do not measure"
     data.ImageComments = f"{_NOBODY}; {run.scale}"
     data.MIMETypeOfEncapsulatedDocument = "model/stl"
     data.ConceptNameCodeSequence = [_code(codes.DCM.PhotogrammetricImaging3DCAMModel)]

@@ -34,7 +34,7 @@ function writeDetails(run) {
   const rows = [
     ["Input", run.input], ["Kind of input", facts.dataset], ["Camera", (facts.camera || {}).source],
     ["Picture", `${run.camera.width} × ${run.camera.height} px, focal length ${run.camera.fx.toFixed(1)} px`],
-    ["Depth by", estimators.depth], ["Scale", run.scale_known ? run.scale_source : `unknown: ${run.scale_source}`], ["Flow by", estimators.flow],
+    ["Depth by", estimators.depth], ["Scale", run.scale_known ? (facts.scale.stated ? "as stated: " : "") + run.scale_source : `unknown: ${run.scale_source}`], ["Flow by", estimators.flow],
     ["Surface", `${mesh.all_faces.toLocaleString("en")} triangles (here ${(bytesOf(mesh.faces).byteLength / 12).toLocaleString("en")})`],
     ["Time", seconds ? `${seconds.toFixed(0)} s${run.frames_per_s ? `, ${run.frames_per_s.toFixed(1)} frames/s` : ""}` : null],
     ["Machine", facts.machine],
