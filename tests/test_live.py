@@ -164,7 +164,9 @@ def test_a_reset_forgets_and_a_snapshot_is_kept(session: LiveSession) -> None:
 def test_the_command_writes_a_result(clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert call("live", clip, "--out", out, "--set", "fusion.every=1") == 0
-    assert "look at" in capfd.readouterr().out
+    said = capfd.readouterr()
+    assert "look at" in said.out
+    assert ("ended: " in said.err, said.out.count("ended: ")) == (False, 1)
     assert {"trajectory.tum", "mesh.ply", "report.html", "frames.csv", "SHA256SUMS"} <= {
         file.name for file in out.iterdir()
     }

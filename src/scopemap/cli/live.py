@@ -180,10 +180,11 @@ def _served(session: LiveSession, port: int, *, silent: bool) -> Callable[[], No
 
 
 def _show(session: LiveSession, ended: threading.Event) -> None:
-    """Show the session's state: in one line of a terminal, elsewhere in a line every ten seconds and at changes."""
+    """Show a session's state until it ends: in one line of a terminal, else in one every ten seconds and at changes."""
     terminal, shown, shown_s = sys.stderr.isatty(), "", 0.0
     while not ended.wait(_SHOWN_EVERY_S):
-        state = session.state()
+        if (state := session.state())["state"] == "ended":  # the summary says so, once
+            continue
         if terminal:
             sys.stderr.write("\r\033[K" + _line(state)[:100])
             sys.stderr.flush()
