@@ -142,7 +142,7 @@ def test_a_run_sees_through_the_lens_that_was_found(clip: Path, tried: list, tmp
 @pytest.mark.parametrize(
     ("said", "words"),
     [
-        (None, "fewer than two windows show a rigid scene"),
+        (None, "too few of the first frames show a rigid scene"),
         (dataclasses.replace(FISHEYE, reason="several lenses fit about as well"), "several lenses fit about as well"),
     ],
 )

@@ -183,7 +183,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         if tried is not None and not tried.reason:
             return _with_tried(sequence, tried, windows), []
         if is_unknown:
-            undecided = "fewer than two windows show a rigid scene" if tried is None else tried.reason
+            undecided = "too few of the first frames show a rigid scene" if tried is None else tried.reason
             kept += f"; a trial of lenses does not tell it either: {undecided}" if adjusts else ""
             default = f"the camera is unknown, and {sequence.camera_source.partition('; ')[0]}: {kept}"
             sequence.source.warnings.append(Notice("camera-unknown", {"reason": default}))
@@ -241,7 +241,7 @@ def combine(fits: Iterable[WindowFit], width_px: float) -> FocalEstimate:
     """Return the combined estimate of windows of images of this width; its relative deviation is 1 % or more."""
     used = [fit for fit in fits if fit.tilt_deg >= _MIN_TILT_DEG]
     if len(used) < _MIN_WINDOWS:
-        reason = f"the camera rotates in {len(used)} windows of the first {MAX_FRAMES} frames, two are needed"
+        reason = "in the first frames the camera turns too little, or what it sees is not rigid"
         return FocalEstimate(math.nan, math.inf, math.nan, len(used), reason=reason)
     logs = np.array([fit.log_focal for fit in used])
     shared = np.array([_ROTATION_ERROR_DEG / fit.tilt_deg for fit in used])
