@@ -173,10 +173,7 @@ CEILINGS = {
     # 20 lines for a lens that the views contradict, 20 for the verdict on the adjustment, 70 for what `help` shows.
     "core": (lambda: _total(MODULES), 30_105),  # 100 for progress in notebooks, 35 in pipes
     "core, net": (lambda: _net(MODULES), 18_550),
-    "bench": (
-        lambda: _total(BENCH_MODULES),
-        11_075,
-    ),  # 30 for the metric consistency, 30 for its public names, 15 for sentences
+    "bench": (lambda: _total(BENCH_MODULES), 11_075),  # 30 metric consistency, 30 public names, 15 for sentences
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
     "tests": (lambda: _total(TESTS), 30_660),  # those of both
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
