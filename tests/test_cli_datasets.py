@@ -103,7 +103,11 @@ def test_list_names_every_reader(datasets: Say) -> None:
     assert all(row["what"] and row["recognised"] for row in rows)
     told = {row["name"]: row for row in rows}
     assert told["c3vd"]["what"].startswith("C3VD: phantom colonoscopy")
-    assert told["video"]["recognised"] == "`path` is a file"
+    assert told["video"]["recognised"] == "It is a file."
+    assert told["oneslam"]["recognised"] == "It holds pictures `images/*`, and `calibration.json`."
+    cells = [cell for row in rows for cell in (row["what"], row["recognised"])]
+    assert all(cell[0].isupper() or cell[0].isdigit() for cell in cells)
+    assert all(cell.endswith(".") and not re.search("Return|`path`|layout is|derive", cell) for cell in cells)
     table = datasets("list")[1]
     assert all(re.search(rf"│ {re.escape(name)} ", table) for name in readers())
     assert datasets("list", "--quiet") == (0, "", "")

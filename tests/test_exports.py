@@ -116,6 +116,7 @@ def test_rgbd_as_endogslam_reads_it(run: Path, tmp_path: Path) -> None:
     colours, depths = sorted((folder / "color").glob("*.png")), sorted((folder / "depth").glob("*.tiff"))
     assert len(colours) == len(depths) == IN_RESULT
     for index in (0, 13):
+        assert Image.open(depths[index]).info["compression"] == "tiff_adobe_deflate"  # LZW needs imagecodecs
         depth_mm = np.array(Image.open(depths[index]), dtype=np.float64) / known["png_depth_scale"]
         np.testing.assert_allclose(depth_mm, depth_of(index), atol=0.011)
         np.testing.assert_allclose(np.asarray(Image.open(colours[index])), seen(index), atol=2)
@@ -201,6 +202,9 @@ def test_surfaces(run: Path, tmp_path: Path, ending: str, axes: str) -> None:
     assert found.volume == pytest.approx(tube().volume / 1e9, rel=1e-4)
     if ending != "stl":
         assert (found.visual.vertex_colors[:, :3] == tube().visual.vertex_colors[:, :3]).all()
+    if ending == "ply":
+        rows = found.metadata["_ply_raw"]["vertex"]["data"]
+        np.testing.assert_array_equal(rows["confidence"], tube().vertex_attributes["confidence"])
     head = file.read_bytes()[:400].decode("ascii", "replace")
     assert ("SPACE=LPS" in head, "SPACE=RAS" in head) == (axes == "lps", axes == "ras")
     assert "unit: m" in head

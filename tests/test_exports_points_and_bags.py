@@ -49,6 +49,7 @@ def test_point_cloud(run: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(cloud.vertices, tube().vertices / 1000, atol=1e-7)
     np.testing.assert_array_equal(cloud.colors[:, :3], tube().visual.vertex_colors[:, :3])
     columns = columns_of(file)
+    np.testing.assert_array_equal(columns["confidence"], tube().vertex_attributes["confidence"])
     normals = np.stack([columns[name] for name in ("nx", "ny", "nz")], -1)
     wall = tube().vertices[:, 2] < 84
     inward = -tube().vertices[wall, :2] / 10
@@ -137,7 +138,10 @@ def test_dicom(run: Path, tmp_path: Path) -> None:
     assert content.startswith(b"SPACE=LPS")
     # Nobody is named, and no viewer measures in a unit that is a guess.
     assert data.PatientIdentityRemoved == "YES"
-    assert "holds no patient's data" in data.ImageComments
+    # What was done is known; whether a patient can be told by the shape is not.
+    assert data.DeidentificationMethod == "nothing copied from the input's tags; not checked further"
+    assert "no name, number or date was copied" in data.ImageComments
+    assert "patient's data" not in str(data)
     assert UNKNOWN in data.ImageComments
     assert {str(data[k].value) for k in ("PatientName", "PatientID", "PatientBirthDate", "StudyDate")} <= {"", "None"}
     assert data.MeasurementUnitsCodeSequence[0].CodeValue == "1"

@@ -138,8 +138,8 @@ def test_less_tilt_and_disagreement_increase_the_deviation() -> None:
     assert different.share > 3 * similar.share
     assert "no endoscope" in combine([_fit(15.0)] * 3, 320.0).reason
     assert combine([_fit(80.0, tilt_deg=1.0)] * 5, 320.0).share == pytest.approx(0.4, rel=0.05)
-    assert "two are needed" in combine([_fit(80.0, tilt_deg=0.01)] * 5, 320.0).reason
-    assert "two are needed" in combine([_fit(80.0)], 320.0).reason
+    assert "turns too little" in combine([_fit(80.0, tilt_deg=0.01)] * 5, 320.0).reason
+    assert "turns too little" in combine([_fit(80.0)], 320.0).reason
 
 
 # ---- images

@@ -45,8 +45,13 @@ def read_decoded(file: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | 
 
 
 def write_encoded(file: Path, image: np.ndarray) -> None:
-    """Write an image (BGR) in the format of the file's ending, by any name on Windows, too. Raises `OSError`."""
-    file.write_bytes(cv2.imencode(file.suffix, image)[1].tobytes())
+    """Write an image (BGR) in the format of the file's ending, by any name on Windows, too. Raises `OSError`.
+
+    A TIFF is packed by deflate: OpenCV's own LZW is read by imageio and tifffile with imagecodecs alone.
+    """
+    is_tiff = file.suffix.lower() in (".tif", ".tiff")
+    options = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE] if is_tiff else []
+    file.write_bytes(cv2.imencode(file.suffix, image, options)[1].tobytes())
 
 
 def first_bytes(file: Path, count: int) -> bytes:

@@ -1,4 +1,4 @@
-"""A folder of images, sorted by the numbers in their names; most readers of data sets derive from it."""
+"""A folder of images, sorted by the numbers in their names."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 from collections import Counter
 from dataclasses import asdict
@@ -18,6 +19,7 @@ from scopemap.errors import InputError, ScopemapError
 
 if TYPE_CHECKING:
     from scopemap.inspection.clip import Finding
+    from scopemap.io.source import Source
 
 app = typer.Typer(help="List the supported data sets; check one.", no_args_is_help=True)
 
@@ -30,12 +32,11 @@ def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
     # A reader's docstrings and its layout's table are the only description of a data set.
     rows = []
     for name, kind in readers().items():
-        recognised = _first_line(getattr(kind, "recognised", kind.recognises)).removeprefix("Whether ")
-        rows.append({"name": name, "what": _first_line(sys.modules[kind.__module__]), "recognised": recognised})
+        rows.append({"name": name, "what": _first_line(sys.modules[kind.__module__]), "recognised": _recognised(kind)})
     if as_json:
         print_json(rows)
     elif not quiet:
-        print_table(("name", "what it is", "recognised where"), (row.values() for row in rows))
+        print_table(("name", "what it is", "how it is recognised"), (row.values() for row in rows))
 
 
 @app.command()
@@ -76,7 +77,17 @@ def check(
 
 
 def _first_line(documented: object) -> str:
-    return (inspect.getdoc(documented) or "").split("\n")[0].rstrip(".")
+    return (inspect.getdoc(documented) or "").split("\n")[0]
+
+
+def _recognised(kind: type[Source]) -> str:
+    """Return in a sentence for users where a reader is chosen."""
+    from scopemap_bench.datasets.layouts import LayoutFolder
+
+    if issubclass(kind, LayoutFolder):
+        return f"It holds {kind.recognised()}."
+    condition = re.sub(r"^(Return w|W)hether ", "", _first_line(kind.recognises)).replace("`path`", "it")
+    return f"{condition[0].upper()}{condition[1:]}"
 
 
 def _print(path: Path, figures: dict[str, Any], findings: list[Finding]) -> None:

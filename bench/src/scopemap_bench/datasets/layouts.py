@@ -87,7 +87,7 @@ class LayoutFolder(ImageFolder):
     def recognised(cls) -> str:
         """Return in words what the folder holds where the layout is recognised."""
         pictures = " or ".join(f"`{Path(place.images) / place.names}`" for place in cls.places)
-        return ", ".join([f"pictures {pictures}", *(" or ".join(f"`{n}`" for n in group) for group in cls.needs)])
+        return ", and ".join([f"pictures {pictures}", *(" or ".join(f"`{n}`" for n in group) for group in cls.needs)])
 
     def _use_intrinsics(self) -> None:
         own = self.path.absolute()

@@ -1,4 +1,4 @@
-"""The surface as a DICOM Encapsulated STL, without any patient's data.
+"""The surface as a DICOM Encapsulated STL, into which no name, number or date of a patient is copied.
 
 Sources: DICOM PS3.3, A.85.1 (Encapsulated STL IOD), C.35.1 (Manufacturing 3D Model); PS3.16, CID 7061 and 7063.
 """
@@ -16,7 +16,7 @@ from scopemap.errors import SettingsError
 from scopemap.trajectory.trajectory import Unit
 
 _ENCAPSULATED_STL = "1.2.840.10008.5.1.4.1.1.104.3"
-_NOBODY = "holds no patient's data; research software, not a medical device"
+_NOBODY = "no name, number or date was copied from the input; research software, not a medical device"
 
 
 def write_dicom_stl(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> None:
@@ -62,7 +62,7 @@ def _dataset(run: ExportedRun, unit: tuple[str, str]) -> Any:
     for keyword in ("ContentDate", "ContentTime", "PositionReferenceIndicator"):
         setattr(data, keyword, "")
     data.PatientIdentityRemoved = "YES"
-    data.DeidentificationMethod = "made without a patient's data"
+    data.DeidentificationMethod = "nothing copied from the input's tags; not checked further"
     data.Modality, data.SeriesNumber, data.InstanceNumber = "M3D", 1, 1
     data.SeriesDescription = "surface from an endoscope's video"
     data.Manufacturer = data.ManufacturerModelName = "scopemap"

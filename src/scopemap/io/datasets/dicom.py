@@ -1,4 +1,6 @@
-"""DICOM: endoscopic video, multi-frame images, series (PS3.3, A.32.5, C.7.6.3 and C.7.6.5; PS3.5, A); by `pydicom`.
+"""DICOM: endoscopic video, multi-frame images, a series; read with the extra `dicom`.
+
+Sources: PS3.3, A.32.5, C.7.6.3 and C.7.6.5; PS3.5, A.
 
 Only the tags that describe images are read, and messages do not repeat them: no names, dates and numbers of patients.
 """

@@ -1,4 +1,4 @@
-"""ROS recordings: `FILE.bag`, a folder with `metadata.yaml` and `.db3` or `.mcap` files, `FILE.mcap`; by `rosbags`.
+"""ROS recordings: `FILE.bag`, `FILE.mcap`, a folder with `metadata.yaml` and `.db3` or `.mcap` files; extra `ros`.
 
 Images of one topic, its `camera_info`, and depth whose topic's name says that it is aligned. Poses are not used.
 """
