@@ -106,7 +106,8 @@ def test_commands_about_the_demonstration_run(small_demo: Path, monkeypatch: pyt
 
 def test_python_about_the_demonstration_runs(small_demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(small_demo)
-    blocks = [block for one in DOCUMENTS for block in _blocks(one.read_text(encoding="utf-8"), "python")]
+    written = [one for one in DOCUMENTS if one.name != "api.md"]  # that is generated, and has signatures
+    blocks = [block for one in written for block in _blocks(one.read_text(encoding="utf-8"), "python")]
     for block in blocks:
         compile(block, "document", "exec")
     about = [block for block in blocks if ABOUT_THE_DEMO.search(block)]
