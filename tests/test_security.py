@@ -75,8 +75,8 @@ def _write_pictures(folder: Path) -> None:
 def test_nothing_of_an_inputs_metadata_is_in_the_result(
     write: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Nor the folders around the input; its own name is."""
-    around = tmp_path / PATIENT
+    """Where the input lies is: a result finds it again, as docs/trust.md says."""
+    around = tmp_path / "around"
     around.mkdir()
     write(around / "in")
     assert PATIENT in _texts(around / "in")
