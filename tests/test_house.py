@@ -171,11 +171,11 @@ def _total(modules: list[_Module]) -> int:
 
 CEILINGS = {
     # 90 for lens, verdict, depth and keyframes at rest, 350 for stereo, 420 for checksums, inputs found again, Python.
-    "core": (lambda: _total(MODULES), 30_900),
-    "core, net": (lambda: _net(MODULES), 19_035),
+    "core": (lambda: _total(MODULES), 30_905),
+    "core, net": (lambda: _net(MODULES), 19_040),
     "bench": (lambda: _total(BENCH_MODULES), 11_330),  # 90 for two phantoms, 195 for the table of verdicts
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 31_700),  # those of all of these; 230 for the network that no command may ask for
+    "tests": (lambda: _total(TESTS), 31_705),  # those of all of these; 230 for the network that no command may ask for
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 13_160),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

@@ -47,8 +47,8 @@ def test_telemetry_of_dependencies_is_off_before_they_are_imported() -> None:
 
 
 def _texts(folder: Path) -> str:
-    """All that is in the files of a folder, and their names."""
-    files = [file for file in folder.rglob("*") if file.is_file()]
+    """All that is in a file, or in the files of a folder, and their names."""
+    files = [file for file in (folder, *folder.rglob("*")) if file.is_file()]
     return "".join(f"{file.name}\n{file.read_bytes().decode('latin-1')}" for file in files)
 
 
@@ -75,8 +75,8 @@ def _write_pictures(folder: Path) -> None:
 def test_nothing_of_an_inputs_metadata_is_in_the_result(
     write: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Where the input lies is: a result finds it again, as docs/trust.md says."""
-    around = tmp_path / "around"
+    """The folders around the input are in provenance.json alone, by which a result finds it again."""
+    around = tmp_path / "folder-around-it"
     around.mkdir()
     write(around / "in")
     assert PATIENT in _texts(around / "in")
@@ -85,8 +85,10 @@ def test_nothing_of_an_inputs_metadata_is_in_the_result(
     settings = ("--set", "tracking.method=paper", "--set", "input.skip_duplicates=false")
     code, said = call("run", source, "--out", tmp_path / "out", *settings), capfd.readouterr()
     assert code == 0, said.err
-    for text in (_texts(tmp_path / "out"), said.out, said.err):
-        assert PATIENT not in text
+    texts = {file.name: _texts(file) for file in (tmp_path / "out").rglob("*") if file.is_file()}
+    texts |= {"printed": said.out, "warned of": said.err}
+    assert not [name for name, text in texts.items() if PATIENT in text]
+    assert [name for name, text in texts.items() if around.name in text] == ["provenance.json"]
 
 
 _BOX = (40, 30, 60, 24)

@@ -14,6 +14,8 @@ from scopemap.io.checksums import input_checksum
 from scopemap.io.run_folder import RunFolder
 
 _MOST_NEIGHBOURS = 10_000
+PLACES = ("input_absolute", "input_relative")
+"""Entries of provenance.json with the folders around an input, whose names may tell of a patient."""
 
 
 def stated_input(path: Path, out: Path | None) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from scopemap.errors import ScopemapError
 from scopemap.geometry.align import align_trajectories
 from scopemap.io.reference import read_reference
 from scopemap.io.run_folder import RunFolder
-from scopemap.io.run_input import places_of_input
+from scopemap.io.run_input import PLACES, places_of_input
 from scopemap.notices import notices_of
 from scopemap.report.losses import losses
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, simplified
@@ -91,7 +91,7 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
         "albedo": tomllib.loads(run.config_text).get("fusion", {}).get("colours") != "raw",
         "truth": _truth(run),
         "config": run.config_text,
-        "provenance": run.provenance,
+        "provenance": {name: value for name, value in run.provenance.items() if name not in PLACES},
     }
 
 
