@@ -216,7 +216,8 @@ def test_a_stereo_phantom_is_measured_in_mm(tmp_path: Path) -> None:
     folder = write_stereo_phantom(tmp_path, spec)
     sequence = open_sequence(folder / "views", camera=folder / "pair.yaml", settings=USE)
     result = reconstruct(sequence, Config.load(settings={"input.stereo": "use"}), out=tmp_path / "result")
-    assert result.provenance["scale"] == {"known": True, "measured": True, "source": "measured depth"}
+    scale = {"known": True, "measured": True, "stated": False, "source": "measured depth"}
+    assert result.provenance["scale"] == scale
     assert "SGBM" in result.provenance["estimators"]["depth"]
     assert result.provenance["tracked"] == 5
     depth = StereoDepth(sequence.pair, sequence.camera)  # type: ignore[arg-type]
