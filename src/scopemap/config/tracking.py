@@ -26,7 +26,7 @@ class TrackingConstants:
     min_keyframe_agreement: float = 0.7
     # A camera that has moved less since the keyframe, rad and translation over depth, needs no other one: its views
     # triangulate nothing, and their errors are alike. 0: off.
-    min_keyframe_motion: float = 0.02
+    min_keyframe_motion: float = 0.01
     keyframe_patience: int = 3  # frames that a keyframe waits longer where the picture is not clear
     levels: int = 5  # of the pyramid, factor 0.5
     finest_level: int = 1  # 0: full working size, 1: half
