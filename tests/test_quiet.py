@@ -27,7 +27,8 @@ from tiny_phantom import only_images, write_tiny
 
 from scopemap.cli.app import app
 
-SWITCHES = ("ORT_DISABLE_TELEMETRY", "HF_HUB_DISABLE_TELEMETRY", "RAY_USAGE_STATS_ENABLED")
+# Of the environment, for nothing else may switch telemetry off: the runtime is quiet where it finds a CI's variables.
+KEPT = {"PATH", "SYSTEMROOT", "LANG", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR"}
 MAIN = "import sys; from scopemap.cli.app import main; main()"
 SHORT_DEMO = (
     "from functools import partial; from scopemap.actions import demo; "
@@ -62,7 +63,7 @@ def _has_guard() -> bool:
 def _environment(home: Path) -> dict[str, str]:
     """Return that of a user of whom nothing is known, whose folders lie in `home`."""
     (home / "tmp").mkdir(parents=True, exist_ok=True)
-    known = {name: value for name, value in os.environ.items() if name not in SWITCHES and name[:4] != "XDG_"}
+    known = {name: value for name, value in os.environ.items() if name in KEPT or name.startswith("SCOPEMAP_")}
     known["PYTHONPATH"] = os.pathsep.join(sys.path)
     places = dict.fromkeys(("HOME", "USERPROFILE", "LOCALAPPDATA"), str(home))
     return known | places | {"TMPDIR": str(home / "tmp"), "COLUMNS": "120"}
