@@ -10,6 +10,7 @@ import typer
 
 from scopemap.cli.figures import print_json
 from scopemap.cli.options import Align, AsJson, Quiet, Unit
+from scopemap.errors import InputError
 
 
 def compare(
@@ -34,16 +35,25 @@ def compare(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure runs against one truth, and print and write their tables and figures."""
+    """Measure runs against one truth, and print and write their tables and figures; two runs alone: with each other.
+
+    Without a truth, the first of two runs is moved onto the second by the Sim(3) of the frames that both have.
+    """
     from scopemap.io.run_folder import RunFolder
     from scopemap.report.page import PAGE, write_comparison
     from scopemap_bench.comparison import compare as compare_runs
     from scopemap_bench.comparison import write_results
     from scopemap_bench.plan import ProtocolPlan
     from scopemap_bench.tables import benchmark_tables
+    from scopemap_bench.two_runs import refuse_run_as_truth
 
-    protocol = ProtocolPlan(align=align, consistency=consistency)
     given = [name.strip() for name in names.split(",")] if names else []
+    if truth is not None:
+        refuse_run_as_truth(truth)
+    elif len(paths) == 2 and all(RunFolder(path).is_finished for path in paths):
+        _compare_two(paths, given, out, as_json=as_json, quiet=quiet)
+        return
+    protocol = ProtocolPlan(align=align, consistency=consistency)
     runs = compare_runs(paths, truth, protocol, names=given, unit=unit)
     results = [run.result for run in runs]
     files = [] if out is None else write_results(runs, out, title="Comparison", paper_units=paper_units)
@@ -60,3 +70,22 @@ def compare(
         if files:
             seen = f", {PAGE} shows the runs" if finished else ""
             typer.echo(f"\n{len(files)} tables and figures in {out}; results.md holds the tables{seen}")
+
+
+def _compare_two(paths: list[Path], names: list[str], out: Path | None, *, as_json: bool, quiet: bool) -> None:
+    from scopemap_bench.two_runs import compare_two
+
+    if names and len(names) != len(paths):
+        raise InputError(f"comparing {len(paths)} runs: {len(names)} names were given")
+    first, second = names or [path.resolve().name for path in paths]
+    if first == second:
+        first, second = map(str, paths)
+    found, files = compare_two(paths[0], paths[1], (first, second), out)
+    if found.figures["same_input"] is False and not quiet:
+        typer.echo("warning: the runs read different inputs; their frames are matched by their numbers", err=True)
+    if as_json:
+        print_json(found.figures | {"files": [str(file) for file in files]})
+    elif not quiet:
+        typer.echo("\n".join(found.lines()))
+        if files:
+            typer.echo(f"pictures in {out}: {', '.join(file.name for file in files)}")
