@@ -34,7 +34,7 @@ from scopemap.notices import Notice
 
 # Displacements in px per unit of ln depth that are aimed at: the median of all pixels, and that of the farthest fifth.
 # Less is noise, more is hard to match.
-_PARALLAX_PX, _FAR_PARALLAX_PX = (6.0, 14.0), (7.0,)
+_PARALLAX_PX, _FAR_PARALLAX_PX = (10.0, 20.0), (12.0,)
 _MIN_PARALLAX_PX = 1.5
 _FAR_PERCENTILE = 80
 # Frames before and after a keyframe among which its neighbours are sought, and the step of the pixels that tell.
