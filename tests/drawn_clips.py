@@ -100,10 +100,10 @@ def bars(mask: np.ndarray) -> None:
     mask[:, 30:290] = 1
 
 
-def text(words: str = "SMITH 12:34", at: tuple[int, int] = (90, 60)) -> Change:
+def text(words: str = "SMITH 12:34", at: tuple[int, int] = (90, 60), *, scale: float = 0.5, level: int = 250) -> Change:
     def change(_: int, picture: np.ndarray) -> np.ndarray:
-        out = picture.copy()
-        cv2.putText(out, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (250, 250, 250), 1, cv2.LINE_AA)
+        out, thick = picture.copy(), max(1, round(2 * scale))
+        cv2.putText(out, words, at, cv2.FONT_HERSHEY_SIMPLEX, scale, (level, level, level), thick, cv2.LINE_AA)
         return out
 
     return change

@@ -170,12 +170,12 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 90 for lens, verdict, depth and keyframes at rest, 350 for stereo, 420 for checksums, inputs found again, Python.
-    "core": (lambda: _total(MODULES), 30_905),
-    "core, net": (lambda: _net(MODULES), 19_040),
+    # 90: lens, verdict, depth, keyframes at rest; 350: stereo; 420: checksums, inputs found again, Python; 95: letters.
+    "core": (lambda: _total(MODULES), 30_995),
+    "core, net": (lambda: _net(MODULES), 19_100),
     "bench": (lambda: _total(BENCH_MODULES), 11_565),  # 235: two runs compared; 90: two phantoms; 195: verdicts
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 31_790),  # those of all of these; 230 for the network that no command may ask for
+    "tests": (lambda: _total(TESTS), 31_900),  # those of all of these; 230 for the network that no command may ask for
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 13_160),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

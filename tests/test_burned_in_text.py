@@ -1,0 +1,113 @@
+"""`inspect` warns of names where letters stay in the picture, and not where an edge alone does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from drawn_clips import Change, circle, clip, inside, text, write
+
+from scopemap.inspection.inspecting import Inspection, inspect
+from scopemap.inspection.letters import LetterFinder
+
+
+def inspected(folder: Path, *changes: Change) -> Inspection:
+    return inspect(write(folder / "video.mp4", clip(50, *changes)))
+
+
+def drawn(draw: Callable[[np.ndarray], object]) -> Change:
+    """What `draw` draws stays where it is, over tissue that moves."""
+
+    def change(_: int, picture: np.ndarray) -> np.ndarray:
+        out = picture.copy()
+        draw(out)
+        return out
+
+    return change
+
+
+def rod(tip: tuple[int, int], towards_deg: float, width_px: int) -> Change:
+    """An instrument at rest: a shaft of steel from the tip out of the picture, bright along its middle."""
+    axis = np.array([np.cos(np.deg2rad(towards_deg)), np.sin(np.deg2rad(towards_deg))])
+    across = np.array([-axis[1], axis[0]]) * width_px
+
+    def draw(out: np.ndarray) -> None:
+        for side, share, level in ((0.0, 1.0, 150), (-0.35, 0.3, 90), (0.05, 0.2, 250)):
+            ends = [tip + side * across, tip + side * across + 400 * axis]
+            half = share / 2 * across
+            corners = np.array([ends[0] - half, ends[0] + half, ends[1] + half, ends[1] - half])
+            cv2.fillConvexPoly(out, np.round(corners * 16).astype(int), (level, level, level + 5), cv2.LINE_AA, 4)
+
+    return drawn(draw)
+
+
+def jaws(tip: tuple[int, int], towards_deg: float) -> Change:
+    """Forceps at rest, open."""
+    upper, lower = rod(tip, towards_deg, 12), rod((tip[0] - 8, tip[1] + 12), towards_deg + 14, 12)
+    return lambda number, picture: lower(number, upper(number, picture))
+
+
+def logo(out: np.ndarray) -> None:
+    for radius, colour in ((22, (235, 235, 240)), (16, (40, 70, 160)), (7, (235, 235, 240))):
+        cv2.circle(out, (270, 200), radius, colour, -1, cv2.LINE_AA)
+
+
+def glare(out: np.ndarray) -> None:
+    """The lamp on the rim of a cap: a bright arc."""
+    cv2.ellipse(out, (160, 120), (95, 95), 0, 200, 300, (250, 250, 250), 3, cv2.LINE_AA)
+
+
+def light_panel(out: np.ndarray) -> None:
+    cv2.rectangle(out, (2, 2), (62, 26), (225, 225, 225), -1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "in_field"),
+    [([text(scale=0.35)], True),
+     ([text(scale=0.35, level=5)], True),
+     ([text("Mueller, Anna", level=5)], True),
+     ([text("Lee 1951", (20, 150), scale=1.0)], True),
+     ([text("Lee 1951", (20, 150), scale=1.0, level=5)], True),
+     ([text("ANNA", (20, 150), scale=2.2)], True),
+     ([inside(circle), text("SMITH", (2, 20), scale=0.4)], False),
+     ([inside(circle), text("ID 7", (2, 30), scale=0.7)], False),
+     ([inside(circle), drawn(light_panel), text("SMITH", (6, 19), scale=0.5, level=10)], False)],
+)  # fmt: skip
+def test_letters_are_text_and_may_name_a_patient(tmp_path: Path, changes: list[Change], in_field: bool) -> None:
+    found = inspected(tmp_path, *changes)
+    assert "overlay-privacy" in {finding.code for finding in found.findings}
+    assert {one.in_field for one in found.overlays if one.is_text} == {in_field}
+    (message,) = [one.message for one in found.findings if one.code in ("overlay", "overlay-outside")]
+    assert "(text)" in message
+
+
+@pytest.mark.parametrize(
+    "change",
+    [*(rod((160, 120), towards, width) for towards in (5, 90, 150, 230, 300) for width in (12, 30)),
+     jaws((150, 120), 20), drawn(logo), drawn(glare)],
+)  # fmt: skip
+def test_an_edge_that_stays_is_an_overlay_and_no_text(tmp_path: Path, change: Change) -> None:
+    found = inspected(tmp_path, change)
+    assert found.overlays
+    assert not any(one.is_text for one in found.overlays)
+    assert {finding.code for finding in found.findings} == {"overlay"}
+    assert "text in 0 of them, else logos or an instrument that rests" in found.findings[0].message
+
+
+def test_a_name_beside_an_instrument_is_found(tmp_path: Path) -> None:
+    found = inspected(tmp_path, rod((180, 140), 40, 20), text())
+    assert any(one.is_text for one in found.overlays)
+    assert "overlay-privacy" in {finding.code for finding in found.findings}
+
+
+def test_strokes_that_come_and_go_are_no_letters() -> None:
+    finder, near, rng = LetterFinder(), np.ones((60, 80), bool), np.random.default_rng(0)
+    assert not len(finder.letters())
+    for _ in range(40):
+        words = "".join(rng.choice(list("ABEHKMRSX"), 8))
+        picture = text(words, (20 + int(rng.integers(0, 9)), 60))(0, np.full((120, 160, 3), 90, np.uint8))
+        finder.add(picture, near)
+    assert not len(finder.letters())
