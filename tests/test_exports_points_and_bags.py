@@ -22,7 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from scopemap.actions.export.image_layouts import write_endonerf
 from scopemap.cameras.camera import PinholeCamera
+from scopemap.fusion.mesh_files import save_mesh
 from scopemap.geometry.rendering import render_mesh
+from scopemap.io.run_folder import RunFolder
 
 UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
 
@@ -43,6 +45,13 @@ def columns_of(file: Path) -> np.ndarray:
 
 
 def test_point_cloud(run: Path, tmp_path: Path) -> None:
+    mesh = RunFolder(run).mesh
+    mesh.vertex_attributes["sigma_mm"] = np.full(len(mesh.vertices), 2.0, np.float32)
+    save_mesh(mesh, run / "mesh.ply")
+    for kind in ("ply", "pointcloud"):
+        columns = columns_of(exported(run, kind, tmp_path / f"{kind}.ply", "--units", "m"))
+        np.testing.assert_array_equal(columns["confidence"], mesh.vertex_attributes["confidence"])
+        np.testing.assert_allclose(columns["sigma_m"], 0.002)
     file = exported(run, "pointcloud", tmp_path / "points.ply", "--units", "m")
     cloud = trimesh.load(file, process=False)
     assert isinstance(cloud, trimesh.PointCloud)

@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,14 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.cli.app import app
 from scopemap.cli.run import summary_lines
 from scopemap.depth.perceptual import StructureDistance
-from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, compare_with_frame
+from scopemap.frame import Frame
+from scopemap.fusion.agreement import (
+    FrameAgreement,
+    agreement_figures,
+    compare_rendering,
+    compare_with_frame,
+    vertex_sigmas,
+)
 from scopemap.geometry.rendering import render_mesh
 from scopemap_bench.evaluation.surface import distances_mm
 
@@ -148,3 +156,15 @@ def test_a_run_whose_video_is_gone_and_no_truth_are_refused(run_folder: Path, tm
     assert "--against-video" in neither.output
     more = CliRunner().invoke(app, ["evaluate", str(run_folder), "--against-video", "--depth", "median"])
     assert more.exit_code == 2
+
+
+def test_a_vertex_is_as_uncertain_as_the_frames_that_see_it() -> None:
+    def frame(number: int, depth_mm: float) -> Frame:
+        seen = Frame(number, 0.0, BLACK, CAMERA, np.ones((64, 80), bool), depth_mm=_depth(depth_mm))
+        return replace(seen, depth_sigma_mm=np.full((64, 80), 0.3, np.float32), T_world_camera=np.eye(4))
+
+    sigmas = vertex_sigmas(_wall(), [frame(0, 50.0), frame(1, 50.4)]).reshape(68, 84)
+    seen = np.isfinite(sigmas)
+    assert seen[2:-2, 2:-2].all()
+    assert not seen[:1].any()  # outside of the picture
+    np.testing.assert_allclose(sigmas[seen], np.sqrt((0.3**2 + 0.4**2) / 2), rtol=0.01)

@@ -50,8 +50,8 @@ COMMANDS = (
 )
 # pydicom imports requests, where that is installed, which binds ::1 to see whether the machine has IPv6, no more.
 SERVING = {"view", "live", "dicom"}
-# Where the installation cannot be written; lists of the machine's fonts, for figures (docs/install.md).
-DOCUMENTED = {"numba", "matplotlib", "fontconfig"}
+# Where the installation cannot be written; lists of the machine's fonts; an empty folder of torch (docs/install.md).
+DOCUMENTED = {"numba", "matplotlib", "fontconfig", "torchinductor_user"}
 
 
 @cache
@@ -66,7 +66,7 @@ def _environment(home: Path) -> dict[str, str]:
     known = {name: value for name, value in os.environ.items() if name in KEPT or name.startswith("SCOPEMAP_")}
     known["PYTHONPATH"] = os.pathsep.join(sys.path)
     places = dict.fromkeys(("HOME", "USERPROFILE", "LOCALAPPDATA"), str(home))
-    return known | places | {"TMPDIR": str(home / "tmp"), "COLUMNS": "120"}
+    return known | places | {"TMPDIR": str(home / "tmp"), "COLUMNS": "120", "USER": "user"}
 
 
 def _start(folder: Path, code: str, *arguments: str, mode: str = "closed") -> subprocess.Popen[str]:

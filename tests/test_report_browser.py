@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import json
+import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -13,8 +16,10 @@ import numpy as np
 import pytest
 from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of
 
+from scopemap.actions.measure import measure
+from scopemap.errors import InputError
 from scopemap.io.run_folder import RunFolder
-from scopemap.report.page import write_comparison, write_report
+from scopemap.report.page import keep_measurements, serve_view, write_comparison, write_report
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -42,7 +47,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Opened:
     """A page that was opened, what it complained of and what it asked for."""
 
-    def __init__(self, browser: Any, file: Path, size: tuple[int, int] = DESKTOP, theme: str = "light") -> None:
+    def __init__(self, browser: Any, file: Path | str, size: tuple[int, int] = DESKTOP, theme: str = "light") -> None:
         viewport = {"width": size[0], "height": size[1]}
         self.page = browser.new_context(viewport=viewport, color_scheme=theme, has_touch=size == PHONE).new_page()
         self.complaints: list[str] = []
@@ -50,7 +55,7 @@ class Opened:
         self.page.on("console", self._heard)
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(file.resolve().as_uri())
+        self.page.goto(file if isinstance(file, str) else file.resolve().as_uri())
         self.wait("shown", "0")
 
     def _heard(self, message: Any) -> None:
@@ -197,7 +202,7 @@ def test_keys_move_the_slider_and_turn_the_surface(browser: Any, report: Path) -
 def test_colours_views_and_curves_can_be_chosen(browser: Any, report: Path) -> None:
     opened = Opened(browser, report)
     before = opened.picture("#scene")
-    for choice, legend in (("1", "never"), ("2", "little")):
+    for choice, legend in (("1", "0 %"), ("2", "0\n0.5")):
         opened.page.locator("#paint").select_option(choice)
         opened.wait("shown", "0")
         assert opened.text("#scene-legend").startswith(legend)
@@ -243,3 +248,129 @@ def test_several_runs_are_chosen_by_name(browser: Any, tmp_path: Path, report: P
     opened.wait("shown", "0")
     assert (opened.text("#name"), opened.text("#word")) == ("theirs", "Not usable")
     assert opened.complaints == []
+
+
+# ---- measuring by hand
+
+
+def measured_in_both(opened: Opened, folder: Path, number: int) -> tuple[str, dict[str, list[float]]]:
+    """Run the command that the page states beside a measurement; return its words, and what both gave, by name."""
+    words = opened.page.locator("#measures li").nth(number).inner_text()
+    command = shlex.split(words[words.index("scopemap measure") :])
+    given = dict(zip(command[3::2], command[4::2], strict=True))
+    pixels = {name: np.array([p.split(",") for p in given[name].split()], float) for name in given if "m" not in name}
+    reference, mm = pixels.get("--reference"), given.get("--reference-mm")
+    frame = int(given["--frame"])
+    exact = measure(folder / command[2], frame, pixels["--points"], reference, None if mm is None else float(mm))
+    assert words.startswith(f"Frame {frame}: " + "; ".join(map(str, exact)))
+    rows = csv.DictReader(opened.page.locator("#csv").input_value().splitlines())
+    found = {row["what"]: row for row in rows if row["number"] == str(number + 1)}
+    return words, {
+        one.what: [float(found[one.what][end]) / getattr(one, end) for end in ("value", "low", "high")] for one in exact
+    }
+
+
+def click(opened: Opened, selector: str, *shares: tuple[float, float]) -> None:
+    box = opened.page.locator(selector).bounding_box()
+    for x, y in shares:
+        opened.page.locator(selector).click(position={"x": x * box["width"], "y": y * box["height"]})
+        opened.page.wait_for_timeout(100)
+
+
+def test_measuring_by_hand_agrees_with_the_command(browser: Any, tmp_path: Path) -> None:
+    folder = draw_run(tmp_path, scale={"known": True, "measured": True, "source": "measured depth"})
+    opened = Opened(browser, write_report(folder)[0])
+    opened.slide(6)
+    assert opened.text("#scene-scale") == "10 mm at the middle of the surface"
+    opened.page.locator("#look").select_option("through")
+    opened.page.wait_for_timeout(100)
+    assert opened.text("#scene-scale").endswith(" mm at 21 mm")
+    opened.page.locator("#look").select_option("overview")
+    has_bar = "canvases => canvases.map(c => c.getContext('2d').getImageData(12, 230, 1, 1).data[0])"
+    assert opened.page.locator("#submap-list canvas").evaluate_all(has_bar) == [255, 255]
+    near, _, far = (float(number) for number in opened.page.locator("#depth-note i").all_inner_texts())
+    assert 0 < near < far < 90
+    assert opened.page.locator("footer a").first.get_attribute("href") == "summary.png"
+    opened.page.locator("#pick-distance").click()
+    click(opened, "#video", (0.3, 0.4), (0.62, 0.7))
+    opened.wait("measures", "1")
+    opened.page.locator("#pick-area").click()
+    click(opened, "#depth", (0.4, 0.2), (0.6, 0.3), (0.63, 0.5), (0.5, 0.4))
+    opened.page.keyboard.press("Enter")
+    opened.wait("measures", "2")
+    opened.page.locator("#pick-distance").click()
+    click(opened, "#scene", (0.45, 0.5), (0.55, 0.56))
+    opened.wait("measures", "3")
+    opened.page.locator("#pick-reference").click()
+    click(opened, "#rendered", (0.35, 0.6), (0.45, 0.7))
+    opened.page.locator("#reference-mm").fill("5")
+    opened.page.locator("#pick-area").click()
+    click(opened, "#residual", (0.4, 0.2), (0.6, 0.3), (0.55, 0.5))
+    opened.page.locator("#close-area").click()
+    opened.wait("measures", "4")
+    for number in range(4):
+        words, ratios = measured_in_both(opened, folder, number)
+        assert ("--reference-mm 5" in words) == (number == 3)
+        assert set(ratios) == ({"area"} if number in (1, 3) else {"straight", "along the surface"})
+        np.testing.assert_allclose(list(ratios.values()), 1, rtol=1e-9)
+    with opened.page.expect_download() as kept:
+        opened.page.locator("#save-json").click()
+    kept.value.save_as(folder / "measurements.json")
+    assert len(json.loads((folder / "measurements.json").read_text())) == 4
+    again = Opened(browser, write_report(folder)[0])
+    assert again.page.locator("#measures li").all_inner_texts() == opened.page.locator("#measures li").all_inner_texts()
+    assert opened.complaints == again.complaints == []
+
+
+def test_points_on_the_surface_are_measured_where_a_frame_sees_the_reference_too(browser: Any, tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    opened = Opened(browser, write_report(folder)[0])
+    opened.page.locator("#pick-reference").click()
+    click(opened, "#video", (0.3, 0.7), (0.4, 0.6))
+    opened.slide(IN_RESULT - 1)
+    opened.page.locator("#pick-distance").click()
+    click(opened, "#scene", (0.45, 0.5), (0.55, 0.56))
+    opened.wait("measures", "1")
+    _, ratios = measured_in_both(opened, folder, 0)
+    np.testing.assert_allclose(list(ratios.values()), 1, rtol=1e-9)
+    # Where a submap lies beside another one is unknown: neither the reference nor a first point counts there.
+    click(opened, "#video", (0.3, 0.4))
+    opened.slide(FRAMES - 1)
+    click(opened, "#video", (0.3, 0.4))
+    assert opened.text("#hand-note") == "1 point"
+    click(opened, "#video", (0.62, 0.7))
+    assert opened.text("#hand-note") == "Not measured: this frame does not see the reference."
+    assert opened.complaints == []
+
+
+def test_without_a_scale_a_reference_is_the_unit(browser: Any, tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    # The full page, served, keeps what was measured beside the result.
+    server = serve_view(folder)
+    try:
+        opened = Opened(browser, server.url)
+        opened.slide(FRAMES - 1)  # in maps/1
+        opened.page.locator("#pick-distance").click()
+        assert opened.text("#hand-note").startswith("Sizes are unknown: first choose Reference")
+        opened.page.locator("#pick-reference").click()
+        click(opened, "#video", (0.3, 0.7), (0.4, 0.6))
+        opened.page.locator("#pick-distance").click()
+        click(opened, "#video", (0.3, 0.4), (0.62, 0.7))
+        opened.wait("measures", "1")
+        words, ratios = measured_in_both(opened, folder, 0)
+        # What was found is said where it is seen without scrolling.
+        assert words.startswith(opened.text("#hand-note"))
+        note = opened.page.locator("#hand-note").bounding_box()
+        assert 0 < note["y"] < note["y"] + note["height"] < DESKTOP[1]
+        assert "scopemap measure maps/1" in words
+        assert "times the reference" in words
+        np.testing.assert_allclose(list(ratios.values()), 1, rtol=1e-9)
+        opened.page.locator("#save-json").click()
+        opened.page.wait_for_timeout(300)
+        assert opened.text("#hand-note") == "Saved as measurements.json beside the result."
+        assert json.loads((folder / "measurements.json").read_text())[0]["folder"] == "maps/1"
+        assert Opened(browser, server.url).page.locator("#measures li").all_inner_texts() == [words]
+        with pytest.raises(InputError, match="no list"):
+            keep_measurements(folder, b"{}")
+    finally:
+        server.close()

@@ -53,7 +53,7 @@ def test_every_frame_is_on_the_page_with_its_pose_and_place(page: str) -> None:
     assert frames["count"] == FRAMES
     assert numbers(frames["index"], "i4").tolist() == list(range(FRAMES))
     assert numbers(frames["place"], "i2").tolist() == [0] * IN_RESULT + [-1] * LOST + [1] * IN_FIRST_MAP
-    poses = numbers(frames["pose"], "f4").reshape(-1, 3, 4)
+    poses = numbers(frames["pose"], "f8").reshape(-1, 3, 4)
     lost = slice(IN_RESULT, IN_RESULT + LOST)
     assert np.isnan(poses[lost]).all()
     np.testing.assert_allclose(poses[5], pose_of(5)[:3], atol=1e-5)
@@ -78,14 +78,13 @@ def test_the_meshes_are_those_of_the_run(page: str, folder: Path) -> None:
 def test_pictures_and_depth_are_those_of_the_frames(page: str, folder: Path) -> None:
     data = shown(page)
     assert [picture["row"] for picture in data["pictures"]] == RunFolder(folder).pictured == list(range(FRAMES))
-    near, far = data["depth_range"]
-    code = cv2.imdecode(np.frombuffer(b64decode(data["pictures"][3]["depth"]), np.uint8), cv2.IMREAD_UNCHANGED)
+    coded = cv2.imdecode(np.frombuffer(b64decode(data["pictures"][3]["depth"]), np.uint8), cv2.IMREAD_COLOR)
     depth = RunFolder(folder).depth.read(3)
     assert depth is not None
-    inside = (code > 1) & (code < 255)
-    assert inside.mean() > 0.5
-    back = near * (far / near) ** ((code[inside] - 1.0) / 254)
-    np.testing.assert_allclose(back, depth[inside], rtol=0.02)
+    assert coded is not None
+    units = coded[..., 2].astype(np.float32) * 256 + coded[..., 1]
+    assert (units > 0).mean() > 0.5
+    np.testing.assert_array_equal(np.where(units > 0, units * np.float32(data["depth_unit_mm"]), np.nan), depth)
 
 
 def test_the_page_asks_for_nothing_and_a_name_cannot_end_its_script(tmp_path: Path, page: str) -> None:
@@ -218,6 +217,14 @@ def test_summary_picture_has_the_verdicts_colour_frames_and_the_mesh(page: str, 
     assert not pieces[:, 2 * 396 + 12 :].any()
 
 
+def test_every_picture_of_the_summary_has_a_scale_bar_where_sizes_are_known(tmp_path: Path) -> None:
+    run = draw_run(tmp_path, scale={"known": True, "measured": True, "source": "measured depth"})
+    picture = cv2.imread(str(write_report(run)[1]))
+    boxes = cv2.connectedComponentsWithStats((picture == 0x10).all(axis=2).astype(np.uint8))[2][1:]
+    # Four frames, their depths, four views of the surface, two submaps.
+    assert (boxes[:, cv2.CC_STAT_AREA] > 1000).sum() == 14
+
+
 def test_only_json_numbers_are_written() -> None:
     text = page_html([{"name": "a<b", "figure": float("nan"), "list": [1.0, float("inf")]}])
     assert "NaN" not in text.partition('id="data">')[2].partition("</script>")[0]
@@ -242,7 +249,8 @@ def test_a_result_shows_itself_in_a_notebook_and_in_one_line(folder: Path) -> No
     result = drawn_result(name="<b>video</b>.mp4")
     assert repr(result) == in_one_line(result)
     assert repr(result) == (
-        "<Reconstruction, doubtful: 14 of 24 frames in one map; scale unknown; surface covers 94 % of what was seen>"
+        "<Reconstruction, doubtful: 14 of 24 frames in one map; scale unknown; "
+        "surface covers 94 % of its own pictures, not of the organ>"
     )
     assert "7 of 7 frames in one map" in repr(result.others[0])
     html = result._repr_html_()

@@ -54,7 +54,10 @@ def adjusted(keyframes: int, rotation_deg: float) -> Notice:
 def test_a_whole_run_is_good_and_its_sizes_are_unknown() -> None:
     found = verdict(run_of([0] * 100))
     assert found.word == "good"
-    assert found.sentence == "100 of 100 frames in one map; scale unknown; surface covers 94 % of what was seen"
+    assert (
+        found.sentence
+        == "100 of 100 frames in one map; scale unknown; surface covers 94 % of its own pictures, not of the organ"
+    )
     assert [reason.level for reason in found.reasons] == ["good", "good", "good"]
     assert found.advice == "The shape can be used. Sizes are unknown: compare shapes, do not measure."
 

@@ -9,22 +9,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
+import trimesh
 
 from scopemap.actions.export.exported_run import ExportedRun, read_exported
-from scopemap.errors import InputError, SettingsError, reporting
+from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
+from scopemap.report.measured_surface import drawn, measure_errors, measured_depth, measured_mesh
 
-_DRAWS, _TAIL_PERCENT = 2000, 2.5
-_PIXEL_ERROR_PX = 1.0
-_DEPTH_ERROR = 0.05
-"""Standard deviation of a depth over the depth, where the run estimated none: the limit of a good surface."""
-_ASSUMED_FOCAL_ERROR = 0.15
-"""Of a focal length by an assumed field of view: 70 degrees stand for 60 to 83."""
-_SCALE_ERROR = {"measured": 0.02, "calibrated": 0.1}
-"""Of a scale by measured depth; by a stated range of depth or by a network that was trained on metric depth."""
+_REFERENCE_ROW, _FIRST_ROW = 3, 9
+"""Of the drawn numbers: 0 to 2 are what all share, then three for each point."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +39,10 @@ class Measure:
     def __str__(self) -> str:
         if not np.isfinite(self.value):
             return f"{self.what}: none, the surface has a gap between the points"
-        return f"{self.what}: {self.value:.3g} {self.unit} ({self.low:.3g} to {self.high:.3g})"
+        value, low, high = (
+            np.format_float_positional(float(f"{one:.3g}"), trim="-") for one in (self.value, self.low, self.high)
+        )
+        return f"{self.what}: {value} {self.unit} ({low} to {high})"
 
 
 @dataclass(frozen=True)
@@ -58,12 +57,15 @@ class _Picked:
 
 @dataclass(frozen=True)
 class _Errors:
-    """Draws of what all measures of a frame share: depth of the whole frame, focal length and scale, (D,) factors."""
+    """Draws of what all measures of a frame share: depth of the whole frame, focal length and scale, (D,) factors.
+
+    sizes : from `measure_errors`.
+    """
 
     depth: np.ndarray
     focal: np.ndarray
     scale: np.ndarray
-    generator: np.random.Generator
+    sizes: dict[str, Any]
 
 
 def measure(
@@ -84,29 +86,31 @@ def measure(
             f"{folder}: {run.scale}; give two points as a reference: measures are then multiples of their distance, "
             "and millimetres where that is given, too"
         )
-    pose = _pose(run, frame)
-    picked, errors = _picked(run, frame, pose, pixels), _drawn(run)
+    pose, mesh = _pose(run, frame), measured_mesh(run)
+    picked, errors = _picked(run, mesh, frame, pose, pixels), _drawn(run)
     unit, divisor, draws = "mm", 1.0, errors.scale
     if reference is not None:
-        known = _picked(run, frame, pose, reference)
+        known = _picked(run, mesh, frame, pose, reference)
         divisor = _straight(np.stack([point.position for point in known.points]))
         if divisor <= 0:
             raise InputError("the reference's two points are the same")
-        draws = 1 / _relative(run, known, errors, _straight)
+        draws = 1 / _relative(run, known, errors, _straight, _REFERENCE_ROW)
         unit = "times the reference" if reference_mm is None else "mm"
         divisor /= reference_mm or 1.0
     if len(pixels) > 2:
-        area = area_inside(run.mesh, pixels, run.camera, pose)
+        area = area_inside(mesh, pixels, run.camera, pose)
         if area <= 0:
             raise InputError(f"no surface is seen inside the polygon of frame {frame}")
-        relative = _relative(run, picked, errors, _flat_area) * draws**2
+        relative = _relative(run, picked, errors, _flat_area, _FIRST_ROW) * draws**2
         unit = {"mm": "mm2"}.get(unit, "times the reference's square")
-        return [_measure("area", area / divisor**2, relative, unit)]
-    relative = _relative(run, picked, errors, _straight) * draws
+        return [_measure("area", area / divisor**2, relative, unit, errors.sizes["tail_percent"])]
+    relative = _relative(run, picked, errors, _straight, _FIRST_ROW) * draws
     straight = _straight(np.stack([point.position for point in picked.points]))
-    along = path_length(run.mesh, *picked.points)
+    along = path_length(mesh, *picked.points)
     found = {"straight": straight, "along the surface": along}
-    return [_measure(what, value / divisor, relative, unit) for what, value in found.items()]
+    return [
+        _measure(what, value / divisor, relative, unit, errors.sizes["tail_percent"]) for what, value in found.items()
+    ]
 
 
 def _pose(run: ExportedRun, frame: int) -> np.ndarray:
@@ -118,12 +122,12 @@ def _pose(run: ExportedRun, frame: int) -> np.ndarray:
     raise InputError(f"frame {frame} is not in the result {run.path}: {where}")
 
 
-def _picked(run: ExportedRun, frame: int, pose: np.ndarray, pixels: np.ndarray) -> _Picked:
+def _picked(run: ExportedRun, mesh: trimesh.Trimesh, frame: int, pose: np.ndarray, pixels: np.ndarray) -> _Picked:
     points, depths = [], []
     for pixel in pixels:
         inside = (pixel >= -0.5).all() and (pixel < [run.camera.width - 0.5, run.camera.height - 0.5]).all()
         ray = run.camera.unproject(pixel)
-        found = meet_surface(run.mesh, pose[:3, 3], pose[:3, :3] @ ray) if inside else None
+        found = meet_surface(mesh, pose[:3, 3], pose[:3, :3] @ ray) if inside else None
         if found is None:
             size = f"{run.camera.width}x{run.camera.height} px"
             raise InputError(f"no surface at pixel {pixel[0]:g},{pixel[1]:g} of frame {frame}, whose size is {size}")
@@ -135,37 +139,34 @@ def _picked(run: ExportedRun, frame: int, pose: np.ndarray, pixels: np.ndarray) 
 
 def _depth_errors(run: ExportedRun, frame: int, pixels: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
     """Return relative standard deviations: the run's own, or what surface and frame differ by where that is more."""
-    own, sigma = run.depth.read(frame), run.depth.read_sigma(frame)
-    column, row = np.round(pixels).astype(int).T
-    errors = np.full(len(pixels), np.nan) if own is None else np.abs(own[row, column] - depth_mm) / depth_mm
-    if own is not None and sigma is not None:
-        errors = np.fmax(errors, sigma[row, column] / depth_mm)
-    return np.where(np.isfinite(errors), errors, _DEPTH_ERROR)
+    errors, coded = np.full(len(pixels), np.nan), measured_depth(run, frame)
+    if coded is not None:
+        shares = np.array([coded.shape[1] / run.camera.width, coded.shape[0] / run.camera.height])
+        column, row = np.floor((pixels + 0.5) * shares).astype(int).T
+        upper, lower, level = coded[row, column].astype(int).T
+        units = np.where(upper + lower > 0, 256 * upper + lower, np.nan).astype(np.float32)
+        own = units * np.float32(run.depth.scale_mm)
+        errors = np.fmax(np.abs(own - depth_mm), run.depth.sigma_shares[level] * own) / depth_mm
+    return np.where(np.isfinite(errors), errors, measure_errors(run)["depth"])
 
 
 def _drawn(run: ExportedRun) -> _Errors:
-    with reporting(f"cannot read what {run.path}/provenance.json says of camera and scale"):
-        camera, scale = run.provenance["camera"], run.provenance.get("scale") or {}
-        focal = float(camera.get("focal_sigma_px") or 0.0) / run.camera.fx
-        if camera.get("origin") == "assumed":
-            focal = max(focal, _ASSUMED_FOCAL_ERROR)
-        kind: Literal["measured", "calibrated"] = "measured" if scale.get("measured") else "calibrated"
-    generator = np.random.default_rng(0)
-    normal = generator.standard_normal((3, _DRAWS))
-    return _Errors(normal[0], 1 + focal * normal[1], np.exp(_SCALE_ERROR[kind] * normal[2]), generator)
+    sizes = measure_errors(run)
+    depth, focal, scale = drawn(0, 3, sizes["draws"])
+    return _Errors(depth, 1 + sizes["focal"] * focal, np.exp(sizes["scale"] * scale), sizes)
 
 
 def _relative(
-    run: ExportedRun, picked: _Picked, errors: _Errors, figure: Callable[[np.ndarray], np.ndarray]
+    run: ExportedRun, picked: _Picked, errors: _Errors, figure: Callable[[np.ndarray], np.ndarray], first: int
 ) -> np.ndarray:
-    """Return draws (D,) of a figure of the points over its value without errors.
+    """Return draws (D,) of a figure of the points over its value without errors; first : row of the drawn numbers.
 
     Half of the variance of a depth is that of the whole frame, half its own.
     """
     count = len(picked.pixels)
-    own = errors.generator.standard_normal((3, _DRAWS, count))
+    own = drawn(first, 3 * count, errors.sizes["draws"]).reshape(3, count, -1).transpose(0, 2, 1)
     depths = picked.depth_mm * np.exp(picked.depth_error * (errors.depth[:, None] + own[0]) / np.sqrt(2))
-    rays = run.camera.unproject(picked.pixels + _PIXEL_ERROR_PX * np.stack([own[1], own[2]], -1))
+    rays = run.camera.unproject(picked.pixels + errors.sizes["pixel_px"] * np.stack([own[1], own[2]], -1))
     rays[..., :2] /= errors.focal[:, None, None]
     points = rays * depths[..., None]
     exact = run.camera.unproject(picked.pixels) * picked.depth_mm[:, None]
@@ -183,6 +184,6 @@ def _flat_area(points: np.ndarray) -> Any:
     return 0.5 * np.linalg.norm(np.cross(from_first[..., :-1, :], from_first[..., 1:, :]).sum(axis=-2), axis=-1)
 
 
-def _measure(what: str, value: float, relative: np.ndarray, unit: str) -> Measure:
-    low, high = np.percentile(relative, [_TAIL_PERCENT, 100 - _TAIL_PERCENT])
+def _measure(what: str, value: float, relative: np.ndarray, unit: str, tail_percent: float) -> Measure:
+    low, high = np.percentile(relative, [tail_percent, 100 - tail_percent])
     return Measure(what, float(value), float(value * min(low, 1.0)), float(value * max(high, 1.0)), unit)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import webbrowser
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,15 +15,26 @@ from scopemap.cli.options import RunFolder
 def view(
     run: RunFolder,
     port: Annotated[int, typer.Option(min=0, max=65535, metavar="PORT", help="0: any free port.")] = 0,
+    turntable: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a film of the surface turning once, .mp4, .mkv or .webm, and end."),
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
-    """Show a run's page with all triangles and pictures at localhost, until Ctrl-C; nothing is written."""
-    from scopemap.report.page import full_page
-    from scopemap.report.serving import LocalServer
+    """Show a run's page with all triangles and pictures at localhost, until Ctrl-C.
 
-    page = full_page(run).encode()
-    server = LocalServer({"/": lambda: ("text/html; charset=utf-8", page)}, port=port)
-    typer.echo(f"{run}: {server.url} ({len(page) / 1e6:.1f} MB); Ctrl-C ends it")
+    Nothing is written but measurements.json, where you measure on the page and save.
+    """
+    if turntable is not None:
+        from scopemap.report.turntable import write_turntable
+
+        write_turntable(run, turntable)
+        typer.echo(f"{turntable}: {turntable.stat().st_size / 1e6:.1f} MB")
+        return
+    from scopemap.report.page import serve_view
+
+    server = serve_view(run, port)
+    typer.echo(f"{run}: {server.url} until Ctrl-C")
     if browser:
         webbrowser.open(server.url)
     try:

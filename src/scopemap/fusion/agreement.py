@@ -15,7 +15,10 @@ from scopemap.depth.estimate import PerceptualDistance
 from scopemap.frame import Frame
 from scopemap.fusion.albedo import lit_by_lamp
 from scopemap.geometry.rendering import Rendering, render_mesh
+from scopemap.geometry.se3 import inverse, transform
 from scopemap.geometry.similarity import structural_similarity
+
+_SAME_SURFACE = 0.02  # between a vertex and what is rendered at its pixel, of its depth: it is not hidden
 
 
 class FrameAgreement(NamedTuple):
@@ -112,3 +115,28 @@ def surface_agreement(mesh: trimesh.Trimesh, settings: FusionSettings, frames: l
             seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
             agreements.append(compare_with_frame(mesh, *seen, albedo=settings.colours == "albedo")[0])
     return agreement_figures(agreements) if agreements else {}
+
+
+def vertex_sigmas(mesh: trimesh.Trimesh, frames: list[Frame]) -> np.ndarray:
+    """Return the standard deviation of each vertex along the lines of sight, (V,) float32, mm; NaN: no frame sees it.
+
+    It is the root mean square, over the frames that see the vertex, of what their depth and the surface differ by or of
+    the depth's own standard deviation where that is larger. Many frames do not make it smaller: their errors are alike.
+    """
+    total, count = np.zeros(len(mesh.vertices)), np.zeros(len(mesh.vertices))
+    for frame in frames if len(mesh.faces) else []:
+        if frame.T_world_camera is None or frame.depth_mm is None:
+            continue
+        z = transform(inverse(frame.T_world_camera), np.asarray(mesh.vertices))
+        shown = render_mesh(mesh, frame.camera, frame.T_world_camera).depth_mm
+        pixels = frame.camera.project(z)
+        limits = [frame.camera.width - 0.5, frame.camera.height - 0.5]
+        inside = np.flatnonzero(((pixels >= -0.5) & (pixels < limits)).all(axis=1))
+        (column, row), z_mm = np.round(pixels[inside]).astype(int).T, z[inside, 2]
+        error = np.abs(np.asarray(frame.depth_mm)[row, column] - z_mm)
+        if frame.depth_sigma_mm is not None:
+            error = np.fmax(error, np.asarray(frame.depth_sigma_mm)[row, column])
+        seen = frame.valid[row, column] & np.isfinite(error) & (np.abs(shown[row, column] / z_mm - 1) < _SAME_SURFACE)
+        total[inside[seen]] += error[seen] ** 2
+        count[inside[seen]] += 1
+    return np.sqrt(np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0)).astype(np.float32)

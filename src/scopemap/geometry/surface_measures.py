@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import trimesh
 from scipy.sparse import coo_array
@@ -21,7 +20,6 @@ Lengths are then up to 1 % too long, by edges alone up to 40 %.
 """
 _CELLS = 400  # along the longer side of a polygon, whose area is measured
 _BREAK = 1.05  # between neighbouring cells: farther apart lie two surfaces
-_SHIFT, _FRACTIONS = 4, 16  # OpenCV's fractions of pixels
 _INSIDE_EDGE = -1e-9
 
 
@@ -87,11 +85,18 @@ def area_inside(
     around = np.stack([depth_mm[:-1, :-1], depth_mm[1:, 1:], depth_mm[1:, :-1], depth_mm[:-1, 1:]])
     whole = around.max(axis=0) < _BREAK * around.min(axis=0)  # False where one is unknown
     # Cell (i, j) has its middle at pixel (i, j) + 0.5, in the polygon moved by half a pixel.
-    outline = ((polygon_px - low) * scale).round(3)
-    inside = cv2.fillPoly(
-        np.zeros((height - 1, width - 1), np.uint8), [np.round(outline * _FRACTIONS).astype(np.int32)], 1, shift=_SHIFT
-    )
-    return float(area[whole & (inside > 0)].sum())
+    inside = _cells_inside((polygon_px - low) * scale, height - 1, width - 1)
+    return float(area[whole & inside].sum())
+
+
+def _cells_inside(polygon: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return which cells' middles, at whole numbers, are inside a polygon (N, 2): to their right, odd crossings."""
+    x, y, inside = np.arange(width), np.arange(height)[:, None], np.zeros((height, width), bool)
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        crossed = (a[1] > y) != (b[1] > y)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inside ^= crossed & (x < (b[0] - a[0]) * ((y - a[1]) / (b[1] - a[1])) + a[0])
+    return inside
 
 
 def _corners(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -152,7 +152,7 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
             return trimesh.Trimesh()
         # trimesh leaves properties that it does not know in the raw table.
         vertices = mesh.metadata["_ply_raw"]["vertex"]["data"]
-        for name in {"confidence", "moving"} & set(vertices.dtype.names):
+        for name in sorted({"confidence", "moving", "sigma_mm"} & set(vertices.dtype.names)):
             mesh.vertex_attributes[name] = np.array(vertices[name])
         if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
             raise ValueError("it is damaged: a face has a vertex that is not there")

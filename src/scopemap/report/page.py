@@ -6,6 +6,7 @@ import html
 import json
 import re
 from collections.abc import Sequence
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,17 @@ from scopemap.io.checksums import SUMS, write_checksums
 from scopemap.io.json_numbers import without_nan
 from scopemap.io.run_folder import RunFolder
 from scopemap.report.frame_pictures import FOLDER as PICTURES
-from scopemap.report.page_data import MOST_FACES, page_data, shown_meshes
+from scopemap.report.measured_surface import MOST_FACES
+from scopemap.report.page_data import MEASUREMENTS, page_data, read_measurements, shown_meshes
+from scopemap.report.serving import LocalServer
 from scopemap.report.shown_mesh import base64_of
 from scopemap.report.summary_picture import summary_picture
 
 PAGE, PICTURE = "report.html", "summary.png"
-_SCRIPTS = ("matrices", "surface_view", "frame_panels", "curves", "words", "page", "gestures")
+_SCRIPTS = (
+    *("matrices", "surface_view", "frame_panels", "curves", "words"),
+    *("measuring", "measure_by_hand", "page", "gestures"),
+)
 _LICENCES = (
     "Licences: scopemap and its depth network scopenet are under Apache-2.0. Weights of other networks have licences "
     "of their own, named by `scopemap models list`; some forbid commercial use. The video and its data set keep theirs."
@@ -71,19 +77,49 @@ def full_page(folder: Path | str) -> str:
     Raises `InputError` where the folder holds no finished run.
     """
     run = RunFolder(folder).checked()
-    return page_html([page_data(run, shown_meshes(run, None), share=float("inf"))])
+    return page_html([page_data(run, shown_meshes(run, None), share=float("inf"))], served=True)
 
 
-def page_html(runs: list[dict[str, Any]]) -> str:
-    """Return the page of runs, each from `page_data`."""
+def keep_measurements(folder: Path | str, sent: bytes) -> None:
+    """Write what was measured by hand on a page, a list as JSON, as `measurements.json` into a run's folder.
+
+    Raises `InputError` where it is no such list, or cannot be written.
+    """
+    file = Path(folder) / MEASUREMENTS
+    with reporting(f"cannot write {file}"):
+        found = json.loads(sent)
+        if not isinstance(found, list):
+            raise ValueError("what was measured is no list")
+        file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+def serve_view(folder: Path | str, port: int = 0) -> LocalServer:
+    """Serve the full page of a run, whose measurements it keeps beside the result, until it is closed.
+
+    Raises `InputError` where the folder holds no finished run, or the port is taken.
+    """
+    page = full_page(folder).encode()
+    return LocalServer(
+        {
+            "/": lambda: ("text/html; charset=utf-8", page),
+            f"/{MEASUREMENTS}": lambda: ("application/json", json.dumps(read_measurements(Path(folder))).encode()),
+        },
+        port=port,
+        uploads={f"/{MEASUREMENTS}": partial(keep_measurements, folder)},
+    )
+
+
+def page_html(runs: list[dict[str, Any]], *, served: bool = False) -> str:
+    """Return the page of runs, each from `page_data`; served : by `view`, which takes its measurements."""
     levels = np.arange(256, dtype=np.uint8)
     maps = {"turbo": cv2.COLORMAP_TURBO, "ramp": cv2.COLORMAP_VIRIDIS}
     colours = {name: base64_of(cv2.applyColorMap(levels, number)[:, 0, ::-1], "u1") for name, number in maps.items()}
-    content = without_nan({"runs": runs, "licences": _LICENCES} | colours)
+    content = without_nan({"runs": runs, "licences": _LICENCES, "served": served} | colours)
     names = ", ".join(run["name"] for run in runs)
     parts = {
         # A file's name may hold bytes that are no UTF-8; in the data JSON escapes them.
         "title": html.escape(names.encode("utf-8", "replace").decode("utf-8"), quote=False),
+        "connect": "; connect-src 'self'" if served else "",
         "style": _asset("page.css"),
         "script": "\n".join(_asset(f"{name}.js") for name in _SCRIPTS),
         # "<" would end the script that holds the data, wherever a name in it contains "</script>".

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from base64 import b64encode
 from collections.abc import Sequence
@@ -21,30 +22,29 @@ from scopemap.io.run_folder import RunFolder
 from scopemap.io.run_input import PLACES, places_of_input
 from scopemap.notices import notices_of
 from scopemap.report.losses import losses
-from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, simplified
+from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
+from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
 from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.report.verdict import Result, frames_per_s, scale_is_known, scale_source, verdict
 from scopemap.trajectory.frame_table import NOT_USED
 from scopemap.trajectory.trajectory import Trajectory
 
-MOST_FACES = 100_000
-_FACES_OF_OTHERS = 20_000
 _MOST_MAPS = 8
+MEASUREMENTS = "measurements.json"
 _MOST_BYTES = 7_500_000
 """Of pictures, before base64, which makes them a third longer."""
-_DEPTH_WIDTH_PX = 160
 _LOOKED_AT = 25
 _CURVES = {"inliers": "inlier_share", "agreement": "correlation", "scale": "depth_scale", "moving": "moving_share"}
-_LEVELS = 254
 
 
 @dataclass(frozen=True)
 class _Picture:
-    """A frame with a picture: its row, files' contents, and its depth (h, w), mm, or None."""
+    """A frame with a picture: its row, files' contents (depth: of `measured_depth`), and depth (h, w), mm, or None."""
 
     row: int
     jpg: bytes
     mask: bytes
+    depth: bytes
     depth_mm: np.ndarray | None
 
 
@@ -56,7 +56,7 @@ def shown_meshes(run: Result, most_faces: int | None) -> list[trimesh.Trimesh]:
     submaps: Sequence[Result] = run.submaps[:_MOST_MAPS]
     if most_faces is None:
         return [submap.mesh for submap in submaps]
-    most = [most_faces] + [min(most_faces, _FACES_OF_OTHERS)] * (_MOST_MAPS - 1)
+    most = [most_faces] + [min(most_faces, FACES_OF_OTHERS)] * (_MOST_MAPS - 1)
     return [simplified(submap.mesh, faces) for submap, faces in zip(submaps, most, strict=False)]
 
 
@@ -65,8 +65,7 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
 
     meshes : from `shown_meshes`. name : by default that of the input. share : of the page's size that is the run's.
     """
-    camera = run.camera
-    pictures = _within_budget(_pictures(run), share * _MOST_BYTES)
+    camera, pictures = run.camera, _within_budget(_pictures(run), share * _MOST_BYTES)
     near_mm, far_mm = _depth_range([p.depth_mm for p in pictures if p.depth_mm is not None])
     source = str(run.provenance.get("input", ""))
     found = verdict(run)
@@ -81,7 +80,12 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "frames": _frames(run),
         "depth_range": [near_mm, far_mm],
-        "pictures": [_picture_data(picture, near_mm, far_mm) for picture in pictures],
+        "pictures": [_picture_data(p) for p in pictures],
+        "depth_unit_mm": float(np.float32(run.depth.scale_mm)),
+        "sigma_shares": run.depth.sigma_shares.astype(np.float64).tolist(),
+        # Runs that share a page have fewer triangles than `measure` measures on.
+        "measuring": share >= 1,
+        "measurements": read_measurements(run.path),
         "maps": _maps(run, meshes, camera, pictures),
         "losses": [
             {"row": loss.first, "when": loss.when, "frames": loss.frames, "cause": loss.cause, "advice": loss.advice}
@@ -117,11 +121,20 @@ def _frames(run: RunFolder) -> dict[str, Any]:
         "index": base64_of(frames["index"], "i4"),
         "time_s": base64_of(frames["time_s"], "f4"),
         "place": base64_of(place, "i2"),
-        "pose": base64_of(poses, "f4"),
+        "pose": base64_of(poses, "f8"),
         "curves": {name: base64_of(values, "f4") for name, values in curves.items()},
         "reasons": different,
         "reason": base64_of(np.array([number_of[reason] for reason in reasons]), "i2"),
     }
+
+
+def read_measurements(folder: Path) -> list[Any]:
+    """Return what was measured by hand on a page and kept beside the result; [] where nothing was, or it is damaged."""
+    try:
+        found = json.loads((folder / MEASUREMENTS).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return []
+    return found if isinstance(found, list) else []
 
 
 def _pose_of(submap: RunFolder) -> dict[int, np.ndarray]:
@@ -135,23 +148,18 @@ def _pictures(run: RunFolder) -> list[_Picture]:
     for index in run.pictured:
         picture, mask = run.picture_file(index), run.mask_file(index)
         if index in used and mask.is_file():
-            depth_mm = _small_depth(run.depth.read(index))
-            found.append(_Picture(used[index], picture.read_bytes(), mask.read_bytes(), depth_mm))
+            coded, depth, depth_mm = measured_depth(run, index), b"", None
+            if coded is not None:
+                depth = cv2.imencode(".png", coded[..., ::-1])[1].tobytes()
+                units = 256.0 * coded[..., 0] + coded[..., 1]
+                depth_mm = np.where(units > 0, units * run.depth.scale_mm, np.nan).astype(np.float32)
+            found.append(_Picture(used[index], picture.read_bytes(), mask.read_bytes(), depth, depth_mm))
     return found
-
-
-def _small_depth(depth_mm: np.ndarray | None) -> np.ndarray | None:
-    if depth_mm is None:
-        return None
-    height, width = depth_mm.shape
-    shown = min(width, _DEPTH_WIDTH_PX)
-    size = (shown, max(1, round(height * shown / width)))
-    return cv2.resize(depth_mm, size, interpolation=cv2.INTER_NEAREST)
 
 
 def _within_budget(pictures: list[_Picture], most_bytes: float) -> list[_Picture]:
     """Leave every second picture out until the others fit on the page."""
-    sizes = [len(p.jpg) + len(p.mask) + (0 if p.depth_mm is None else p.depth_mm.size) for p in pictures]
+    sizes = [len(p.jpg) + len(p.mask) + len(p.depth) for p in pictures]
     while len(pictures) > 1 and sum(sizes) > most_bytes:
         pictures, sizes = pictures[::2], sizes[::2]
     return pictures
@@ -167,15 +175,9 @@ def _depth_range(depths_mm: list[np.ndarray]) -> tuple[float, float]:
     return round(near_mm, 3), round(max(far_mm, 1.2 * near_mm), 3)
 
 
-def _picture_data(picture: _Picture, near_mm: float, far_mm: float) -> dict[str, Any]:
-    """Return a picture for the page; depth: 1..255 = near..far, logarithmic, 0 = unknown."""
-    data = {"row": picture.row, "jpg": b64encode(picture.jpg).decode(), "mask": b64encode(picture.mask).decode()}
-    if picture.depth_mm is not None:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            level = 1 + _LEVELS * np.log(picture.depth_mm / near_mm) / np.log(far_mm / near_mm)
-        code = np.where(np.isnan(level), 0, np.clip(np.round(level), 1, 255)).astype(np.uint8)
-        data["depth"] = b64encode(cv2.imencode(".png", code)[1].tobytes()).decode()
-    return data
+def _picture_data(picture: _Picture) -> dict[str, Any]:
+    files = {"jpg": picture.jpg, "mask": picture.mask, "depth": picture.depth}
+    return {"row": picture.row} | {name: b64encode(content).decode() for name, content in files.items()}
 
 
 def _maps(
@@ -191,7 +193,9 @@ def _maps(
         looking = [p for p in pictures if place[p.row] == number and p.depth_mm is not None]
         looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
         seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
-        data = mesh_data(mesh, seen, camera)
+        data = mesh_data(mesh, seen, camera) | {"errors": measure_errors(submap)}
+        if len(mesh.faces) > (most := MOST_FACES if number == 0 else FACES_OF_OTHERS):
+            data["measured"] = shape_data(simplified(mesh, most))
         facts = {"frames": len(pose_of), "all_faces": len(submap.mesh.faces)}
         found.append(data | facts | {"turn": turn.get(number, number), "inliers": inliers.get(number, "")})
     return found

@@ -15,6 +15,7 @@ Content = tuple[str, bytes]
 """A content type and bytes."""
 
 _ADDRESS = "127.0.0.1"
+_MOST_SENT = 1_000_000
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -28,6 +29,7 @@ class LocalServer:
     """Serves pages at http://localhost:PORT/ in threads of its own until it is closed.
 
     pages : by path, what returns a GET's content; None: not there yet (503). actions : by path, what a POST calls.
+    uploads : by path, what a POST calls with the bytes that were sent, at most 1 MB; an `InputError` there answers 400.
     port : 0: any free one. Requests that name another host, and those that pages of another origin send, are refused
     (403): a page in the web must not read an operation or press its buttons.
 
@@ -39,9 +41,10 @@ class LocalServer:
         pages: Mapping[str, Callable[[], Content | None]],
         actions: Mapping[str, Callable[[], None]] | None = None,
         port: int = 0,
+        uploads: Mapping[str, Callable[[bytes], None]] | None = None,
     ) -> None:
         try:
-            self._server = _Server((_ADDRESS, port), _handler(pages, actions or {}))
+            self._server = _Server((_ADDRESS, port), _handler(pages, actions or {}, uploads or {}))
         except (OSError, OverflowError) as error:
             raise InputError(f"cannot serve on port {port}: {error}; choose another one") from None
         self.url = f"http://localhost:{self._server.server_port}/"
@@ -68,7 +71,9 @@ def live_page() -> Content:
 
 
 def _handler(
-    pages: Mapping[str, Callable[[], Content | None]], actions: Mapping[str, Callable[[], None]]
+    pages: Mapping[str, Callable[[], Content | None]],
+    actions: Mapping[str, Callable[[], None]],
+    uploads: Mapping[str, Callable[[bytes], None]],
 ) -> type[BaseHTTPRequestHandler]:
     """Return the class that answers requests."""
 
@@ -89,10 +94,11 @@ def _handler(
         def do_POST(self) -> None:
             if not self._is_own():
                 return
-            action = actions.get(self.path)
+            action, upload = actions.get(self.path), uploads.get(self.path)
             if action is not None:
                 action()
-            self._answer(404 if action is None else 204, "text/plain", b"")
+            found = 404 if action is None else 204
+            self._answer(_taken(self, upload) if upload is not None else found, "text/plain", b"")
 
         def _is_own(self) -> bool:
             """Return whether the request is for this server and from its own page or no page; else refuse it."""
@@ -114,3 +120,15 @@ def _handler(
             """Log nothing."""
 
     return Handler
+
+
+def _taken(request: BaseHTTPRequestHandler, upload: Callable[[bytes], None]) -> int:
+    """Hand on what a request sends, and return the code of the answer."""
+    size = request.headers.get("Content-Length", "")
+    if not size.isdecimal() or int(size) > _MOST_SENT:
+        return 413
+    try:
+        upload(request.rfile.read(int(size)))
+    except InputError:
+        return 400
+    return 204

@@ -15,7 +15,8 @@ from scopemap.geometry.se3 import inverse
 
 _SAME_SURFACE = 0.1
 _CELLS_PER_FACE = 2.5  # faces of a surface that crosses a grid, times a cell's area, over its area
-_LARGEST_16_BIT = 65535
+LARGEST_LEVEL = 65535
+"""Of a position, in 16 bits."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,6 @@ def mesh_data(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCam
     positions: uint16 between `low` and `high`, mm. normals: int8. colours, confidence, moving, seen: uint8.
     faces: uint32.
     """
-    low, high = (np.zeros(3), np.ones(3)) if not len(mesh.vertices) else np.asarray(mesh.bounds)
-    spread = np.maximum(high - low, 1e-9)
     confidence, moving = (
         np.asarray(mesh.vertex_attributes.get(name, np.full(len(mesh.vertices), otherwise)), np.float64)
         for name, otherwise in (("confidence", 1.0), ("moving", 0.0))
@@ -97,14 +96,25 @@ def mesh_data(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCam
     seen = times_seen(mesh, frames, camera)
     return {
         "vertices": len(mesh.vertices),
-        "low": np.round(low, 4).tolist(),
-        "high": np.round(high, 4).tolist(),
-        "positions": base64_of(np.round((np.asarray(mesh.vertices) - low) / spread * _LARGEST_16_BIT), "u2"),
+        **shape_data(mesh),
         "normals": base64_of(np.round(127 * np.asarray(mesh.vertex_normals)), "i1"),
         "colours": base64_of(vertex_colours(mesh)[:, :3], "u1"),
         "confidence": base64_of(np.round(255 * np.clip(confidence.ravel(), 0, 1)), "u1"),
         "moving": base64_of(np.round(255 * np.clip(moving.ravel(), 0, 1)), "u1"),
         "seen": base64_of(np.round(255 * seen / max(len(frames), 1)), "u1"),
         "looked": len(frames),
-        "faces": base64_of(mesh.faces, "u4"),
     }
+
+
+def shape_data(mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """Return the part of `mesh_data` that is measured on: positions and faces."""
+    low, spread, levels = levels_of(mesh)
+    shape = {"low": low.tolist(), "spread": spread.tolist(), "high": (low + spread).tolist()}
+    return shape | {"positions": base64_of(levels, "u2"), "faces": base64_of(mesh.faces, "u4")}
+
+
+def levels_of(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the lowest corner (3,) of a mesh, its size (3,), and its vertices (V, 3) as levels, 65535 of the size."""
+    low, high = (np.zeros(3), np.ones(3)) if not len(mesh.vertices) else np.asarray(mesh.bounds)
+    spread = np.maximum(high - low, 1e-9)
+    return low, spread, np.round((np.asarray(mesh.vertices) - low) / spread * LARGEST_LEVEL)

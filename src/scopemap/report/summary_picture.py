@@ -11,7 +11,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from scopemap.geometry.rendering import vertex_colours
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.geometry.rendering import render_mesh, vertex_colours
 from scopemap.io.decoding import read_decoded
 from scopemap.io.run_folder import RunFolder
 from scopemap.report.mesh_figures import (
@@ -24,9 +25,10 @@ from scopemap.report.mesh_figures import (
     outside_views,
     view_from_behind,
 )
+from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import SOFT, Sheet, rgb_of
 from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.report.verdict import Result, Verdict, verdict
+from scopemap.report.verdict import Result, Verdict, scale_is_known, verdict
 
 _CELL_PX, _GAP_PX, _HEAD_PX, _LABEL_PX = 384, 12, 104, 26
 _COLUMNS = 4
@@ -78,18 +80,42 @@ def _spread(run: RunFolder) -> list[int]:
 
 def _frames_row(run: RunFolder, frames: list[int]) -> dict[str, np.ndarray]:
     pictures = {f"frame {index}": read_decoded(run.picture_file(index), cv2.IMREAD_COLOR) for index in frames}
-    return {title: _fitted(picture[..., ::-1]) for title, picture in pictures.items() if picture is not None}
+    shown = {title: _fitted(picture[..., ::-1]) for title, picture in pictures.items() if picture is not None}
+    for title, index in zip(pictures, frames, strict=True):
+        if title in shown:
+            _scale_frame(run, index, shown[title])
+    return shown
+
+
+def _scale_frame(run: RunFolder, index: int, picture: np.ndarray) -> None:
+    depth_mm = run.depth.read(index) if run.scale_known else None
+    if depth_mm is not None:
+        _scale_at_median(picture, run.camera, depth_mm)
+
+
+def _scale_at_median(picture: np.ndarray, camera: PinholeCamera, depth_mm: np.ndarray) -> None:
+    """Draw a scale bar that holds at the median depth of a camera's picture, which is as wide as a cell."""
+    if np.isfinite(depth_mm).any():
+        median_mm = float(np.nanmedian(depth_mm))
+        draw_scale_bar(picture, camera.fx / median_mm * _CELL_PX / camera.width, f" at {median_mm:.3g} mm")
 
 
 def _depth_row(run: RunFolder, frames: list[int]) -> dict[str, np.ndarray]:
     """Return the depths in turbo, red near, blue far, of one range."""
-    depths = [depth for index in frames if (depth := run.depth.read(index)) is not None]
+    kept = [index for index in frames if run.depth.has(index)]
+    depths = [depth for index in kept if (depth := run.depth.read(index)) is not None]
     known = np.concatenate([np.empty(0, np.float32), *(depth[np.isfinite(depth)] for depth in depths)])
     if not known.size:
         return {}
     near, far = np.log(np.percentile(known, [1, 99]))
-    titles = ["depth: red near, blue far, one range"] + [" " * place for place in range(1, len(depths))]
-    return {title: _fitted(_turbo(depth, near, far)) for title, depth in zip(titles, depths, strict=True)}
+    ends = ("near", f"{np.exp(far - near):.3g} times as far")
+    if run.scale_known:
+        ends = (f"{np.exp(near):.3g} mm", f"{np.exp(far):.3g} mm")
+    titles = [f"depth: red {ends[0]}, blue {ends[1]}"] + [" " * place for place in range(1, len(depths))]
+    shown = {title: _fitted(_turbo(depth, near, far)) for title, depth in zip(titles, depths, strict=True)}
+    for picture, index in zip(shown.values(), kept, strict=True):
+        _scale_frame(run, index, picture)
+    return shown
 
 
 def _turbo(depth_mm: np.ndarray, near: float, far: float) -> np.ndarray:
@@ -108,17 +134,28 @@ def _mesh_row(run: Result, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
     views = {"surface and camera path": outside, "from the other side": other}
     views["from behind the start"] = view_from_behind(poses[0], path)
     pictures = {
-        title: _with_path(mesh if view is other else _opened(mesh, view), view, path) for title, view in views.items()
+        title: _with_path(mesh if view is other else _opened(mesh, view), view, path, scale_is_known(run.provenance))
+        for title, view in views.items()
     }
     middle = inside_view(poses[len(poses) // 2])
-    inside = mesh_picture(_opened(mesh, middle), middle, smooth=False)
-    return pictures | {"from the middle of the path": _fitted(inside)}
+    opened = _opened(mesh, middle)
+    inside = _fitted(mesh_picture(opened, middle, smooth=False))
+    if scale_is_known(run.provenance):
+        seen = render_mesh(opened, middle.camera, middle.T_world_camera)
+        _scale_at_median(inside, middle.camera, seen.depth_mm)
+    return pictures | {"from the middle of the path": inside}
 
 
-def _with_path(mesh: trimesh.Trimesh, view: MeshView, path_mm: np.ndarray) -> np.ndarray:
+def _with_path(mesh: trimesh.Trimesh, view: MeshView, path_mm: np.ndarray, scaled: bool) -> np.ndarray:
+    """Return a picture of a mesh and a path; scaled : with a scale bar that holds at the middle of the mesh."""
     picture = mesh_picture(mesh, view, smooth=False)
     draw_path(picture, view, path_mm, ESTIMATE_COLOUR)
-    return _fitted(cropped(picture))
+    part = cropped(picture)
+    shown = _fitted(part)
+    if scaled:
+        depth_mm = float(view.project(np.asarray(mesh.bounds).mean(axis=0))[0][2])
+        draw_scale_bar(shown, view.camera.fx / depth_mm * shown.shape[1] / part.shape[1], " at its middle")
+    return shown
 
 
 def _submap_rows(run: Result, meshes: Sequence[trimesh.Trimesh]) -> list[dict[str, np.ndarray]]:
@@ -134,7 +171,7 @@ def _submap_rows(run: Result, meshes: Sequence[trimesh.Trimesh]) -> list[dict[st
             view = outside_views(mesh, poses[0], poses[:, :3, 3])["from outside"]
             title = f"{submap.name}: frames {submap.first} to {submap.last}"
             title = ", ".join(filter(None, (title, submap.inliers, "most doubtful" * (submap is worst))))
-            shown[title] = _with_path(_opened(mesh, view), view, poses[:, :3, 3])
+            shown[title] = _with_path(_opened(mesh, view), view, poses[:, :3, 3], scale_is_known(run.provenance))
     titles = list(shown)
     return [{t: shown[t] for t in titles[row : row + _COLUMNS]} for row in range(0, len(titles), _COLUMNS)]
 

@@ -140,7 +140,7 @@ def _sentence(run: Result) -> str:
     if not len(run.mesh.faces):
         parts.append("no surface")
     elif "coverage_mean" in surface:
-        parts.append(f"surface covers {_percent(surface['coverage_mean'])} of what was seen")
+        parts.append(f"surface covers {_percent(surface['coverage_mean'])} of its own pictures, not of the organ")
     return "; ".join(parts)
 
 
@@ -182,8 +182,8 @@ def _of_surface(run: Result) -> list[Reason]:
     surface, found = run.provenance.get("surface") or {}, []
     if "coverage_mean" in surface:
         coverage = float(surface["coverage_mean"])
-        text = f"The surface covers {_percent(coverage)} of what its frames show"
-        text += f" (worst frame: {_percent(float(surface['coverage_least']))})."
+        text = f"The surface covers {_percent(coverage)} of the tissue in its own pictures (worst picture: "
+        text += f"{_percent(float(surface['coverage_least']))}). How much of the organ the camera saw is not known."
         found.append(Reason("surface-coverage", _level(-coverage, -GOOD_COVERAGE, -LEAST_COVERAGE), text))
     if "depth_error" in surface:
         error = float(surface["depth_error"])

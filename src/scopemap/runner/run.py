@@ -15,7 +15,7 @@ import numpy as np
 from numba.core.event import TimingListener, register
 
 from scopemap.frame import Frame
-from scopemap.fusion.agreement import surface_agreement
+from scopemap.fusion.agreement import surface_agreement, vertex_sigmas
 from scopemap.fusion.finish import finished
 from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
 from scopemap.fusion.surface_fusion import FusedSurface, depth_notices
@@ -212,6 +212,8 @@ class _Finishing:
         fused = replace(fused, mesh=self.run.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
         fused.mesh.vertex_attributes["moving"] = moving.shares(fused.mesh.vertices).astype(np.float32)
         agreement = self.run.clock.timed("check surface", surface_agreement, fused.mesh, fused.settings, checked.frames)
+        sigmas_mm = self.run.clock.timed("check surface", vertex_sigmas, fused.mesh, checked.frames)
+        fused.mesh.vertex_attributes["sigma_mm"] = sigmas_mm
         frames = frames_of_submap(number, submaps, self.frames)
         provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
         notices = self.notices + motion_notices(frames, config)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.rendering import vertex_colours
 from scopemap.io.decoding import write_encoded
 from scopemap.io.run_folder import RunFolder
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
 
 class ExportedRun(RunFolder):
@@ -33,6 +34,13 @@ class ExportedRun(RunFolder):
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """The vertices of the mesh, (V, 3) float64, world mm, and their colours, (V, 3) uint8 sRGB."""
         return np.asarray(self.mesh.vertices, np.float64).reshape(-1, 3), vertex_colours(self.mesh)[:, :3]
+
+    def vertex_attributes(self, unit: Unit) -> dict[str, Any]:
+        """Return numbers of each vertex, (V,) float32: confidence, moving, sigma_mm, whose name has the unit."""
+        known: dict[str, Any] = {name: np.asarray(x, np.float32) for name, x in self.mesh.vertex_attributes.items()}
+        if "sigma_mm" in known:
+            known[f"sigma_{unit}"] = known.pop("sigma_mm") / np.float32(MM_PER_UNIT[unit])
+        return known
 
     def tracked_frames(self) -> Iterator[Frame]:
         """Yield the tracked frames in order, rectified and masked, as `frames_again` has them.

@@ -31,7 +31,7 @@ _THICKNESS = 0.1  # across the surface, of the scale along it
 def write_points(run: ExportedRun, file: Path, unit: Unit) -> None:
     """Write the vertices of the surface with their colours and normals as binary PLY without faces."""
     points, normals, colours = _points_of(run, unit)
-    attributes: dict[str, Any] = dict(run.mesh.vertex_attributes) | {
+    attributes: dict[str, Any] = run.vertex_attributes(unit) | {
         name: normals[:, column].astype(np.float32) for column, name in enumerate(("nx", "ny", "nz"))
     }
     cloud = trimesh.Trimesh(points, vertex_colors=colours, vertex_attributes=attributes, process=False)

@@ -104,5 +104,5 @@ def _surface_of(run: ExportedRun, unit: Unit, axes: Axes) -> trimesh.Trimesh:
     if not len(run.mesh.faces):
         raise InputError(f"{run.path}: the run has no surface to export")
     vertices = run.mesh.vertices @ _R_FILE_WORLD[axes].T / MM_PER_UNIT[unit]
-    colours, measured = vertex_colours(run.mesh), dict(run.mesh.vertex_attributes)  # `confidence` and `moving`
-    return trimesh.Trimesh(vertices, run.mesh.faces, vertex_colors=colours, vertex_attributes=measured, process=False)
+    colours, attributes = vertex_colours(run.mesh), run.vertex_attributes(unit)
+    return trimesh.Trimesh(vertices, run.mesh.faces, vertex_colors=colours, vertex_attributes=attributes, process=False)

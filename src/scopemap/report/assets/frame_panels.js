@@ -39,6 +39,17 @@ function differenceColour(share) {
   return s < 0 ? [40 + 205 * rest, 90 + 155 * rest, 200 + 45 * rest] : [200 + 45 * rest, 50 + 195 * rest, 40 + 205 * rest];
 }
 
+// A bar of a round length, about a quarter of a canvas, which is so many px per mm; where: at which distance.
+function drawScaleBar(canvas, pxPerMm, where) {
+  const { width, height } = canvas, context = canvas.getContext("2d"), unit = width / 320;
+  const mm = roundLength(pxPerMm, 0.25 * width), px = mm * pxPerMm, words = `${short(mm)} mm ${where}`;
+  Object.assign(context, { font: `${15 * unit}px system-ui, sans-serif`, textAlign: "left", fillStyle: "#000a" });
+  context.fillRect(4 * unit, height - 36 * unit, Math.max(px, context.measureText(words).width) + 10 * unit, 32 * unit);
+  context.fillStyle = "#fff";
+  context.fillText(words, 9 * unit, height - 18 * unit);
+  context.fillRect(9 * unit, height - 11 * unit, px, 3 * unit);
+}
+
 class FramePanels {
   constructor(run, view, turbo) {
     Object.assign(this, { run, view, turbo, decoded: new Map() });
@@ -69,9 +80,10 @@ class FramePanels {
   draw(images, mesh, pose, { showMask, far }) {
     const [width, height] = this.size, canvas = (id) => document.getElementById(id);
     const mask = images && bytesOfImage(images.mask, width, height);
+    Object.assign(this, { medianMm: 0, drawn: [] });
     if (images) this.#video(canvas("video"), images.video, showMask ? mask : null);
     else blank(canvas("video"), width, height, "no picture was kept");
-    const codes = images?.depth && bytesOfImage(images.depth, width, height);
+    const codes = images?.depth && this.#codes(bytesOfImage(images.depth, width, height));
     if (codes) this.#depth(canvas("depth"), codes, showMask ? mask : null);
     else blank(canvas("depth"), width, height, "no depth was kept");
     if (!pose || !mesh.vertices) {
@@ -85,12 +97,32 @@ class FramePanels {
     return null;
   }
 
+  // A scale bar in each picture, where sizes are known, for what is as far away as the frame's median depth.
+  drawScale() {
+    const mm = this.run.scale_known && this.medianMm;
+    if (mm) this.drawn.forEach((canvas) => drawScaleBar(canvas, this.lens.fx / mm, `at ${short(mm)} mm`));
+  }
+
+  // Depth in levels: 1..255 = near..far, logarithmic, 0 = unknown; of pictures whose red and green are its units.
+  #codes(bytes) {
+    const [near, far] = this.run.depth_range, depths = [];
+    for (let i = 0; i < bytes.length; i += 4) {
+      const mm = (256 * bytes[i] + bytes[i + 1]) * this.run.depth_unit_mm;
+      bytes[i] = mm ? Math.max(1, Math.min(255, Math.round(1 + (254 * Math.log(mm / near)) / Math.log(far / near)))) : 0;
+      if (mm) depths.push(mm);
+    }
+    this.medianMm = Float64Array.from(depths).sort()[depths.length >> 1] || 0;
+    return bytes;
+  }
+
   #put(canvas, bytes, label) {
     dimensioned(canvas, ...this.size).putImageData(new ImageData(bytes, ...this.size), 0, 0);
     canvas.setAttribute("aria-label", label);
+    this.drawn.push(canvas);
   }
 
   #video(canvas, image, mask) {
+    this.drawn.push(canvas);
     const context = dimensioned(canvas, ...this.size);
     context.drawImage(image, 0, 0, ...this.size);
     canvas.setAttribute("aria-label", "Frame of the video" + (mask ? ", unused parts dimmed" : ""));

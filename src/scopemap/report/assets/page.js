@@ -8,7 +8,7 @@ const FIELD_OF_VIEW = 0.8;
 let run, panels, curves, view = null, row = 0, shown = 0, turn = { yaw: 0, pitch: 0, distance: 1, shift: [0, 0, 0] }, images = null, playing = null, due = false;
 
 function prepared(raw) {
-  const frames = raw.frames, floats = (text) => new Float32Array(bytesOf(text)), poses = floats(frames.pose);
+  const frames = raw.frames, floats = (text) => new Float32Array(bytesOf(text)), poses = new Float64Array(bytesOf(frames.pose));
   const places = new Int16Array(bytesOf(frames.place)), curves = {};
   for (const [name, text] of Object.entries(frames.curves)) curves[name] = floats(text);
   const poseOf = (i) => {
@@ -69,7 +69,8 @@ function eye(pose) {
   const target = add(along ? pose.t : centre, turn.shift);
   const { clientWidth, clientHeight } = element("scene"), fit = Math.min(1, Math.max(0.72, (1.05 * clientHeight) / clientWidth));
   const away = !along ? (fit * radius) / Math.sin(FIELD_OF_VIEW / 2) : look === "behind" ? 0.5 * radius : 0.002 * radius;
-  return { R, t: add(target, scaled(column(R, 2), -away * turn.distance)), through: along && look === "through" };
+  const through = along && look === "through";
+  return { R, t: add(target, scaled(column(R, 2), -away * turn.distance)), through, fieldOfView: through ? 1.2 : FIELD_OF_VIEW };
 }
 
 function drawScene() {
@@ -77,12 +78,13 @@ function drawScene() {
   if (!view) return;
   const pose = run.places[row] === shown ? run.poseOf(row) : null, from = eye(pose), { radius, centre } = run.balls[shown];
   const distance = Math.hypot(...add(from.t, scaled(centre, -1))), corners = pose && cornersOf(pose, 0.16 * radius);
+  writeSceneScale(from, distance);
   view.background = colour("--scene");
   view.paint = Number(element("paint").value);
   view.cut = element("cut").checked;
   const near = Math.max(0.004 * radius, distance - 2 * radius);
   view.draw(run.maps[shown], from, {
-    near, far: distance + 3 * radius, fieldOfView: from.through ? 1.2 : FIELD_OF_VIEW, lines: pathLines(),
+    near, far: distance + 3 * radius, fieldOfView: from.fieldOfView, lines: [...pathLines(), ...handLines()],
     frustum: corners && !from.through ? frustumLines(pose, corners) : [], corners: from.through ? null : corners,
   });
   root.dataset.frustum = pose ? pose.t.map((value) => value.toFixed(4)).join(" ") : "";
@@ -109,10 +111,13 @@ async function setRow(next) {
   if (at !== row) return;
   images = decoded;
   // The pictures are those of the nearest frame that was kept, and so is the pose that they are compared at.
+  panels.shown = near;
   const of = near ? near.row : row, pose = run.places[of] === shown ? run.poseOf(of) : null;
   put("video-note", near && near.row !== row ? `of frame ${run.indices[near.row]}` : "");
   view?.setPicture(images ? images.video : null);
   const median = panels.draw(images, run.maps[shown], view && pose, { showMask: element("mask").checked, far: 8 * run.balls[shown].radius + 2 * run.depth_range[1] });
+  markPictures();
+  panels.drawScale();
   put("residual-note", median === null ? "" : `differs by ${(100 * median).toFixed(1)} %`);
   redraw();
   root.dataset.shown = String(row);
@@ -120,20 +125,38 @@ async function setRow(next) {
 
 function showMap(number) {
   shown = number;
+  hand.picks = [];
   turn = { yaw: -0.7, pitch: -0.4, distance: 1, shift: [0, 0, 0] };
   put("submap", run.maps.length > 1 ? (number ? `Submap ${number}: where it lies is unknown` : "The result") : "");
   document.querySelectorAll("#submap-list button").forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.map) === number)));
   writeLegend();
 }
 
+const rampStops = (levels) => [0, 32, 64, 96, 128, 160, 192, 224, 255].map((k) => `rgb(${levels.subarray(3 * k, 3 * k + 3).join(" ")})`);
+
 function writeLegend() {
-  const words = legendOf(run, run.maps[shown], Number(element("paint").value)), box = element("scene-legend");
-  box.replaceChildren();
-  if (!words) return;
-  const bar = document.createElement("span"), stops = [0, 64, 128, 192, 255].map((k) => `rgb(${ramp.subarray(3 * k, 3 * k + 3).join(" ")})`);
-  bar.className = "ramp";
-  bar.style.background = `linear-gradient(to right, ${stops.join(", ")})`;
-  box.append(words[0], bar, words[1]);
+  const found = legendOf(run, run.maps[shown], Number(element("paint").value));
+  element("scene-legend").replaceChildren(...(found ? [colourBar(rampStops(ramp), found[0]), found[1]] : []));
+}
+
+// What the colours of depth and of its difference are in numbers; without a scale in multiples of the nearest depth.
+function writeScales() {
+  const [near, far] = run.depth_range, of = (share) => near * (far / near) ** share, unit = run.scale_known ? 1 : near;
+  const numbers = [0, 0.5, 1].map((share) => [share, short(of(share) / unit)]);
+  element("depth-note").replaceChildren(colourBar(rampStops(turbo).reverse(), numbers), run.scale_known ? "mm" : "× the nearest");
+  const shares = [-DIFFERENCE_LIMIT, 0, DIFFERENCE_LIMIT], stops = shares.map((share) => `rgb(${differenceColour(share).map(Math.round).join(" ")})`);
+  element("residual-scale").replaceChildren(colourBar(stops, shares.map((share, k) => [k / 2, String(100 * share)])), "%");
+}
+
+// How long so many mm are, where sizes are known: at a distance, or through the camera at its frame's median depth.
+function writeSceneScale(from, distance) {
+  const { clientWidth, clientHeight } = element("scene"), away = from.through ? panels.medianMm : distance;
+  const pxPerMm = lensOf(clientWidth, clientHeight, from.fieldOfView).fx / away;
+  element("scene-scale").hidden = !run.scale_known || !away;
+  if (element("scene-scale").hidden) return;
+  const mm = roundLength(pxPerMm, 110);
+  document.querySelector("#scene-scale .rule").style.width = `${mm * pxPerMm}px`;
+  put("scene-scale-note", `${short(mm)} mm at ${from.through ? `${short(away)} mm` : "the middle of the surface"}`);
 }
 
 function writeSubmaps() {
@@ -149,8 +172,9 @@ function writeSubmaps() {
     button.append(canvas, number ? `Submap ${number} (maps/${number})` : "The result", note);
     button.addEventListener("click", () => (showMap(number), setRow(first)));
     if (view && map.vertices) {
-      const { centre, radius } = run.balls[number], R = turned(-0.7, -0.4), t = add(centre, scaled(column(R, 2), -2.2 * radius));
-      dimensioned(canvas, 320, 240).putImageData(new ImageData(view.pixels(map, { R, t }, lensOf(320, 240, 0.9), 0.05 * radius, 9 * radius, { cut: true }), 320, 240), 0, 0);
+      const { centre, radius } = run.balls[number], R = turned(-0.7, -0.4), t = add(centre, scaled(column(R, 2), -2.2 * radius)), lens = lensOf(320, 240, 0.9);
+      dimensioned(canvas, 320, 240).putImageData(new ImageData(view.pixels(map, { R, t }, lens, 0.05 * radius, 9 * radius, { cut: true }), 320, 240), 0, 0);
+      if (run.scale_known) drawScaleBar(canvas, lens.fx / (2.2 * radius), "at its middle");
     }
     return button;
   });
@@ -188,14 +212,16 @@ function open(number) {
   writeSubmaps();
   writeLosses();
   element("truth-key").hidden = !run.truth;
-  const [near, far] = run.depth_range, unit = run.scale_known ? " mm" : "";
-  put("depth-note", run.scale_known ? `red ${short(near)} to blue ${short(far)}${unit}` : "red near, blue far");
+  writeScales();
+  if (data.runs.length === 1 && !data.served) document.querySelectorAll("a[data-file]").forEach((link) => (link.href = link.textContent));
+  else element("beside").hidden = true;
   element("curves").replaceChildren();
   curves = curvesOf(run).map((curve) => new Curve(element("curves"), run, curve, setRow));
   element("slider").max = run.places.length - 1;
   showMap(0);
   drawStrip(element("strip"), run);
-  setRow(Math.max(run.places.indexOf(0), 0));
+  row = Math.max(run.places.indexOf(0), 0);
+  openMeasures();
 }
 
 function setTheme(dark) {

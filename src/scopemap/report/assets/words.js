@@ -66,8 +66,30 @@ function statusOf(run, row) {
   return place === NOT_USED ? `not used: ${reason || "left out"}` : `camera lost: ${reason || "no reason was kept"}`;
 }
 
+// Numbers below a bar of colours: [[place 0..1, text], ...], and what they are of.
 function legendOf(run, map, paint) {
-  if (paint === 1) return ["never", `in all of ${map.looked} frames looked at`];
-  if (paint === 4) return ["never moves on its own", "in all frames that see it"];
-  return paint === 2 ? ["little", "much: seen often, near, from the front"] : null;
+  const percent = (share) => `${Math.round(100 * share)} %`;
+  if (paint === 1) return [[0, 0.25, 1].map((share) => [Math.sqrt(share), percent(share)]), `of ${map.looked} frames looked at see it`];
+  if (paint === 4) return [[0, 0.5, 1].map((share) => [share, percent(share)]), "of the frames that see it: it moves on its own"];
+  return paint === 2 ? [[0, 0.5, 1].map((share) => [share, String(share)]), "confidence: often seen, near, from the front"] : null;
+}
+
+// A bar of colours, "rgb(...)" from left to right, with numbers at their places.
+function colourBar(stops, numbers) {
+  const bar = document.createElement("span");
+  bar.className = "ramp";
+  bar.style.background = `linear-gradient(to right, ${stops.join(", ")})`;
+  bar.append(...numbers.map(([place, text]) => {
+    const number = document.createElement("i");
+    number.textContent = text;
+    number.style.left = `${100 * place}%`;
+    return number;
+  }));
+  return bar;
+}
+
+// A round length, mm, that is about so many px long.
+function roundLength(pxPerMm, wantedPx) {
+  const power = 10 ** Math.floor(Math.log10(wantedPx / pxPerMm));
+  return power * [5, 2, 1].find((digit) => digit * power * pxPerMm <= wantedPx);
 }
