@@ -170,7 +170,7 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 350: stereo; 420: checksums, inputs found again, Python; 340: measuring by hand, scale bars, sigma_mm; 95: letters.
+    # 350: stereo; 420: checksums, inputs found again, Python; 340: measuring by hand, scale bars, sigma_mm; 95: text.
     "core": (lambda: _total(MODULES), 31_320),
     "core, net": (lambda: _net(MODULES), 19_285),
     "bench": (lambda: _total(BENCH_MODULES), 11_665),  # 235: two runs compared; 195: verdicts; 100: intervals
