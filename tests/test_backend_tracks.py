@@ -92,6 +92,16 @@ def test_a_map_that_the_camera_leaves_keeps_no_flows_and_goes_on_when_it_comes_b
     assert first / second == pytest.approx(1.5, abs=0.05)
 
 
+def test_keyframes_that_are_far_apart_are_matched_from_depth_and_poses_as_tracked() -> None:
+    # 72 px in twelve steps; and four times as much, with nothing in common.
+    along, from_zero = (_errors_px(flow, 12, 2.0) for flow in (DisFlow(), _FromZero()))
+    good, without = (int((away < 0.5).sum()) for away in (along, from_zero))
+    assert good > 80
+    assert good > 1.5 * without
+    assert np.median(along) < 0.25
+    assert not len(_errors_px(DisFlow(), 12, 8.0))
+
+
 def test_patches_that_differ_are_no_observations() -> None:
     view, rng = plane_scene.see(plane_scene.pose()), np.random.default_rng(0)
     noise = rng.integers(0, 255, view.rgb.shape, np.uint8)

@@ -66,7 +66,7 @@ KINDS: dict[str, _Kind] = {
         "pictures were cut after it; if it is right, the tissue moves",
     ),
     "camera-unconfirmed": _Kind(
-        "note",
+        "doubtful",
         "mapping: the views do not tell the focal length (standard deviation {sigma:.0%}): nothing but the calibration "
         "supports it",
         "The motion does not tell the focal length: were the calibration wrong, this result would not show it",

@@ -18,7 +18,7 @@ class MappingConstants:
     # Triangulate the depth of keyframes against frames around them, where the scene is rigid; all frames take it over.
     # False: depth as predicted, corrected at the keyframes' corners.
     triangulate_depth: bool = True
-    keyframe_gaps: tuple[int, ...] = (1, 2, 3, 5, 8)  # a keyframe's corners are tracked to those so many before it
+    keyframe_gaps: tuple[int, ...] = (1, 2, 3, 5, 8, 16, 32)  # a keyframe's corners are matched in those so many before
     # So many observations count as one: errors of flow are alike at neighbouring corners.
     correlated_observations: float = 4.0
     depth_sigma_share: float = 0.2  # standard deviation that every estimated depth has at least, over the depth

@@ -82,7 +82,7 @@ class KeyframeMatcher:
         """Detect the corners of a frame, None: no keyframe; flow is searched from `T_frame_keyframe` (4, 4) first."""
         same, self._keyframe, self._flows = keyframe is self._keyframe, keyframe, None
         if keyframe is not None and frame is not None and T_frame_keyframe is not None:
-            self._flows = _expected_flow(keyframe, T_frame_keyframe), _expected_flow(frame, inverse(T_frame_keyframe))
+            self._flows = expected_flow(keyframe, T_frame_keyframe), expected_flow(frame, inverse(T_frame_keyframe))
         if keyframe is None or same:
             return
         assert keyframe.depth_mm is not None
@@ -114,10 +114,10 @@ class KeyframeMatcher:
         assert self._keyframe is not None
         height, width = frame.valid.shape
         size = (width // downscale, height // downscale)
-        start = None if self._flows is None else (_flow_at(self._flows[0], size), _flow_at(self._flows[1], size))
+        start = None if self._flows is None else (flow_at(self._flows[0], size), flow_at(self._flows[1], size))
         keyframe, current = _resized(self._keyframe.rgb, size), _resized(frame.rgb, size)
         self._flows = self.flow.estimate_checked(keyframe, current, start)
-        whole = (_flow_at(self._flows[0], (width, height)), _flow_at(self._flows[1], (width, height)))
+        whole = (flow_at(self._flows[0], (width, height)), flow_at(self._flows[1], (width, height)))
         return match_corners(self._corners, whole, frame.valid, _CONSISTENCY_PX)
 
     def _aligned_in(self, frame: Frame, matched: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +130,7 @@ class KeyframeMatcher:
         return matched[near], there[near].astype(np.float64)
 
 
-def _expected_flow(frame: Frame, T_other_frame: np.ndarray) -> np.ndarray:
+def expected_flow(frame: Frame, T_other_frame: np.ndarray) -> np.ndarray:
     """Return the flow (h, w, 2), in its own pixels, that a motion gives a frame's points; coarse."""
     assert frame.depth_mm is not None
     height, width = (side // _EXPECTED_PX for side in frame.valid.shape)
@@ -150,7 +150,7 @@ def _resized(rgb: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return rgb if size == rgb.shape[1::-1] else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
 
 
-def _flow_at(flow: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def flow_at(flow: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return flow between images of another size (width, height)."""
     height, width = flow.shape[:2]
     if size == (width, height):

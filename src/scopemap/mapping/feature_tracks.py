@@ -1,4 +1,8 @@
-"""Feature tracks: corners of keyframes, matched in others by composed flow, aligned patches, and loops."""
+"""Feature tracks: corners of keyframes, matched in others by flow, aligned patches, and loops.
+
+Flow between near keyframes is searched from the composed flows of those between; that between distant ones, whose
+parallax outweighs what flow lags behind, from where their depth and poses as tracked have it.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,17 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
-from scopemap.flow.corners import detect_corners, match_corners, normalised_brightness, refined_corners
-from scopemap.flow.estimator import FlowEstimator
+from scopemap.flow.corners import (
+    detect_corners,
+    expected_flow,
+    flow_at,
+    match_corners,
+    normalised_brightness,
+    refined_corners,
+)
+from scopemap.flow.estimator import FlowEstimator, FlowPair
 from scopemap.frame import Frame, RowTable, rows_in_memory
+from scopemap.geometry.se3 import inverse
 from scopemap.geometry.uncertainty import relative_sigma
 from scopemap.mapping.bundle_problem import Observations, Points
 from scopemap.mapping.loop_closure import Loop
@@ -22,6 +34,8 @@ _CELL_PX = 16  # one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.
 _MOST_MAPS = 20
 _CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
+_MOST_COMPOSED = 8  # keyframes between which flows are composed
+_LEAST_IN_COMMON = 0.15  # of either picture, by depth and poses as tracked
 
 
 @dataclass
@@ -30,20 +44,19 @@ class _FlowKeyframe:
 
     number : among all keyframes. number_in_map : among those of its map. corners : (n, 2) int px; the first of them is
     point `first_point`. pattern : (H, W) uint8 as `normalised_brightness`. composed : flows to the latest
-    keyframe of its map and back, None: it is the latest, or the camera has been in another map since.
+    keyframe of its map and back, None: it is the latest or too old, or the camera has been in another map since.
     """
 
     number: int
     number_in_map: int
-    rgb: np.ndarray
-    valid: np.ndarray
+    frame: Frame
     corners: np.ndarray
     first_point: int
     pattern: np.ndarray = field(init=False)
-    composed: tuple[np.ndarray, np.ndarray] | None = None
+    composed: FlowPair | None = None
 
     def __post_init__(self) -> None:
-        self.pattern = normalised_brightness(self.rgb)
+        self.pattern = normalised_brightness(self.frame.rgb)
 
 
 _POINT = np.dtype([("host", np.int64), ("pixel", np.float64, (2,)), ("log_depth", np.float64), ("sigma", np.float32)])
@@ -78,7 +91,7 @@ class FeatureTracks:
         for past in (past for other, others in self._recent.items() if other != map_number for past in others):
             past.composed = None
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
-        new = _FlowKeyframe(self._keyframe_count, number_in_map, keyframe.rgb, keyframe.valid, corners, first)
+        new = _FlowKeyframe(self._keyframe_count, number_in_map, _slim(keyframe), corners, first)
         self._match_with(recent, new)
         recent.append(new)
         self._keyframe_count += 1
@@ -87,17 +100,23 @@ class FeatureTracks:
         """Match a new keyframe both ways with recent ones of its map."""
         if not recent:
             return
-        step = self._flow.estimate_both(recent[-1].rgb, new.rgb)
+        latest = recent[-1]
+        step = self._flow.estimate_both(latest.frame.rgb, new.frame.rgb)
         for past in recent:
-            flows = step
-            if past.composed is not None:
-                flows = _composed(past.composed[0], step[0]), _composed(step[1], past.composed[1])
-            elif past is not recent[-1]:
-                flows = self._flow.estimate_both(past.rgb, new.rgb)
-            past.composed = flows
-            if new.number_in_map - past.number_in_map in self.settings.keyframe_gaps:
-                if past is not recent[-1]:
-                    flows = self._flow.estimate_both_from(past.rgb, new.rgb, flows)
+            gap = new.number_in_map - past.number_in_map
+            start: FlowPair | None = None
+            if gap > _MOST_COMPOSED:
+                past.composed = None
+                start = _expected_flows(past.frame, new.frame) if gap in self.settings.keyframe_gaps else None
+            elif past is latest:
+                past.composed = step
+            elif past.composed is not None:
+                start = past.composed = _composed(past.composed[0], step[0]), _composed(step[1], past.composed[1])
+            else:
+                start = past.composed = self._flow.estimate_both(past.frame.rgb, new.frame.rgb)
+            if gap in self.settings.keyframe_gaps and (start is not None or past is latest):
+                both = past.frame.rgb, new.frame.rgb
+                flows = step if start is None else self._flow.estimate_both_from(*both, start)
                 self._match(past, new, flows)
                 self._match(new, past, flows[::-1])
 
@@ -161,7 +180,7 @@ class FeatureTracks:
 
     def _match(self, host: _FlowKeyframe, other: _FlowKeyframe, flows: tuple[np.ndarray, np.ndarray]) -> None:
         """Add the observations of the host's corners in another keyframe; `flows` : to the other one, and back."""
-        number, pixel = match_corners(host.corners, flows, other.valid, _CONSISTENCY_PX)
+        number, pixel = match_corners(host.corners, flows, other.frame.valid, _CONSISTENCY_PX)
         kept, pixel = refined_corners(host.pattern, other.pattern, host.corners[number], pixel, flows[0])
         self._add_matches(host.first_point + number[kept], other.number, pixel)
 
@@ -173,3 +192,29 @@ def _composed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     onwards = cv2.remap(second, u + first[..., 0], v + first[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     composed: np.ndarray = first + onwards
     return composed
+
+
+def _expected_flows(past: Frame, new: Frame) -> FlowPair | None:
+    """Return the flows that depth and poses as tracked give, and back; None with hardly anything in common."""
+    T_world_past, T_world_new = past.T_world_camera, new.T_world_camera
+    assert T_world_past is not None
+    assert T_world_new is not None
+    T_new_past = inverse(T_world_new) @ T_world_past
+    flows = expected_flow(past, T_new_past), expected_flow(new, inverse(T_new_past))
+    if min(_share_inside(flow) for flow in flows) < _LEAST_IN_COMMON:
+        return None
+    size = new.valid.shape[1], new.valid.shape[0]
+    return flow_at(flows[0], size), flow_at(flows[1], size)
+
+
+def _share_inside(flow: np.ndarray) -> float:
+    """Return the share of pixels that a flow (h, w, 2) leaves in the picture."""
+    height, width = flow.shape[:2]
+    there = flow + np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
+    return float(((there >= 0) & (there <= [width - 1, height - 1])).all(-1).mean())
+
+
+def _slim(keyframe: Frame) -> Frame:
+    """Return what matching needs of a keyframe."""
+    shown = (keyframe.index, keyframe.time_s, keyframe.rgb, keyframe.camera, keyframe.valid)
+    return Frame(*shown, depth_mm=keyframe.depth_mm, T_world_camera=keyframe.T_world_camera)

@@ -49,7 +49,7 @@ PHANTOMS = {
     "motion blur, H.264, lagging exposure, scattered light": ("--scene", "colon", *CAMERA),
     "abdominal wall seen sideways, 600 frames": (
         *("--scene", "abdominal_wall", "--frames", 600, "--set", "route=sideways", "--set", "fov_deg=65"),
-        *("--set", "texture=0.6", "--set", "indirect=0.15", "--set", "h264_crf=30", *EXPOSURE),
+        *("--set", "indirect=0.15", "--set", "h264_crf=30", *EXPOSURE),
     ),
     "withdrawal along a straight colon, 184 frames": (
         *("--scene", "colon", "--frames", 184, "--set", "route=withdrawal", "--set", "gloss=2"),
