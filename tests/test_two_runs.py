@@ -77,7 +77,7 @@ def test_it_is_told_in_words_and_drawn(tmp_path: Path, capfd: pytest.CaptureFixt
     said = capfd.readouterr().out
     assert f"{IN_RESULT - 4} common frames" in said
     assert "% within 2 %" in said
-    assert "What differs is not known" in said
+    assert "Where they differ, neither is confirmed" in said
     assert "one: scale unknown" in said
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"path.png", "difference.png", "report.html"}
 

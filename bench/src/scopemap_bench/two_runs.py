@@ -55,7 +55,7 @@ class TwoRuns:
             f"{self.figures['common_frames']} common frames; the first run was moved onto the second by Sim(3), scale "
             f"{self.figures['scale']:.3f}",
             f"path: {path['position_rmse_mm']:.2f} mm apart (RMS, {path['position_rmse_percent']:.1f} % of length), "
-            f"{path['position_max_mm']:.2f} mm at most; directions {path['rotation_mean_deg']:.2f} deg, at most "
+            f"{path['position_max_mm']:.2f} mm at most; rotation {path['rotation_mean_deg']:.2f} deg, at most "
             f"{path['rotation_max_deg']:.2f} deg",
         ]
         if surface:
@@ -70,7 +70,7 @@ class TwoRuns:
         return [
             *found,
             *scales,
-            "What differs is not known. Which of the two is right, or whether any is, this does not tell.",
+            "Where they differ, neither is confirmed: which of the two is right, or whether any is, this does not say.",
         ]
 
     def save(self, out: Path) -> list[Path]:

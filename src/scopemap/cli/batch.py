@@ -89,7 +89,7 @@ def batch(
 ) -> None:
     """Reconstruct many videos: look at index.html, or batch.csv, in the folder of the results.
 
-    The same command again goes on where it ended: what is finished is not run again, what failed is. Exit code 1 where
+    The same command again resumes: what is finished is not run again, what failed is. Exit code 1 where
     a video failed.
     """
     chosen = {"preset": preset, "config": config, "dataset": dataset, "camera": camera, "fov": fov}

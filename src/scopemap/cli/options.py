@@ -45,7 +45,7 @@ Dataset = Annotated[
 CameraFile = Annotated[
     Path | None,
     typer.Option(
-        metavar="FILE|NUMBERS", help="Calibration file, or 'fx fy cx cy [k1 k2 p1 p2 [k3]]', px of the input's images."
+        metavar="FILE|NUMBERS", help="Calibration file or 'fx fy cx cy [k1 k2 p1 p2 \\[k3]]', px of the input's images."
     ),
 ]
 FieldOfView = Annotated[
@@ -53,7 +53,7 @@ FieldOfView = Annotated[
     typer.Option(
         min=5.0,
         max=170.0,
-        help="Horizontal field of view, degrees, of an unknown camera; default: from the motion, or 70 (live: 70).",
+        help="Horizontal field of view, degrees, of an unknown camera; default: estimated, or 70 (live: 70).",
     ),
 ]
 NearFar = Annotated[

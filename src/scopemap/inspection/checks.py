@@ -117,7 +117,7 @@ def check_frames(clip: Clip) -> Iterator[VideoFinding]:
     if segments := clip.segments(~blank & (detail < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2):
         share = np.median(detail[covered(segments, len(clip))]) / usual
         message = (
-            f"blurred, or without texture: {{frames}} show {share:.0%} of the usual detail (a smear on "
+            f"blurred, or without texture: {{frames}} show {share:.0%} of the usual sharpness (a smear on "
             "the lens, defocus, or tissue very near)"
         )
         yield clip.finding("warning", "blurred", message, segments, "{selection}")

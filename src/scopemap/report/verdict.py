@@ -164,7 +164,7 @@ def _of_maps(run: Result) -> list[Reason]:
     if other:
         kept = len(run.submaps) - 1
         shown = f"; {kept} {'submap is' if kept == 1 else 'submaps are'} shown below" if kept else ""
-        text = f"After losses {other} more frames form submaps of their own: where they belong is unknown{shown}."
+        text = f"After losses {other} more frames form submaps of their own: their relative poses are unknown{shown}."
         found.append(Reason("submaps", "note", text))
     doubt = doubt_words(submaps_in_time(frames))
     if doubt:

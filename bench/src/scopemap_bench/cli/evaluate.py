@@ -66,7 +66,7 @@ def evaluate(
         DepthScaling | None, typer.Option(help="Also a run's depth maps against true depth, scaled so.")
     ] = None,
     consistency: Annotated[
-        bool, typer.Option("--consistency", help="Also the consistency of a run's depth over time.")
+        bool, typer.Option("--consistency", help="Also how steady a run's depth is; --truth is a data set's folder.")
     ] = False,
     as_json: AsJson = False,
     as_csv: AsCsv = False,

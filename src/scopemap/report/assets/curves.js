@@ -59,7 +59,7 @@ function curvesOf(run) {
   return [
     { title: "Camera position", unit: run.scale_known ? "mm" : "size unknown", lines: axes(positions) },
     { title: "Camera rotation", unit: "degrees", lines: axes(rotations) },
-    { title: "How well followed", unit: "1 is best", lines: [["fit", run.curves.inliers], ["likeness", run.curves.agreement]] },
+    { title: "How well followed", unit: "1 is best", lines: [["inliers", run.curves.inliers], ["correlation", run.curves.agreement]] },
     { title: "Tissue that moves on its own", unit: "share of the picture", lines: [["", run.curves.moving]] },
     { title: "Sharpness", unit: "more is sharper", lines: [["", run.curves.sharpness]] },
     { title: "Scale of depth", unit: "level is good", lines: [["", run.curves.scale]] },

@@ -127,7 +127,7 @@ function showMap(number) {
   shown = number;
   hand.picks = [];
   turn = { yaw: -0.7, pitch: -0.4, distance: 1, shift: [0, 0, 0] };
-  put("submap", run.maps.length > 1 ? (number ? `Submap ${number}: where it lies is unknown` : "The result") : "");
+  put("submap", run.maps.length > 1 ? (number ? `Submap ${number}: its relative pose is unknown` : "The result") : "");
   document.querySelectorAll("#submap-list button").forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.map) === number)));
   writeLegend();
 }
