@@ -55,8 +55,8 @@ KINDS: dict[str, _Kind] = {
         "doubtful",
         "mapping: the views ask for another focal length than the one used ({change:+.0%}); check the calibration, or "
         "the tissue moves",
-        "The motion asks for another focal length ({change:+.0%}): depth against width is wrong. Check the "
-        "calibration; if it is right, the tissue moves",
+        "The motion asks for another focal length ({change:+.0%}): depth against width is wrong. Calibrate, or "
+        "check the calibration; if it is right, the tissue moves",
     ),
     "camera-off-centre": _Kind(
         "doubtful",
