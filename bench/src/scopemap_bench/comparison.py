@@ -241,7 +241,7 @@ def compare(
         if (path / FILE_NAME).is_file():
             runs.append(_of_benchmark(path, name, protocol))
         elif truth is None:
-            raise InputError(f"comparing {path}: name the true poses by --truth, or two runs alone")
+            raise InputError(f"comparing {path}: name the true poses by --truth, or give two runs")
         else:
             runs.append(_scored(path, name or path.resolve().name, truth, protocol, unit))
     counts = Counter((run.result.sequence, run.result.method, run.result.seed) for run in runs)
