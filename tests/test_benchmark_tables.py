@@ -119,6 +119,16 @@ def test_a_plans_seeds_are_one_row_with_their_spread_in_the_order_of_the_plan() 
 # ---- the paper's tables
 
 
+def test_rows_of_a_straight_path_are_marked_in_every_table_of_poses() -> None:
+    line = run("colon", "ours", 0.5)
+    line.figures["poses"]["straight"] = "straight path"
+    found = tables([line, run("tube", "ours", 0.5)])
+    for name in ("overview", "table1", "table2", "table3", "tracking"):
+        assert "straight path" in found[name].markdown(), name
+        assert "fitted to the orientations" in found[name].caption, name
+    assert "straight" not in tables([run("tube", "ours", 0.5)])["overview"].markdown()
+
+
 @pytest.mark.parametrize(("name", "file"), [*zip(("table1", "table2", "table3"), PUBLISHED, strict=True)])
 def test_published_rows_are_the_files(name: str, file: str) -> None:
     text = (resources.files("scopemap_bench") / "published" / f"{file}.csv").read_text()

@@ -23,7 +23,7 @@ from scopemap.trajectory.trajectory import write_kitti
 from scopemap_bench.cli.evaluate import evaluate
 
 KEYS = [
-    *("frames", "tracked", "align", "scale", "ate_rmse_mm", "ate_hold_rmse_mm", "ate_mean_mm"),
+    *("frames", "tracked", "align", "straight", "scale", "ate_rmse_mm", "ate_hold_rmse_mm", "ate_mean_mm"),
     *("rotation_mean_deg", "rotation_max_deg", "rotation_unaligned_mean_deg", "rotation_unaligned_max_deg"),
     *("rpe_1_mm", "rpe_1_deg", "rpe_10_mm", "rpe_10_deg", "tlr"),
     *("ate_median_mm", "ate_max_mm", "rpe_10mm_path_mm", "rpe_10mm_path_deg"),
@@ -86,7 +86,7 @@ def test_lost_frames_and_straight_paths_warn_on_stderr(tmp_path: Path, folders: 
     poses = np.tile(np.eye(4), (50, 1, 1))
     poses[:, :3, 3] = np.random.default_rng(0).normal(size=(50, 3)) * [20, 0.1, 0.1]
     straight = write_c3vd(tmp_path / "straight", poses)
-    assert "nearly a straight line" in run(straight, "--truth", straight).stderr
+    assert "nearly a straight line: the turn" in run(straight, "--truth", straight).stderr
     assert run(straight, "--truth", straight, "--align", "origin").stderr == ""
 
 

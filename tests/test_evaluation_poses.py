@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from scopemap.evaluation.poses import (
 )
 from scopemap.geometry.align import align_trajectories
 from scopemap.geometry.se3 import se3_exp
+from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
 
 MODES = ("none", "origin", "se3", "sim3", "scale")
@@ -210,3 +212,20 @@ def test_association_by_time_is_nearest_one_to_one_and_bounded() -> None:
     assert rows[0].tolist() == [1, 2, 4]
     assert rows[1].tolist() == [0, 1, 3]
     assert [len(r) for r in associate(estimate, reference.rows(np.zeros(5, dtype=bool)))] == [0, 0]
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["c4v3", "t1v1", "t2v1", "t2v2"])
+def test_true_rotations_on_straight_paths_are_seen_to_be_right(name: str, real_data: Path) -> None:
+    truth = read_trajectory(real_data / "endoscopy" / "c3vd_camera_paths" / f"{name}.txt")
+    rng, poses = np.random.default_rng(5), truth.T_world_camera.copy()
+    # Errors along the path, as those of a tracker: smooth.
+    off_mm = np.cumsum(rng.normal(size=(len(poses), 3)), 0)
+    poses[:, :3, 3] += 0.066 * off_mm / np.sqrt((off_mm**2).mean())
+    estimate = replace(truth, T_world_camera=se3_exp(np.array([0.3, -2.0, 0.5, 9.0, -4.0, 2.0])) @ poses)
+    report = evaluate_poses(estimate, truth, "sim3")
+    assert report["straight"] == "straight path"
+    assert np.radians(report["rotation_max_deg"]) < 0.01
+    assert report["ate_rmse_mm"] < 0.2
+    by_positions, _ = align_trajectories(estimate.T_world_camera, truth.T_world_camera, "sim3")
+    assert rotation_errors_rad(by_positions, truth.T_world_camera).mean() > 0.01

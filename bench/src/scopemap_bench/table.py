@@ -39,7 +39,8 @@ smaller errors."""
 
 _LONGEST_ERROR = 80
 # Columns of text, and where the runs keep their words: rows compete where the figures were measured alike.
-_WORDS = {"alignment": "poses.align", "flow": "consistency.flow", "scaling": "depth.scaling", "depth": "facts.depth"}
+_WORDS = {"alignment": "poses.align", "path": "poses.straight"}
+_WORDS |= {"flow": "consistency.flow", "scaling": "depth.scaling", "depth": "facts.depth"}
 
 
 @dataclass(frozen=True)
@@ -191,8 +192,8 @@ def summarise(results: Iterable[RunResult]) -> pd.DataFrame:
     """Return one row per sequence and method, both in the order in which they first appear.
 
     Figures are medians over the seeds, by "group.name", with half their range under the same name and `SPREAD`. Further
-    columns: "sequence", "method", "runs", "frames tracked", "alignment", "depth", "flow", "scaling", "failure", "done",
-    "competes", "tracked", "frames". A sequence whose name ends with its seed ("colon, seed 1") is that sequence.
+    columns: "sequence", "method", "runs", "frames tracked", "alignment", "path", "depth", "flow", "scaling", "failure",
+    "done", "competes", "tracked", "frames". A sequence whose name ends with its seed ("colon, seed 1") is that one.
     """
     runs = _runs(results)
     order = {name: place for place, name in enumerate(dict.fromkeys(runs["sequence"]))}

@@ -110,7 +110,7 @@ def published_rows(table: PublishedTable) -> pd.DataFrame:
     """
     with (resources.files("scopemap_bench") / "published" / f"{table}.csv").open(encoding="utf-8") as file:
         rows = pd.read_csv(file)
-    empty = dict.fromkeys(("depth", "frames tracked", "sequences", "failure"), "")
+    empty = dict.fromkeys(("depth", "frames tracked", "sequences", "path", "failure"), "")
     return rows.assign(competes=False, alignment="not stated", source="published", **empty)
 
 
@@ -127,7 +127,7 @@ def _means_over_sequences(rows: pd.DataFrame) -> pd.DataFrame:
         .assign(
             **{"frames tracked": of_frames(done[["tracked", "frames"]].sum().reindex(methods))},
             sequences=[f"{count} of {sequences}" for count in finished],
-            **{name: rows.groupby("method")[name].agg(joined).reindex(methods) for name in ("alignment", "depth")},
+            **{key: rows.groupby("method")[key].agg(joined).reindex(methods) for key in ("alignment", "path", "depth")},
             failure=rows.groupby("method")["failure"].first().reindex(methods).where(finished == 0, ""),
             competes=whole & (scored == finished),
         )

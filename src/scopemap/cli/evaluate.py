@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from scopemap.cli.figures import OutputForm
     from scopemap.evaluation.poses import MatchedTrajectories
 
-# Below this ratio of singular values the path hardly determines the rotation about it.
-_WEAK_LINE_RATIO = 1e-3
-
 EstimatePath = Annotated[
     Path, typer.Argument(metavar="DIR|TRAJECTORY", help="A run's folder, or a trajectory file (docs/formats.md).")
 ]
@@ -103,10 +100,10 @@ def against_own_video(run: Path, source: Path | None = None) -> dict[str, Any]:
 
 def warn_of(matched: MatchedTrajectories) -> None:
     """Print what limits the figures of these trajectories."""
-    lost, ratio = int((~matched.tracked).sum()), matched.similarity.line_ratio
+    lost = int((~matched.tracked).sum())
     if lost:
         counted = f"{lost} of {len(matched.tracked)} frames are lost"
         typer.echo(f"warning: {counted} and left out of all but one figure", err=True)
-    if ratio < _WEAK_LINE_RATIO:
-        line = f"the path is nearly a straight line (D2/D1 = {ratio:.1e}); the rotation about it is poorly determined"
-        typer.echo(f"warning: {line}, and so are the rotation errors", err=True)
+    if matched.similarity.straight:
+        turn = "the turn about it is fitted to the orientations, since positions do not tell it"
+        typer.echo(f"warning: the path is nearly a straight line: {turn}", err=True)

@@ -178,7 +178,7 @@ def match(
         raise AlignmentError(_too_few(estimate, known, int(np.count_nonzero(tracked))))
     estimated = _with_last_pose(estimate)[rows_estimate]
     truth = known.T_world_camera[rows_reference]
-    _, similarity = align_trajectories(estimated[tracked], truth[tracked], align, first=first)
+    _, similarity = align_trajectories(estimated[tracked], truth[tracked], align, first=first, by_orientations=True)
     stamps, true_stamps, gap = _stamps(estimate, known)
     in_span = (true_stamps >= stamps.min() - gap) & (true_stamps <= stamps.max() + gap)
     return MatchedTrajectories(
@@ -230,6 +230,7 @@ def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
 
     frames, tracked : matched frames, and those of them that are not lost.
     align, scale : mode of the alignment, and the scale that it found.
+    straight : "straight path" where the turn about it was fitted to the orientations; else "".
     ate_... : absolute translation error after the alignment; ate_hold_rmse_mm with lost frames held at the last pose.
     rotation_mean_deg, rotation_max_deg : absolute rotation error after the alignment.
     rotation_unaligned_mean_deg, rotation_unaligned_max_deg : rotation since the first tracked frame, no alignment.
@@ -253,6 +254,7 @@ def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
         "frames": len(ok),
         "tracked": int(np.count_nonzero(ok)),
         "align": matched.align,
+        "straight": "straight path" if matched.similarity.straight else "",
         "scale": matched.similarity.scale,
         "ate_rmse_mm": ate.rmse,
         "ate_hold_rmse_mm": ErrorSummary.of(held_mm).rmse,
