@@ -15,7 +15,9 @@ from scopemap.geometry.se3 import se3, so3_exp
 from scopemap_bench.evaluation.surface import (
     compare_surfaces,
     distance_to_mesh,
+    distances_mm,
     normal_consistency,
+    thinned,
 )
 
 
@@ -131,3 +133,15 @@ def test_normals_of_tilted_planes_agree_by_the_cosine() -> None:
     flipped = flat.copy()
     flipped.invert()
     assert normal_consistency(flat, flipped) == pytest.approx(1, abs=1e-3)
+
+
+def test_dense_points_are_thinned_and_distances_stay() -> None:
+    rng = np.random.default_rng(2)
+    truth = np.column_stack([rng.uniform(-10, 10, (200_000, 2)), np.zeros(200_000)])
+    fewer = thinned(truth)
+    assert len(truth) / 25 < len(fewer) < len(truth) / 15
+    others = np.column_stack([rng.uniform(-9, 9, (2_000, 2)), rng.uniform(-1, 1, 2_000)])
+    found, wanted = (distances_mm(others, surface) for surface in (fewer, truth))
+    assert np.abs(found - wanted).mean() < 0.03
+    mesh = wavy_sheet(10, 1.0)
+    assert thinned(mesh) is mesh

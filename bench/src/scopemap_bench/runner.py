@@ -41,7 +41,7 @@ _FLOW_S = {"dis": 0.02, "raft-small": 0.7, "raft-large": 2.6}
 _DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 100.0}
 _PERCEPTUAL_S = {"lpips": 0.05, "structure": 0.01}
 _TRACKING_S, _SCORING_S = 0.2, 0.1  # with reading, masks, fusion and the back end
-_START_S = 20.0  # of a run: imports and kernels
+_START_S, _SURFACE_S = 20.0, 20.0  # of a run: imports and kernels; its surface against the true one
 Listener = Callable[[Entry, RunResult, bool], None]
 
 
@@ -110,7 +110,7 @@ def _seconds(entry: Entry, frames: int) -> float:
     if (mapis.constants.blend, mapis.constants.frame_scale) != ("none", "none"):
         per_frame += _FLOW_S.get(flow, 0.0) + _PERCEPTUAL_S[networks.perceptual]
     once = _START_S + (_DEPTH_S["depth-pro"] if config.depth.anchor == "depth-pro" else 0.0)
-    return once + frames * per_frame
+    return once + frames * per_frame + _SURFACE_S * entry.protocol.surface
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ from scopemap_bench.evaluation.surface import (
     refine,
     small_triangles,
     surface_points,
+    thinned,
 )
 
 TrueView = tuple[np.ndarray, np.ndarray]
@@ -205,6 +206,7 @@ def measure_surface(
             raise ValueError("measure_surface: a truth of one view needs the camera of that view")
         valid = pixels_near(surface_points(truth.surface), camera, truth.T_view, radius_px=truth.reach_px)
         predicted = visible_from(predicted, camera, truth.T_view, valid)
+    truth = replace(truth, surface=thinned(truth.surface))
     figures = compare_surfaces(predicted, truth.surface, observed=truth.observed)
     figures["normal_consistency"] = normal_consistency(predicted, truth.surface)
     return figures | (_icp_figures(predicted, truth.surface) if icp else {})
