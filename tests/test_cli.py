@@ -173,7 +173,7 @@ TOO_LARGE = "is too large: 32000 px a side and 64 million pixels at most"
         (("--camera", "120 120 80 64 1e10 0 0 0"), "check the distortion coefficients"),
         (("--camera", "120 120 80 64 0 0 1e10 0"), "check the distortion coefficients"),
         (("--config", "/nowhere.toml"), "cannot read the settings"),
-        (("--preset", "paper"), "scopemap models pull"),
+        (("--preset", "paper"), "pull depth-anything && .*pull depth-pro && .*pull raft"),
     ],
 )
 def test_a_bad_option_is_one_line(

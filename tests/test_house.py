@@ -171,7 +171,7 @@ def _total(modules: list[_Module]) -> int:
 
 CEILINGS = {
     # 350: stereo; 420: checksums, inputs found again, Python; 340: measuring by hand, scale bars, sigma_mm; 95: text.
-    "core": (lambda: _total(MODULES), 31_390),
+    "core": (lambda: _total(MODULES), 31_395),
     "core, net": (lambda: _net(MODULES), 19_325),
     "bench": (lambda: _total(BENCH_MODULES), 11_680),  # 235: two runs compared; 195: verdicts; 100: intervals
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),

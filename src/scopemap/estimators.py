@@ -15,6 +15,7 @@ from scopemap.depth.files import FilesDepth
 from scopemap.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOINTS
 from scopemap.depth.perceptual import create_perceptual
 from scopemap.depth.stereo import StereoDepth
+from scopemap.errors import WeightsError
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.flow.flows import create_flow
 from scopemap.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
@@ -42,6 +43,9 @@ def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | N
     own : replace those of the settings; a flow must then be safe in several threads.
     """
     own = own or OwnEstimators()
+    if own == OwnEstimators() and len(lacking := missing_weights(config)) > 1:
+        pulls = " && ".join(f"scopemap models pull {name}" for name in lacking)
+        raise WeightsError(f"weights are missing: {pulls}; `scopemap models list` says where they are looked for")
     networks, folder = config.networks, files_folder(config.depth)
     in_input = folder is not None and folder.resolve() == sequence.path.resolve()
     depth = own.depth or create_depth(

@@ -180,7 +180,8 @@ class _Finishing:
         frames, pipeline, clock = self.frames, self.run.pipeline, self.run.clock
         check_tracked(frames, self.run.sequence.path)
         clock.timed("track backwards", track_backwards, pipeline, frames)
-        self.run.progress("adjusting keyframes", 0, 0)
+        if pipeline.config.mapping.method != "none":
+            self.run.progress("adjusting keyframes", 0, 0)
         submaps, notices = clock.timed("back end", pipeline.mapper.submaps)
         results = [self._fused(number, submaps) for number in range(len(submaps))]
         submapped = {index for submap in submaps for index in submap.frames}
