@@ -14,6 +14,7 @@ from scopemap.report.mesh_figures import ESTIMATE_COLOUR, TRUTH_COLOUR
 from scopemap_bench.pictures import (
     BAR_COLOUR,
     draw_ate,
+    draw_frames_until_contradicted,
     draw_frames_until_loss,
 )
 from scopemap_bench.scene_pictures import draw_depth_change, draw_reconstruction
@@ -61,6 +62,12 @@ def test_methods_that_hold_to_the_end_are_green(tmp_path: Path) -> None:
     assert lost[0] / kept[0] == pytest.approx(0.5, abs=0.02)
     with pytest.raises(ValueError, match="lengths"):
         draw_frames_until_loss(frames, [90, 80], tmp_path / "bad.png")
+
+
+def test_frames_until_contradicted_are_drawn_over_the_limit(tmp_path: Path) -> None:
+    over = pd.DataFrame({"ours": [40, 60, 80], "Park": [10, 20, 80]}, index=[1.0, 3.0, 8.0])
+    draw_frames_until_contradicted({"clip": over, "other": over}, tmp_path / "until.png")
+    assert read(tmp_path / "until.png").std() > 5
 
 
 def test_depth_changes_share_one_scale(tmp_path: Path) -> None:

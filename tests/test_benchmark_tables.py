@@ -18,6 +18,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.evaluation.poses import match, pose_report
 from scopemap_bench.evaluation.consistency import ConsistencyMeter
 from scopemap_bench.evaluation.depth import mean_depth_report, metric_consistency, scale_jitter
+from scopemap_bench.evaluation.failure import FailureMeter
 from scopemap_bench.evaluation.paper import paper_figures
 from scopemap_bench.evaluation.surface import compare_surfaces, distance_figures
 from scopemap_bench.result import RunResult
@@ -175,7 +176,7 @@ def test_every_column_names_a_figure_that_is_measured() -> None:
     surface = compare_surfaces(plane, plane) | {"normal_consistency": 1.0}
     surface |= distance_figures("accuracy_icp", np.ones(3))
     measured: dict[str, Any] = {
-        "poses": pose_report(MATCHED),
+        "poses": pose_report(MATCHED) | FailureMeter(PinholeCamera(50, 50, 10, 10, 20, 20)).figures(),
         "paper": PAPER_FIGURES,
         "depth": mean_depth_report([])
         | {"jitter": scale_jitter(np.ones(3))}

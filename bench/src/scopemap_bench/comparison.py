@@ -33,6 +33,7 @@ from scopemap_bench import pictures
 from scopemap_bench.entry import FILE_NAME as ENTRY
 from scopemap_bench.entry import Entry
 from scopemap_bench.evaluation.consistency import FrameMatcher, lifted_matches
+from scopemap_bench.evaluation.failure import LIMIT_PX, LIMITS_PX
 from scopemap_bench.plan import ProtocolPlan, folder_name
 from scopemap_bench.result import FILE_NAME, RunResult
 from scopemap_bench.scene_pictures import draw_depth_change, draw_reconstruction, draw_registered_clouds
@@ -86,6 +87,13 @@ def _bars(results: Sequence[RunResult], folder: Path) -> Iterator[Path]:
         longest = lengths.max(axis=1).fillna(0).astype(int).tolist()
         pictures.draw_frames_until_loss(of_all("poses.frames_until_loss"), longest, folder / "frames_until_loss.png")
         yield folder / "frames_until_loss.png"
+    until = {limit: of_all(f"poses.frames_until_contradicted_at_{limit:g}_px") for limit in LIMITS_PX}
+    if until[LIMIT_PX].notna().any(axis=None):
+        over = {
+            name: pd.DataFrame({limit: table.loc[name] for limit, table in until.items()}).T for name in lengths.index
+        }
+        pictures.draw_frames_until_contradicted(over, folder / "frames_until_contradicted.png")
+        yield folder / "frames_until_contradicted.png"
     orb = f"consistency.orb_{_world_poses(results)}"
     if (medians_mm := of_all(f"{orb}.median_mm")).notna().any(axis=None):
         means_mm, stds_mm = of_all(f"{orb}.mean_mm"), of_all(f"{orb}.std_mm")

@@ -6,6 +6,7 @@ per method, NaN where there is no figure. All functions write a PNG.
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -49,6 +50,23 @@ def draw_frames_until_loss(frames: pd.DataFrame, lengths: Sequence[int], file: P
         axes.axvline(length, color="black", linestyle="--", linewidth=1)
         axes.set_xlabel(f"frames, of {length}")
     _headline(figure, "Frames until tracking is lost; green: never; higher is better")
+    figure.savefig(file)
+
+
+def draw_frames_until_contradicted(frames: Mapping[str, pd.DataFrame], file: Path) -> None:
+    """Draw the frames until poses contradict the pictures over the limit, px (index), of each method (columns)."""
+    across, down = _grid_size(len(frames))
+    figure = _new_figure(4.6 * across, 3.6 * down + 0.8)
+    for number, (sequence, of_methods) in enumerate(frames.items(), start=1):
+        axes = figure.add_subplot(down, across, number)
+        axes.set_title(_short(sequence), fontsize=11)
+        axes.set_xlabel("limit, px")
+        axes.set_ylabel("frames")
+        for mark, method in zip(itertools.cycle("osD^vPX*"), of_methods, strict=False):
+            axes.plot(of_methods.index, of_methods[method], marker=mark, label=_short(method), markersize=5, alpha=0.8)
+        axes.set_ylim(bottom=0)
+    axes.legend(fontsize=8)
+    _headline(figure, "Frames until the poses contradict the pictures' flow, over the limit; higher is better")
     figure.savefig(file)
 
 

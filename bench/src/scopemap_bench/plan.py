@@ -41,6 +41,7 @@ class ProtocolPlan(_Part):
     align : alignment of the trajectory, also applied to mesh and depth in mm.
     protocols : protocols of other papers, measured as well (`evaluation.protocols.PROTOCOLS`).
     surface, depth, consistency : whether these are measured, where there is a truth for them.
+    contradiction : whether frames until the poses contradict the pictures are counted (`evaluation.failure`).
     icp : measure the mesh also after a refinement by ICP.
     flow : for consistency, the same for all methods, named as `networks.flow`.
     depth_scaling : scaling of predicted depth before it is compared with true depth.
@@ -53,6 +54,7 @@ class ProtocolPlan(_Part):
     icp: bool = False
     depth: bool = True
     consistency: bool = False
+    contradiction: bool = False
     flow: str = "dis"
     depth_scaling: DepthScaling = "median"
     depth_range_mm: tuple[float, float] = (1e-3, 1e4)

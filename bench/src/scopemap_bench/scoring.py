@@ -27,6 +27,7 @@ from scopemap.trajectory.trajectory import Trajectory
 from scopemap_bench.evaluation import depth as depth_errors
 from scopemap_bench.evaluation.consistency import ConsistencyMeter, FrameMatcher
 from scopemap_bench.evaluation.depth import DEPTH_RANGES_MM, DepthPairs, DepthScaling
+from scopemap_bench.evaluation.failure import FailureMeter
 from scopemap_bench.evaluation.paper import paper_figures
 from scopemap_bench.evaluation.protocols import PROTOCOLS
 from scopemap_bench.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
@@ -50,6 +51,8 @@ def score(
         figures |= _depth(depth, sequence, protocol, matched)
     if depth.present and protocol.consistency:
         figures |= _consistency(depth, sequence, estimate, protocol, flows)
+    if protocol.contradiction:
+        figures["poses"] |= _contradiction(sequence, estimate)
     return figures
 
 
@@ -191,11 +194,7 @@ def _consistency(
     matcher, meter = FrameMatcher(camera), ConsistencyMeter(camera, scale)
     estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())
     folder = None if flows is None else flows / estimator.name
-    poses = {
-        index: estimate.T_world_camera[row]
-        for row, index in enumerate(estimate.indices.tolist())
-        if estimate.tracked[row]
-    }
+    poses = _tracked_poses(estimate)
     before: np.ndarray | None = None
     for frame, truth in sequence:
         # Highlights move with the lamp, and pixels outside the field of view show no tissue: one mask for all methods.
@@ -213,6 +212,19 @@ def _consistency(
             true_depth_mm=None if truth is None else truth.depth_mm,
         )
     return {"consistency": meter.report() | {"flow": estimator.name}}
+
+
+def _contradiction(sequence: Sequence, estimate: Trajectory) -> dict[str, int]:
+    meter, masker, poses = FailureMeter(sequence.camera), Masker(MaskSettings()), _tracked_poses(estimate)
+    for frame, _ in sequence:
+        meter.add(frame.rgb, masker(frame).valid, poses.get(frame.index))
+    return meter.figures()
+
+
+def _tracked_poses(estimate: Trajectory) -> dict[int, np.ndarray]:
+    """Return the poses (4, 4) of the tracked frames by number."""
+    rows = np.flatnonzero(estimate.tracked)
+    return dict(zip(estimate.indices[rows].tolist(), estimate.T_world_camera[rows], strict=True))
 
 
 def flow_to_previous(
