@@ -1,7 +1,7 @@
 """Findings about a video's frames: time stamps, repeated, blank, blurred, badly exposed frames, odd colours, motion.
 
 Each check takes a `Clip` and yields findings, with the option that answers each as its advice. The limits of motion and
-texture separate clips that runs tracked whole (likeness above 0.84, motion below 2 % of the width, detail above 0.015)
+texture separate clips that runs track whole (correlation above 0.84, motion below 2 % of width, sharpness above 0.015)
 from a colonoscopy and a bare tube of which they lost most frames.
 """
 
@@ -16,7 +16,7 @@ from scopemap.io.video_format.interlacing import is_interlaced
 from scopemap.io.video_format.stereo_packing import Packing
 
 _BLACK_LEVEL = 16.0
-# Shares of the video's usual detail: of a blurred frame, of a soft one. No texture: detail of the usual frame.
+# Shares of the video's usual sharpness: of a blurred frame, of a soft one. No texture: sharpness of the usual frame.
 _BLURRED_SHARE, _SOFT_SHARE, _NO_TEXTURE = 0.35, 0.6, 0.008
 # Mean red over the stronger of green and blue, of tissue in white light.
 _LEAST_REDNESS, _MOSTLY = 1.1, 0.9
@@ -109,13 +109,13 @@ def _rhythm(single: tuple[Segment, ...]) -> str:
 
 def check_frames(clip: Clip) -> Iterator[VideoFinding]:
     """Yield which frames are blank, blurred, of another colour than tissue, or badly exposed."""
-    blank, black, detail = clip["blank"], clip["brightness"] <= _BLACK_LEVEL, clip["detail"]
+    blank, black, sharpness = clip["blank"], clip["brightness"] <= _BLACK_LEVEL, clip["sharpness"]
     for flags, code, words in ((blank & black, "black", "black"), (blank & ~black, "one-colour", "of one colour")):
         if segments := segments_of(flags):
             yield clip.finding("warning", code, f"{words}: {{frames}}", segments, "{selection}")
-    usual = np.median(detail[~blank]) if not blank.all() else 0.0
-    if segments := clip.segments(~blank & (detail < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2):
-        share = np.median(detail[covered(segments, len(clip))]) / usual
+    usual = np.median(sharpness[~blank]) if not blank.all() else 0.0
+    if segments := clip.segments(~blank & (sharpness < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2):
+        share = np.median(sharpness[covered(segments, len(clip))]) / usual
         message = (
             f"blurred, or without texture: {{frames}} show {share:.0%} of the usual sharpness (a smear on "
             "the lens, defocus, or tissue very near)"
@@ -151,21 +151,21 @@ def _dangers(clip: Clip) -> tuple[dict[str, np.ndarray], bool]:
 
     fast : the picture moves by more than 5 % of its width. unlike : hardly like the frame before, moved by its flow.
     cut : so unlike, between frames that are like their neighbours; not in `unlike`. soft : less than 0.6 of the usual
-    detail, but more than a blurred frame. Blank and repeated frames, which runs leave out, are in none of them.
+    sharpness, but more than a blurred frame. Blank and repeated frames, which runs leave out, are in none of them.
     """
     shown = ~clip["blank"] & ~clip.repeats
-    likeness, detail = clip["likeness"], clip["detail"]
-    usual = float(np.median(detail[shown])) if shown.any() else 0.0
+    correlation, sharpness = clip["correlation"], clip["sharpness"]
+    usual = float(np.median(sharpness[shown])) if shown.any() else 0.0
     # A picture after a blank or an unreadable one resembles nothing.
     gap = np.diff(clip["position"]) > clip.step
     follows = shown & ~np.concatenate([[True], clip["blank"][:-1] | gap])
-    around = np.minimum(np.concatenate([[1.0], likeness[:-1]]), np.concatenate([likeness[1:], [1.0]]))
-    cut = follows & (likeness < _CUT) & (around > _LIKE)
+    around = np.minimum(np.concatenate([[1.0], correlation[:-1]]), np.concatenate([correlation[1:], [1.0]]))
+    cut = follows & (correlation < _CUT) & (around > _LIKE)
     flags = {
         "cut": cut,
         "fast": follows & (clip["motion"] > _FAST),
-        "unlike": follows & (likeness < _UNLIKE) & ~cut,
-        "soft": shown & (detail < _SOFT_SHARE * usual) & (detail >= _BLURRED_SHARE * usual),
+        "unlike": follows & (correlation < _UNLIKE) & ~cut,
+        "soft": shown & (sharpness < _SOFT_SHARE * usual) & (sharpness >= _BLURRED_SHARE * usual),
     }
     return flags, usual < _NO_TEXTURE
 

@@ -25,9 +25,9 @@ class FrameMeasures:
     """Measures of one frame.
 
     position : in the input, from 0, as `--frames` counts. time_s : from the reader. blank : whether it shows next to
-    nothing that is not black. brightness : mean level in the field, 0-255. detail : the tracker's sharpness.
+    nothing that is not black. brightness : mean level in the field, 0-255. sharpness : as the tracker has it.
     change : mean difference from the last frame that was no repeat, grey levels. motion : median flow since the frame
-    before, share of the width. likeness : correlation with the frame before, moved by that flow, -1 to 1; 1 for the
+    before, share of the width. correlation : correlation with the frame before, moved by that flow, -1 to 1; 1 for the
     first frame. redness : mean red over the stronger of green and blue. clipped, dark, highlights : shares of the
     field. usable : share of the frame that a run would use.
     """
@@ -36,10 +36,10 @@ class FrameMeasures:
     time_s: float
     blank: bool
     brightness: float
-    detail: float
+    sharpness: float
     change: float
     motion: float
-    likeness: float
+    correlation: float
     redness: float
     clipped: float
     dark: float
@@ -82,16 +82,16 @@ class FrameInspector:
         darkest, middle = darker_channels(small)
         clipped = (middle >= BRIGHT_LEVEL) & inside
         red, green, blue, _ = cv2.mean(small, (inside & ~clipped).astype(np.uint8))
-        motion, likeness = self._motion(small)
+        motion, correlation = self._motion(small)
         measures = FrameMeasures(
             position=position,
             time_s=masked.time_s,
             blank=bool(is_constant(small) or lit[inside].mean() < _LEAST_LIT),
             brightness=sum(cv2.mean(small, inside.astype(np.uint8))[:3]) / 3,
-            detail=sharpness(masked.rgb, masked.valid),
+            sharpness=sharpness(masked.rgb, masked.valid),
             change=self._change(rgb, small),
             motion=motion,
-            likeness=likeness,
+            correlation=correlation,
             redness=red / max(green, blue, 1.0),
             clipped=float(clipped[inside].mean()),
             dark=1 - float(lit[inside].mean()),
@@ -112,7 +112,7 @@ class FrameInspector:
         return change
 
     def _motion(self, small: np.ndarray) -> tuple[float, float]:
-        """Return motion and likeness."""
+        """Return motion and correlation."""
         grey = cv2.cvtColor(shrunk(small, _FLOW_PX), cv2.COLOR_RGB2GRAY)
         before, self._before = self._before, grey
         if before is None:
@@ -122,8 +122,8 @@ class FrameInspector:
         # Large shades agree whatever moves: fine ones tell.
         fine, moved = _fine(before), cv2.remap(_fine(grey), x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR)
         norm = float(np.sqrt((fine**2).mean() * (moved**2).mean()))
-        likeness = float((fine * moved).mean()) / norm if norm > 0 else 1.0
-        return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / grey.shape[1], likeness
+        correlation = float((fine * moved).mean()) / norm if norm > 0 else 1.0
+        return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / grey.shape[1], correlation
 
 
 def _fine(grey: np.ndarray) -> np.ndarray:

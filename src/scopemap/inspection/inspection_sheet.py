@@ -21,7 +21,7 @@ _WIDTH_PX, _LEFT_PX, _HEAD_PX, _LINE_PX, _BAND_PX, _GAP_PX = 1300, 110, 50, 85, 
 _LINE_COLOUR, _SHOWN_COLOUR = "#404040", "#9ecae1"
 _FIELD_COLOUR, _OVERLAY_COLOUR, _INSET_COLOUR = "#00e5ff", "#ffea00", "#ff00ff"
 _MASK_TINT = np.array([0.0, 90.0, 255.0])
-_LINES = (("detail", "sharpness", 1), ("brightness", "brightness", 1), ("motion", "motion, % of width", 100))
+_LINES = (("sharpness", "sharpness", 1), ("brightness", "brightness", 1), ("motion", "motion, % of width", 100))
 _BANDS = {
     "black": "#000000",
     "one-colour": "#777777",
