@@ -17,7 +17,7 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import se3_exp, so3_exp
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap_bench.climb import figures as climb
-from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures
+from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures, climb_score
 from scopemap_bench.trajectories.climb import read_climb_reference, read_submap, write_submap
 
 QUARTER_TURN = Similarity(10.0, so3_exp(np.array([0, 0, np.pi / 2])), np.array([5.0, -3.0, 2.0]))
@@ -76,6 +76,38 @@ def test_a_case_worked_out_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     alone = evaluated(write_foreign_run(tmp_path / "alone", first), truth)
     assert alone["climb_rpe_1_mean_mm"] == pytest.approx(np.sqrt(2), abs=1e-6)
     assert alone["climb_tfr_percent"] == pytest.approx(20)
+
+
+@pytest.mark.parametrize(
+    ("ate_mm", "tfr_percent", "duration_share", "by_hand"),
+    [
+        (4.0, 100.0, 0.7, 4.0),
+        (4.0, 80.0, 1.5, 4.0 * 1.1 * 1.25),
+        (8.0, 60.0, 3.0, 8.0 * 1.2 * 1.5),
+        (1.0, 50.0, 0.5, 56.25),
+        (float("nan"), 0.0, 1.0, 56.25),
+    ],
+)
+def test_the_score_is_that_made_by_hand(
+    ate_mm: float, tfr_percent: float, duration_share: float, by_hand: float
+) -> None:
+    assert climb_score(ate_mm, tfr_percent, duration_share) == pytest.approx(by_hand)
+
+
+def test_a_run_that_says_how_long_it_took_has_a_score(tmp_path: Path) -> None:
+    true = path_of(300)
+    truth = write_reference(tmp_path / "truth", true)
+    run = write_foreign_run(tmp_path / "run", (true, [*range(1, 301)]))
+    assert "climb_score" not in evaluated(run, truth)
+    # 300 frames of 50 a second took half as long again; the path is exact, so the score is 0 whatever the time.
+    (run / "runtime.txt").write_text("init_seconds=1.0\nprocessing_seconds=9.0\n")
+    assert evaluated(run, truth)["climb_score"] == pytest.approx(0, abs=1e-6)
+    noisy = true.copy()
+    noisy[:, :3, 3] += np.random.default_rng(0).normal(size=(300, 3))
+    other = write_foreign_run(tmp_path / "noisy", (noisy, [*range(1, 301)]))
+    (other / "runtime.txt").write_text("init_seconds=1.0\nprocessing_seconds=9.0\n")
+    figures = evaluated(other, truth)
+    assert figures["climb_score"] == pytest.approx(1.25 * figures["climb_ate_mean_mm"], rel=0.01)
 
 
 def test_evo_agrees(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from scopemap.io.sequence import Sequence
 from scopemap.masking.masker import Masker
 from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap.trajectory.trajectory import Trajectory
+from scopemap_bench.climb.submission import with_score
 from scopemap_bench.evaluation import depth as depth_errors
 from scopemap_bench.evaluation.consistency import ConsistencyMeter, FrameMatcher
 from scopemap_bench.evaluation.depth import DEPTH_RANGES_MM, DepthPairs, DepthScaling
@@ -43,6 +44,8 @@ def score(
     """Return all figures of a run's folder that its sequence's truth allows, by group; `flows` keeps flow."""
     estimate, reference = read_trajectory(folder), reference_trajectory(sequence)
     figures, matched = pose_groups(estimate, reference, protocol, align or protocol.align)
+    if "climb" in figures:
+        figures["climb"] = with_score(figures["climb"], folder, estimate)
     if matched is not None and protocol.surface:
         surface = surface_figures_of(folder, sequence, matched.similarity, icp=protocol.icp)
         figures |= {"surface": surface} if surface else {}

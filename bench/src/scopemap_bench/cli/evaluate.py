@@ -81,6 +81,7 @@ def evaluate(
     from scopemap.evaluation.poses import match, pose_report
     from scopemap.io.reference import read_reference
     from scopemap.trajectory.formats.opening import read_trajectory
+    from scopemap_bench.climb.submission import with_score
     from scopemap_bench.evaluation.paper import paper_figures
     from scopemap_bench.scoring import depth_groups
 
@@ -102,6 +103,8 @@ def evaluate(
     if paper_units:
         figures["paper"] = paper_figures(matched)
     figures |= _protocols(estimate, reference, protocol or [])
+    if "climb" in figures:
+        figures["climb"] = with_score(figures["climb"], trajectory, estimate)
     if depth or consistency:
         figures |= depth_groups(trajectory, truth, depth, consistency=consistency, matched=matched)
     figures |= own

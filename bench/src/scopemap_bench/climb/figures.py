@@ -15,6 +15,8 @@ from scopemap.trajectory.trajectory import Trajectory
 LEAST_FRAMES = 250
 """Frames of the reference that a submap needs to count, 5 s of video; 100 before the challenge's commit 79d7435."""
 
+# The score's factors, at most, and the error of a clip of which not more than half is found, mm.
+_MOST_WEIGHT, _FAILED_MM, _LEAST_TFR_PERCENT = 1.5, 25.0, 50.0
 _RPE_FRAMES = (1, 10, 20, 40)
 _RPE_NAMES = tuple(f"rpe_{step}_mean_{unit}" for step in _RPE_FRAMES for unit in ("mm", "deg"))
 _ERRORS = ("ate_mean_mm", "ate_median_mm", "ate_std_mm", *_RPE_NAMES)
@@ -45,6 +47,21 @@ def climb_figures(estimate: Trajectory, reference: Trajectory) -> dict[str, floa
         "matched_poses": float(sum(matched)),
         "reference_poses": float(len(known)),
     }
+
+
+def climb_score(ate_mean_mm: float, tfr_percent: float, duration_share: float) -> float:
+    """Return the challenge's score of a clip, lower is better: ATE times W_rtf times W_t.
+
+    duration_share : processing time over the clip's duration. W_rtf grows from 1 with all frames found to 1.5 with
+    none; W_t from 1 up to the clip's duration to 1.5 from twice that. A clip with a TFR of 50 % or less has 25 mm and
+    both factors at their most. The challenge does not publish the factors: these give what a competitor quotes of the
+    board (JmeesInc/CLiMB26-jmees at c286e1f): W_rtf 1.094 at 81.3 %, W_t 1 at 0.020, 1.15 at 0.026 and 1.5 at 0.077 s a
+    frame of 50 a second, 56.25 for a failed clip.
+    """
+    if not tfr_percent > _LEAST_TFR_PERCENT:
+        return _FAILED_MM * _MOST_WEIGHT**2
+    weights = np.array([1 - tfr_percent / 100, np.clip(duration_share - 1, 0, 1)]) * (_MOST_WEIGHT - 1) + 1
+    return float(ate_mean_mm * weights.prod())
 
 
 def _errors(estimated: np.ndarray, reference: np.ndarray, frames: np.ndarray) -> list[float]:

@@ -12,6 +12,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from scopemap.io.run_folder import RunFolder, read_mesh
 from scopemap.trajectory.formats.folders import read_run, submap_folders
 from scopemap.trajectory.formats.text import text_lines
 from scopemap.trajectory.trajectory import Trajectory
+from scopemap_bench.climb.figures import climb_score
 from scopemap_bench.trajectories.climb import read_submap, write_submap
 
 RUNS = ("1", "2", "3", "4", "5")
@@ -38,10 +40,7 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
     """
     try:
         facts = RunFolder(run).provenance
-        seconds, clip = facts["seconds"], clip or Path(facts["input"]).stem
-        prepare_s, fuse_s = seconds.get("prepare", 0.0), seconds.get("fuse", 0.0) + seconds.get("check surface", 0.0)
-        # The time up to the last pose, the back end included; the mesh comes after it.
-        times = zip(RUNTIME_KEYS, (prepare_s, seconds["total"] - prepare_s - fuse_s), strict=True)
+        times, clip = zip(RUNTIME_KEYS, _times_s(facts), strict=True), clip or Path(facts["input"]).stem
     except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"exporting {run}: it is not the folder of a finished run ({error})") from None
     first, *others = (out / clip / number for number in RUNS)
@@ -53,6 +52,27 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
     except OSError as error:
         raise InputError(f"cannot write a submission: {error.filename}: {error.strerror}") from None
     return clip
+
+
+def with_score(figures: dict[str, float], run: Path, estimate: Trajectory) -> dict[str, float]:
+    """Return the protocol's figures with "climb_score", where the folder says how long its run took."""
+    try:
+        text = (run / "runtime.txt").read_text() if (run / "runtime.txt").is_file() else ""
+        stated_s = text.partition(f"{RUNTIME_KEYS[1]}=")[2].split()
+        processing_s = float(stated_s[0]) if text else _times_s(RunFolder(run).provenance)[1]
+    except (OSError, InputError, LookupError, ValueError, TypeError, AttributeError):
+        return figures
+    times_s = np.unique(np.concatenate([submap.times_s for submap in (estimate, *estimate.others)]))
+    duration_s = float(np.ptp(times_s) + np.median(np.diff(times_s)))
+    score = climb_score(figures["climb_ate_mean_mm"], figures["climb_tfr_percent"], processing_s / duration_s)
+    return figures | {"climb_score": score}
+
+
+def _times_s(facts: dict[str, Any]) -> tuple[float, float]:
+    """Return a run's time before the first frame, and that up to the last pose: the mesh comes after it."""
+    seconds = facts["seconds"]
+    prepare_s, fuse_s = seconds.get("prepare", 0.0), seconds.get("fuse", 0.0) + seconds.get("check surface", 0.0)
+    return prepare_s, seconds["total"] - prepare_s - fuse_s
 
 
 def _write_maps(run: Path, folder: Path) -> None:
