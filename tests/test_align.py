@@ -84,6 +84,12 @@ def test_about_a_straight_path_orientations_decide(seed: int, width_mm: float) -
     assert found.straight
     assert rotation_angle_rad(np.swapaxes(aligned[:, :3, :3], 1, 2) @ truth[:, :3, :3]).max() < 0.01
     assert np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.6
+    # Neither does a straight estimate of a bent path tell it.
+    bent = truth.copy()
+    bent[:, :3, 3] += 3 * np.sin(truth[:, :1, 3]) * [[0.0, 1.0, 0.3]]
+    aligned, found = align_trajectories(moved, bent, "sim3", by_orientations=True)
+    assert found.straight
+    assert rotation_angle_rad(np.swapaxes(aligned[:, :3, :3], 1, 2) @ truth[:, :3, :3]).mean() < 0.5
     curved, other = random_poses(rng), random_poses(rng)
     as_evo, found = (align_trajectories(curved, other, "se3", by_orientations=by) for by in (False, True))
     assert not found[1].straight

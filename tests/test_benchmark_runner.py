@@ -99,7 +99,6 @@ def test_every_method_is_a_row_and_one_that_dies_says_so(done: tuple[Benchmark, 
     assert ours.figures["poses"]["tracked"] == 6
     assert 0 < ours.figure("poses", "ate_rmse_mm") < still.figure("poses", "ate_rmse_mm")
     assert ours.figure("poses", "frames_until_contradicted") == 6
-    assert still.figure("poses", "frames_until_contradicted_at_1_px") <= 6
     assert math.isnan(imported.figure("poses", "ate_rmse_mm"))
     assert {"poses", "paper", "evo", "depth", "surface"} <= set(ours.figures)
     assert {"machine", "commit", "versions", "align", "key"} <= set(ours.facts)

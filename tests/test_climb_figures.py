@@ -108,6 +108,11 @@ def test_a_run_that_says_how_long_it_took_has_a_score(tmp_path: Path) -> None:
     (other / "runtime.txt").write_text("init_seconds=1.0\nprocessing_seconds=9.0\n")
     figures = evaluated(other, truth)
     assert figures["climb_score"] == pytest.approx(1.25 * figures["climb_ate_mean_mm"], rel=0.01)
+    # Frames that are lost at the end belong to the clip: it is as long.
+    part = write_foreign_run(tmp_path / "part", (noisy[:270], [*range(1, 271)]))
+    (part / "runtime.txt").write_text("preprocessing_seconds=99\ninit_seconds=1.0\nprocessing_seconds = 6.0\n")
+    figures = evaluated(part, truth)
+    assert figures["climb_score"] == pytest.approx(1.05 * figures["climb_ate_mean_mm"], rel=0.01)
 
 
 def test_evo_agrees(tmp_path: Path) -> None:

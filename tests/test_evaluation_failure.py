@@ -40,6 +40,8 @@ CHANGES: dict[str, tuple[Change, int, int]] = {
     "a jump of 6 degrees": (lambda n, pose: pose @ se3_exp(np.array([0, 0.1, 0, 0, 0, 0.0]) * (n >= AT)), AT, AT),
     "growing": (grown, AT, AT + 4),
     "missing": (lambda n, pose: None if n >= AT else pose, AT, AT),
+    "not before it begins": (lambda n, pose: pose if n > 5 else None, FRAMES, FRAMES),
+    "never": (lambda *_: None, 0, 0),
     "missing twice": (lambda n, pose: None if n in (AT, AT + 1) else pose, FRAMES, FRAMES),
 }
 

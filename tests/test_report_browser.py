@@ -370,7 +370,7 @@ def test_without_a_scale_a_reference_is_the_unit(browser: Any, tmp_path: Path) -
         assert opened.text("#hand-note") == "Saved as measurements.json beside the result."
         assert json.loads((folder / "measurements.json").read_text())[0]["folder"] == "maps/1"
         assert Opened(browser, server.url).page.locator("#measures li").all_inner_texts() == [words]
-        with pytest.raises(InputError, match="no list"):
+        with pytest.raises(InputError, match="no list of measurements"):
             keep_measurements(folder, b"{}")
     finally:
         server.close()

@@ -44,8 +44,8 @@ def score(
     """Return all figures of a run's folder that its sequence's truth allows, by group; `flows` keeps flow."""
     estimate, reference = read_trajectory(folder), reference_trajectory(sequence)
     figures, matched = pose_groups(estimate, reference, protocol, align or protocol.align)
-    if "climb" in figures:
-        figures["climb"] = with_score(figures["climb"], folder, estimate)
+    if "climb" in figures and reference is not None:
+        figures["climb"] = with_score(figures["climb"], folder, estimate, reference)
     if matched is not None and protocol.surface:
         surface = surface_figures_of(folder, sequence, matched.similarity, icp=protocol.icp)
         figures |= {"surface": surface} if surface else {}

@@ -131,16 +131,18 @@ def _fit(estimated: np.ndarray, reference: np.ndarray, mode: AlignMode, by_orien
 
 
 def _turned(found: Similarity, estimated: np.ndarray, reference: np.ndarray) -> Similarity:
-    """Return the similarity turned about a nearly straight reference, so that orientations (N, 3, 3) agree best.
+    """Return the similarity turned about the path, where either is nearly straight, so that orientations agree best.
 
     The turn by t about the unit vector a that maximises the trace of R_turn^T M, M = sum of R_reference R_estimated^T,
     which is cos t (tr M - a^T M a) + sin t (a . v) + a^T M a, v the vector of M - M^T.
     """
     centre = reference[:, :3, 3].mean(0)
-    _, spread, axes = np.linalg.svd(reference[:, :3, 3] - centre, full_matrices=False)
-    if not spread[1] ** 2 < _STRAIGHT * spread[0] ** 2:
+    paths = (found.transform_points(estimated[:, :3, 3]), reference[:, :3, 3])
+    spreads, axes = zip(*(np.linalg.svd(path - path.mean(0), full_matrices=False)[1:] for path in paths), strict=True)
+    ratio, axis = min((spread[1] / spread[0], main) for spread, (main, *_) in zip(spreads, axes, strict=True))
+    if not ratio**2 < _STRAIGHT:
         return found
     M = np.einsum("nij,nkj->ik", reference[:, :3, :3], found.R @ estimated[:, :3, :3])
     v = np.array([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]])
-    turn = so3_exp(np.arctan2(axes[0] @ v, np.trace(M) - axes[0] @ M @ axes[0]) * axes[0])
+    turn = so3_exp(np.arctan2(axis @ v, np.trace(M) - axis @ M @ axis) * axis)
     return Similarity(found.scale, turn @ found.R, centre + turn @ (found.t - centre), straight=True)

@@ -88,7 +88,8 @@ class OverlayWatcher:
         if outside:
             message = f"{len(outside)} overlay(s) beside the field of view ({_kinds(outside)}): {_places(outside)}"
             yield VideoFinding("info", "overlay-outside", message)
-        if any(one.is_text for one in overlays):
+        # Beside the field no instrument rests, but patients' data often stand: a name in letters that are not read.
+        if outside or any(one.is_text for one in overlays):
             message = "burned-in text may name a patient: look before you pass the video or pictures of it on"
             yield VideoFinding("info", "overlay-privacy", message)
 

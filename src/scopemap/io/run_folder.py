@@ -76,6 +76,12 @@ class RunFolder:
         """The result first, then maps/1, maps/2, ..."""
         return [self, *(RunFolder(folder) for folder in submap_folders(self.path)[1:])]
 
+    @property
+    def is_submap(self) -> bool:
+        """Whether it is `maps/N` of a result."""
+        folder = self.path.resolve().parent
+        return folder.name == "maps" and (folder.parent / "provenance.json").is_file()
+
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
         """The surface with its vertices' attributes; empty where there is no mesh.ply or no face."""
@@ -113,7 +119,7 @@ class RunFolder:
     def depth(self) -> DepthReader:
         """The final depth of its frames; that of a submap is the run's."""
         own = DepthReader(self.path)
-        return own if own.present or self.path.parent.name != "maps" else DepthReader(self.path.parent.parent)
+        return own if own.present or not self.is_submap else DepthReader(self.path.resolve().parent.parent)
 
     def picture_file(self, index: int) -> Path:
         """Return the file of a frame's small picture."""

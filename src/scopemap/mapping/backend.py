@@ -28,7 +28,7 @@ from scopemap.mapping.depth_correction import (
     fit_depth_corrections,
 )
 from scopemap.mapping.feature_tracks import FeatureTracks
-from scopemap.mapping.loop_closure import LOOP, Loop, LoopFinder
+from scopemap.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
 from scopemap.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
@@ -336,7 +336,8 @@ class Backend:
             factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
             after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
         both = ((self._as_tracked(chosen, worlds), before), (inverse(found.state.T_camera_world), after))
-        gaps = self.settings.keyframe_gaps
+        # Farther apart two keyframes may have a few pixels in common, which prove nothing.
+        gaps = [gap for gap in self.settings.keyframe_gaps if gap <= MOST_RECENT]
         tracked, adjusted = (depth_disagreement(self._camera, T, grids, gaps) for T, grids in both)
         for was, now in zip(tracked, adjusted, strict=True):
             if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):

@@ -28,13 +28,12 @@ from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.se3 import inverse
 from scopemap.geometry.uncertainty import relative_sigma
 from scopemap.mapping.bundle_problem import Observations, Points
-from scopemap.mapping.loop_closure import Loop
+from scopemap.mapping.loop_closure import MOST_RECENT, Loop
 
 _CELL_PX = 16  # one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.
 _MOST_MAPS = 20
 _CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
-_MOST_COMPOSED = 8  # keyframes between which flows are composed
 _LEAST_IN_COMMON = 0.15  # of either picture, by depth and poses as tracked
 
 
@@ -87,9 +86,12 @@ class FeatureTracks:
         recent = self._recent[map_number] = self._recent.pop(map_number, deque(maxlen=max(self.settings.keyframe_gaps)))
         for oldest in [*self._recent][:-_MOST_MAPS]:
             del self._recent[oldest]
-        # With the flows of each new map memory would grow by tens of megabytes.
-        for past in (past for other, others in self._recent.items() if other != map_number for past in others):
-            past.composed = None
+        # With the flows, and the older keyframes, of each new map memory would grow by tens of megabytes.
+        for others in (others for other, others in self._recent.items() if other != map_number):
+            while len(others) > MOST_RECENT:
+                others.popleft()
+            for past in others:
+                past.composed = None
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
         new = _FlowKeyframe(self._keyframe_count, number_in_map, _slim(keyframe), corners, first)
         self._match_with(recent, new)
@@ -105,7 +107,7 @@ class FeatureTracks:
         for past in recent:
             gap = new.number_in_map - past.number_in_map
             start: FlowPair | None = None
-            if gap > _MOST_COMPOSED:
+            if gap > MOST_RECENT:
                 past.composed = None
                 start = _expected_flows(past.frame, new.frame) if gap in self.settings.keyframe_gaps else None
             elif past is latest:

@@ -21,7 +21,8 @@ _CANDIDATES = 3
 _STATIC_PX = 2.0
 # With a camera at rest every keyframe would close loops to the same few ones; the adjustment's cost is their square.
 _MIN_INTERVAL, _MAX_LOOPS = 5, 20  # keyframes between two loops to the same keyframe, loops to one keyframe
-_MOST_RECENT = 8  # keyframes just before, to which flow matches: loops are sought to those before them
+MOST_RECENT = 8
+"""Keyframes just before a new one: flow leads to them, and loops are sought to those before them."""
 _MAX_PAIRS = 60  # features of a loop
 MOST_SEARCHED = 400
 """Keyframes with features; above, every second one is forgotten, so that memory and time of a search are bounded."""
@@ -92,7 +93,7 @@ class LoopFinder:
         self._detector = detector or SiftFeatures()
         self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
         self._min_inliers, gaps = settings.constants.min_loop_inliers, settings.constants.keyframe_gaps
-        self._max_gap = min(max(gaps), _MOST_RECENT)
+        self._max_gap = min(max(gaps), MOST_RECENT)
         self._features: dict[int, _KeptFeatures] = {}
         self._rows = table("features", self._kind)
         self._map_of: dict[int, int] = {}

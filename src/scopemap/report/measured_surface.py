@@ -32,7 +32,7 @@ def measured_mesh(run: RunFolder) -> trimesh.Trimesh:
 
     A vertex is off by a part of the shown triangles' size, which is far below the errors of depth.
     """
-    mesh = simplified(run.mesh, FACES_OF_OTHERS if run.path.parent.name == "maps" else MOST_FACES)
+    mesh = simplified(run.mesh, FACES_OF_OTHERS if run.is_submap else MOST_FACES)
     low, spread, levels = levels_of(mesh)
     return trimesh.Trimesh(low + levels / LARGEST_LEVEL * spread, mesh.faces, process=False)
 

@@ -20,7 +20,7 @@ from scopemap.io.json_numbers import without_nan
 from scopemap.io.run_folder import RunFolder
 from scopemap.report.frame_pictures import FOLDER as PICTURES
 from scopemap.report.measured_surface import MOST_FACES
-from scopemap.report.page_data import MEASUREMENTS, page_data, read_measurements, shown_meshes
+from scopemap.report.page_data import MEASUREMENTS, checked_measurements, page_data, read_measurements, shown_meshes
 from scopemap.report.serving import LocalServer
 from scopemap.report.shown_mesh import base64_of
 from scopemap.report.summary_picture import summary_picture
@@ -87,10 +87,9 @@ def keep_measurements(folder: Path | str, sent: bytes) -> None:
     """
     file = Path(folder) / MEASUREMENTS
     with reporting(f"cannot write {file}"):
-        found = json.loads(sent)
-        if not isinstance(found, list):
-            raise ValueError("what was measured is no list")
-        file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        text = json.dumps(checked_measurements(sent), indent=1)
+        file.with_suffix(".part").write_text(f"{text}\n", encoding="utf-8")
+        file.with_suffix(".part").replace(file)
 
 
 def serve_view(folder: Path | str, port: int = 0) -> LocalServer:

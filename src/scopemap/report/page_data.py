@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from base64 import b64encode
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import ScopemapError
@@ -131,10 +131,36 @@ def _frames(run: RunFolder) -> dict[str, Any]:
 def read_measurements(folder: Path) -> list[Any]:
     """Return what was measured by hand on a page and kept beside the result; [] where nothing was, or it is damaged."""
     try:
-        found = json.loads((folder / MEASUREMENTS).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return checked_measurements((folder / MEASUREMENTS).read_bytes())
+    except (OSError, ValueError):
         return []
-    return found if isinstance(found, list) else []
+
+
+class _Value(BaseModel):
+    what: str
+    value: float | None
+    low: float | None
+    high: float | None
+    unit: str
+
+
+class _ByHand(BaseModel):
+    folder: str
+    frame: int
+    points: list[tuple[float, float]]
+    reference: list[tuple[float, float]] | None
+    reference_mm: float | None
+    found: list[_Value]
+    command: str
+    world: list[tuple[float, float, float]]
+
+
+def checked_measurements(text: bytes) -> list[dict[str, Any]]:
+    """Return what a page keeps of measuring by hand, from its JSON; raises `ValueError` where it is anything else."""
+    try:
+        return [one.model_dump() for one in TypeAdapter(list[_ByHand]).validate_json(text)]
+    except ValidationError:
+        raise ValueError("it is no list of measurements") from None
 
 
 def _pose_of(submap: RunFolder) -> dict[int, np.ndarray]:

@@ -125,7 +125,7 @@ def _handler(
 def _taken(request: BaseHTTPRequestHandler, upload: Callable[[bytes], None]) -> int:
     """Hand on what a request sends, and return the code of the answer."""
     size = request.headers.get("Content-Length", "")
-    if not size.isdecimal() or int(size) > _MOST_SENT:
+    if not size.isdecimal() or len(size) > 9 or int(size) > _MOST_SENT:
         return 413
     try:
         upload(request.rfile.read(int(size)))

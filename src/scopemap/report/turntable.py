@@ -32,7 +32,7 @@ def write_turntable(folder: Path | str, file: Path, frames: int = _FRAMES) -> No
     points = np.concatenate([np.asarray(mesh.bounds), poses[:, :3, 3]])
     centre, radius = (points.min(axis=0) + points.max(axis=0)) / 2, np.linalg.norm(np.ptp(points, axis=0)) / 2
     with reporting(f"cannot write {file}"), av.open(str(file), "w") as film:
-        stream = film.add_stream("libvpx-vp9" if file.suffix == ".webm" else "libx264", rate=_FRAMES_PER_S)
+        stream = film.add_stream("libvpx-vp9" if file.suffix.lower() == ".webm" else "libx264", rate=_FRAMES_PER_S)
         stream.pix_fmt, stream.bit_rate = "yuv420p", _QUALITY_BITS
         for number in range(frames):
             view = view_of(poses[0][:3, :3], centre, float(radius), 2 * np.pi * number / frames, _PITCH_RAD)

@@ -77,6 +77,8 @@ def _compare_two(paths: list[Path], names: list[str], out: Path | None, *, as_js
 
     if names and len(names) != len(paths):
         raise InputError(f"comparing {len(paths)} runs: {len(names)} names were given")
+    if paths[0].resolve() == paths[1].resolve():
+        raise InputError(f"comparing {paths[0]} with itself: give two runs")
     first, second = names or [path.resolve().name for path in paths]
     if first == second:
         first, second = map(str, paths)

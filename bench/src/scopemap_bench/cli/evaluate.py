@@ -104,7 +104,7 @@ def evaluate(
         figures["paper"] = paper_figures(matched)
     figures |= _protocols(estimate, reference, protocol or [])
     if "climb" in figures:
-        figures["climb"] = with_score(figures["climb"], trajectory, estimate)
+        figures["climb"] = with_score(figures["climb"], trajectory, estimate, reference)
     if depth or consistency:
         figures |= depth_groups(trajectory, truth, depth, consistency=consistency, matched=matched)
     figures |= own

@@ -54,16 +54,19 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
     return clip
 
 
-def with_score(figures: dict[str, float], run: Path, estimate: Trajectory) -> dict[str, float]:
-    """Return the protocol's figures with "climb_score", where the folder says how long its run took."""
+def with_score(figures: dict[str, float], run: Path, estimate: Trajectory, reference: Trajectory) -> dict[str, float]:
+    """Return the protocol's figures with "climb_score", where the folder says how long its run took.
+
+    The clip is as long as the frames of both trajectories, at the intervals of the estimate's time stamps.
+    """
     try:
-        text = (run / "runtime.txt").read_text() if (run / "runtime.txt").is_file() else ""
-        stated_s = text.partition(f"{RUNTIME_KEYS[1]}=")[2].split()
-        processing_s = float(stated_s[0]) if text else _times_s(RunFolder(run).provenance)[1]
-    except (OSError, InputError, LookupError, ValueError, TypeError, AttributeError):
+        file = run / "runtime.txt"
+        processing_s = _stated_s(file)[RUNTIME_KEYS[1]] if file.is_file() else _times_s(RunFolder(run).provenance)[1]
+    except (InputError, LookupError, ValueError, TypeError, AttributeError):
         return figures
-    times_s = np.unique(np.concatenate([submap.times_s for submap in (estimate, *estimate.others)]))
-    duration_s = float(np.ptp(times_s) + np.median(np.diff(times_s)))
+    frames = np.concatenate([one.indices for one in (estimate, *estimate.others, reference)])
+    frame_s = float(np.median(np.diff(estimate.times_s) / np.diff(estimate.indices)))
+    duration_s = (np.ptp(frames) + 1) * frame_s
     score = climb_score(figures["climb_ate_mean_mm"], figures["climb_tfr_percent"], processing_s / duration_s)
     return figures | {"climb_score": score}
 
@@ -116,7 +119,7 @@ def _clip_problems(clip: Path) -> Iterator[str]:
 
 def _run_problems(run: Path) -> Iterator[str]:
     maps, trajectories = run / "3D_maps", run / "camera_trajectory"
-    checks: list[tuple[Callable[[Path], object], Path]] = [(_check_runtime, run / "runtime.txt")]
+    checks: list[tuple[Callable[[Path], object], Path]] = [(_stated_s, run / "runtime.txt")]
     names, expected = _folders(maps), set[Path]()
     if not names:
         yield f"{maps}: no map"
@@ -138,11 +141,16 @@ def _run_problems(run: Path) -> Iterator[str]:
             yield str(error)
 
 
-def _check_runtime(file: Path) -> None:
+def _stated_s(file: Path) -> dict[str, float]:
+    """Return the times that runtime.txt states; raises `InputError` where one is missing."""
     lines = [line.replace(" ", "") for line in text_lines(file)]
+    stated = {}
     for key in RUNTIME_KEYS:
-        if not any(re.fullmatch(rf"{key}=\d+(\.\d+)?(e[-+]?\d+)?", line) for line in lines):
+        found = [line for line in lines if re.fullmatch(rf"{key}=\d+(\.\d+)?(e[-+]?\d+)?", line)]
+        if not found:
             raise InputError(f"{file}: expected a line {key}=<seconds>")
+        stated[key] = float(found[0].partition("=")[2])
+    return stated
 
 
 def _check_points(file: Path) -> None:

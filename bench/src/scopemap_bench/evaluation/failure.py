@@ -2,8 +2,8 @@
 
 The relative pose of two frames lets a point of the first be seen on a segment of the second: from where it would be at
 infinity to where it would be at twice the translation. Flow that ends beside these segments contradicts the pose; so
-does a missing pose, and a depth of the scene, as flow and translation imply it, that jumps. What a method itself calls
-lost is another figure, `frames_until_loss`. The form and the limits are ours.
+does a missing pose after the first one, and a depth of the scene, as flow and translation imply it, that jumps. What a
+method itself calls lost is another figure, `frames_until_loss`. The form and the limits are ours.
 """
 
 from __future__ import annotations
@@ -40,18 +40,20 @@ class FailureMeter:
         self._before: deque[tuple[np.ndarray, np.ndarray, np.ndarray | None]] = deque(maxlen=_STEP)
         self._log_depths: deque[float] = deque(maxlen=_KEPT)
         self._off_px: list[float] = []
+        self._has_begun = False
 
     def add(self, rgb: np.ndarray, valid: np.ndarray, T_world_camera: np.ndarray | None) -> None:
         """Add the next frame: (H, W, 3) uint8, its usable pixels (H, W) bool, its pose (4, 4) or None."""
         past = self._before[0] if self._before else None
-        self._off_px.append(math.inf if T_world_camera is None else 0.0)
+        self._has_begun |= T_world_camera is not None
+        self._off_px.append(math.inf if self._has_begun and T_world_camera is None else 0.0)
         if past is not None and past[2] is not None and T_world_camera is not None:
             self._off_px[-1] = self._off((past[0], rgb), (past[1], valid), inverse(T_world_camera) @ past[2])
         self._before.append((rgb, valid, T_world_camera))
 
     def figures(self) -> dict[str, int]:
         """Return frames_until_contradicted, and _at_N_px for each of `LIMITS_PX`; all frames where none is."""
-        off_px = np.array(self._off_px)
+        off_px = np.array(self._off_px) if self._has_begun else np.full(len(self._off_px), math.inf)
         counts = {limit: _until(off_px > limit) for limit in LIMITS_PX}
         name = "frames_until_contradicted"
         return {name: counts[LIMIT_PX]} | {f"{name}_at_{limit:g}_px": count for limit, count in counts.items()}

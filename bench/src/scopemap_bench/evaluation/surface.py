@@ -172,9 +172,10 @@ def distances_mm(points: np.ndarray, surface: Surface) -> np.ndarray:
 
 
 def thinned(surface: Surface) -> Surface:
-    """Return points (N, 3) with one of each cube of 0.2 mm, by which distances change by 0.01 mm; a mesh as it is.
+    """Return points (N, 3) with one of each cube of 0.2 mm; a mesh as it is.
 
-    A SCARED keyframe has 1.3 million, twenty to a triangle of a reconstruction: measuring took minutes.
+    A SCARED keyframe has 1.3 million, twenty to a triangle of a reconstruction: measuring took minutes. Distances of
+    0.2 mm and more grow by less than 0.02 mm, smaller ones by up to 0.05 mm.
     """
     if isinstance(surface, trimesh.Trimesh):
         return surface

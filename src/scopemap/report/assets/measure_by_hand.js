@@ -86,6 +86,7 @@ function pickInFrame(event) {
   const zoom = Math.min(box.width / canvas.width, box.height / canvas.height), c = run.camera; // object-fit: contain
   const at = (client, start, size, pixels, all) => ((client - start - (size - pixels * zoom) / 2) / zoom) * (all / pixels) - 0.5;
   const pixel = rounded([at(event.clientX, box.left, box.width, canvas.width, c.width), at(event.clientY, box.top, box.height, canvas.height, c.height)]);
+  if (!pixel.every((value, k) => value >= -0.5 && value < [c.width, c.height][k] - 0.5)) return;
   const pose = run.poseOf(picture.row), found = meet(surfaceOf(run.maps[shown]), pose.t, rotated(pose.R, unprojected(c, pixel)));
   pick(found && { picture, pixel, at: found.at });
 }
@@ -155,8 +156,8 @@ function writeMeasures() {
 async function saveMeasures() {
   const text = JSON.stringify(hand.list, null, 1);
   if (data.served) {
-    const answer = await fetch("measurements.json", { method: "POST", body: text });
-    return tell(answer.ok ? "Saved as measurements.json beside the result." : "The server could not write measurements.json.");
+    const answer = await fetch("measurements.json", { method: "POST", body: text }).catch(() => ({ ok: false }));
+    return tell(answer.ok ? "Saved as measurements.json beside the result." : "measurements.json could not be written: has scopemap view ended?");
   }
   const link = document.createElement("a");
   Object.assign(link, { href: URL.createObjectURL(new Blob([text], { type: "application/json" })), download: "measurements.json" });
@@ -165,9 +166,8 @@ async function saveMeasures() {
 }
 
 async function openMeasures() {
-  if (data.served) run.measurements = await (await fetch("measurements.json")).json();
-  const whole = (one) => one && [one.points, one.world, one.found].every(Array.isArray) && typeof one.folder === "string";
-  Object.assign(hand, { mode: "", picks: [], reference: null, list: (run.measurements || []).filter(whole) });
+  if (data.served) run.measurements = await fetch("measurements.json").then((answer) => answer.json()).catch(() => []);
+  Object.assign(hand, { mode: "", picks: [], reference: null, list: run.measurements || [] });
   element("by-hand").hidden = !run.measuring || !run.pictures.length;
   writeMeasures();
 }
@@ -175,6 +175,7 @@ async function openMeasures() {
 function listenToHand() {
   const choose = (mode) => {
     const without = mode !== "reference" && !run.scale_known && !hand.reference;
+    if (mode === "reference" && hand.mode !== mode) hand.reference = null; // chosen anew, or removed by Escape
     Object.assign(hand, { mode: hand.mode === mode || without ? "" : mode, picks: [] });
     tell(without ? "Sizes are unknown: first choose Reference and click the two points of a distance, of which all else is a multiple." : "");
     writeMeasures();
