@@ -139,8 +139,9 @@ def _turned(found: Similarity, estimated: np.ndarray, reference: np.ndarray) -> 
     centre = reference[:, :3, 3].mean(0)
     paths = (found.transform_points(estimated[:, :3, 3]), reference[:, :3, 3])
     spreads, axes = zip(*(np.linalg.svd(path - path.mean(0), full_matrices=False)[1:] for path in paths), strict=True)
-    ratio, axis = min((spread[1] / spread[0], main) for spread, (main, *_) in zip(spreads, axes, strict=True))
-    if not ratio**2 < _STRAIGHT:
+    ratios = [spread[1] / spread[0] for spread in spreads]
+    axis = axes[int(np.argmin(ratios))][0]
+    if not min(ratios) ** 2 < _STRAIGHT:
         return found
     M = np.einsum("nij,nkj->ik", reference[:, :3, :3], found.R @ estimated[:, :3, :3])
     v = np.array([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]])
