@@ -99,7 +99,7 @@ def align_trajectories(
     Both are (N, 4, 4) float64 camera-to-world, mm, matched row by row. `none` moves nothing, `origin` puts the first
     poses onto each other, `se3` and `sim3` fit the positions (`umeyama`), `scale` takes the scale of the `sim3` fit and
     neither rotates nor translates. `first` fits the first rows only (evo's `--n_to_align`) and moves all.
-    `by_orientations` fits the turn about a nearly straight reference to the orientations: positions do not tell it.
+    `by_orientations` fits the turn about the path, where either is nearly straight, to the orientations.
     Raises `AlignmentError` where the fit is degenerate, `mode` is unknown, or `first` is given to a mode that fits
     nothing.
     """

@@ -51,6 +51,8 @@ def compare(
     if truth is not None:
         refuse_run_as_truth(truth)
     elif len(paths) == 2 and all(RunFolder(path).is_finished for path in paths):
+        if (align, unit, consistency, paper_units) != ("sim3", "mm", False, False):
+            raise InputError("--align, --unit, --consistency and --paper-units need --truth: two runs alone have none")
         _compare_two(paths, given, out, as_json=as_json, quiet=quiet)
         return
     protocol = ProtocolPlan(align=align, consistency=consistency)
