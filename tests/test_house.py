@@ -175,7 +175,7 @@ CEILINGS = {
     "core, net": (lambda: _net(MODULES), 19_360),
     "bench": (lambda: _total(BENCH_MODULES), 11_890),  # 235: two runs; 195: verdicts; 145: failures; 40: score
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 32_280),  # those of all of these; 230 for the network that no command may ask for
+    "tests": (lambda: _total(TESTS), 32_310),  # those of all of these; 230: a network at rest; 30: merging by the graph
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 95),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 13_275),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import MappingSettings
+from scopemap.config.mapping import MappingConstants
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
@@ -26,6 +28,7 @@ from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.io.depth_maps import DepthReader
 from scopemap.mapping import Backend, Mapper, TrackedPose
+from scopemap.mapping.pose_graph import PoseGraph, optimise_pose_graph
 from scopemap.mapping.submaps import corrected_frame
 from scopemap.tracking.relocalisation import Relocaliser
 from scopemap.tracking.track import Track
@@ -190,6 +193,23 @@ def test_a_map_that_does_not_fit_is_not_merged(swelling: bool) -> None:
             frame = replace(frame, rgb=cv2.remap(frame.rgb, x + swell[..., 0], y + swell[..., 1], cv2.INTER_LINEAR))
         backend.add(frame, pose._replace(map=number % 3))
     assert sorted(backend.adjust(0).S_common_map) == ([0, 2] if swelling else [0, 1, 2])
+
+
+@pytest.mark.parametrize("zoom", [0.0, 0.2])
+def test_the_pose_graph_merges_no_maps_whose_depths_then_disagree(zoom: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    def with_other_scales(*given: Any) -> PoseGraph:
+        graph = optimise_pose_graph(*given)
+        return graph._replace(log_scale=graph.log_scale + zoom * (np.arange(len(graph.log_scale)) % 2))
+
+    monkeypatch.setattr("scopemap.mapping.backend.optimise_pose_graph", with_other_scales)
+    # No adjustment is so exact: all are refused, as where tissue moves.
+    backend = Backend(MappingSettings(constants=MappingConstants(max_sigma_px=1e-3)), DisFlow())
+    for number in range(10):
+        frame, pose = _keyframe(number, (2.0 * number, 0.5 * number, 0.0), Similarity.identity(), 1.0)
+        backend.add(frame, pose._replace(map=number % 2))
+    correction = backend.adjust(0)
+    assert correction.refused
+    assert sorted(correction.S_common_map) == ([0] if zoom else [0, 1])
 
 
 @pytest.mark.parametrize(("far", "found", "split"), [(True, False, True), (True, True, False), (False, False, False)])

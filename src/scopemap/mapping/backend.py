@@ -53,8 +53,9 @@ _MIN_GRAPH_SUPPORT = 4
 class _Adjusted(NamedTuple):
     """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
 
-    main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph.
-    between_px : between maps. support : keyframes on either side of the accepted loops of the least supported map.
+    main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph,
+    infinite where the depths of keyframes agree less there than as tracked. between_px : between maps. support :
+    keyframes on either side of the accepted loops of the least supported map.
     """
 
     correction: FrameCorrection
@@ -256,8 +257,11 @@ class Backend:
             residual = lens_residual(problem, found)
             correction = replace(correction, loops=loops, depth_fields=fields, lens_residual=residual)
         elif len(worlds) > 1 and problem.start is not None:
-            by_graph = self._correction(chosen, worlds, found._replace(state=graph))
-            correction = replace(by_graph, loops=len(accepted), sigma_px=found.sigma_px, refused=refused)
+            by_graph = found._replace(state=graph)
+            correction = self._correction(chosen, worlds, by_graph)
+            correction = replace(correction, loops=len(accepted), refused=refused)
+            if self._depth_contradiction(chosen, by_graph, (), worlds):
+                before = [math.inf]
         else:
             index, as_tracked = np.array(self._frames)[chosen], np.tile(np.eye(4), (len(chosen), 1, 1))
             correction = FrameCorrection(index, as_tracked, np.zeros(len(index)), found.sigma_px, refused=refused)
