@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -173,3 +174,7 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     assert "weights that are missing or damaged: alexnet, depth-anything, depth-pro, raft-large (damaged)" in lines
     assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about ")
     assert list(tmp_path.iterdir()) == [refused]
+    copy = Path(shutil.copytree(data / "scared", tmp_path / "scared"))
+    (copy / "dataset_1/keyframe_1/data/rgb.mp4").write_bytes(b"half a download")
+    assert call("bench", "scared", "--data", copy, "--dry-run") == 0
+    assert "  dataset_1/keyframe_1: reading the video " in capfd.readouterr().out

@@ -48,7 +48,7 @@ Listener = Callable[[Entry, RunResult, bool], None]
 def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:
     """Yield the lines that `scopemap bench PLAN --dry-run` prints; raises as `run_plan`, but writes nothing."""
     entries, notes = planned(plan, out, data)
-    lengths = {label: _frames(entry) for label, entry in {entry.label: entry for entry in entries}.items()}
+    lengths = {label: _length(entry) for label, entry in {entry.label: entry for entry in entries}.items()}
     rows: defaultdict[str, list[str]] = defaultdict(list)
     hours: defaultdict[str, float] = defaultdict(float)
     lacking: set[str] = set()
@@ -61,9 +61,10 @@ def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:
             flows = [entry.protocol.flow] * entry.protocol.consistency
             lacking |= set(missing_weights(_config(entry) or Config(), *flows, verified=True))
         else:
-            hours[entry.method.name] += _seconds(entry, lengths[entry.label]) / 3600
-    yield f"{plan.title}: {len(lengths)} sequences, {sum(lengths.values())} frames, {len(plan.method)} methods"
-    yield from (f"  {label}: {count} frames" for label, count in lengths.items())
+            hours[entry.method.name] += _seconds(entry, lengths[entry.label][0]) / 3600
+    frames = sum(count for count, _ in lengths.values())
+    yield f"{plan.title}: {len(lengths)} sequences, {frames} frames, {len(plan.method)} methods"
+    yield from (f"  {label}: {fault or f'{count} frames'}" for label, (count, fault) in lengths.items())
     yield from (f"note: {note}" for note in notes)
     yield "rows:"
     for method in dict.fromkeys(entry.method.name for entry in entries):
@@ -82,14 +83,14 @@ def _duration(hours: float) -> str:
     return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.0f} min"
 
 
-def _frames(entry: Entry) -> int:
-    """Return the number of frames of an entry's sequence; 0 where its file does not state it."""
+def _length(entry: Entry) -> tuple[int, str]:
+    """Return the frames of an entry's sequence, 0 where its file does not state them, and why it cannot be opened."""
     if entry.sequence.phantom is not None:
-        return spec_of(entry.sequence.phantom, entry.seed, entry.data).frames or 0
+        return spec_of(entry.sequence.phantom, entry.seed, entry.data).frames or 0, ""
     try:
-        return entry.open().count or 0
-    except ScopemapError:  # the run reports it
-        return 0
+        return entry.open().count or 0, ""
+    except ScopemapError as error:
+        return 0, str(error)
 
 
 def _config(entry: Entry) -> Config | None:
