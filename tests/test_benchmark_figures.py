@@ -14,6 +14,7 @@ from scopemap.report.mesh_figures import ESTIMATE_COLOUR, TRUTH_COLOUR
 from scopemap_bench.pictures import (
     BAR_COLOUR,
     draw_ate,
+    draw_displacements,
     draw_frames_until_contradicted,
     draw_frames_until_loss,
 )
@@ -34,9 +35,7 @@ def is_colour(picture: np.ndarray, colour: str, within: int = 12) -> np.ndarray:
 def bar_lengths(picture: np.ndarray, colour: str = BAR_COLOUR) -> list[int]:
     """The lengths, px, of the bars of a colour from top to bottom, of one panel."""
     rows = is_colour(picture, colour).sum(axis=1)
-    # A whisker cuts its bar in two.
-    filled = cv2.morphologyEx((rows > 8).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 1), np.uint8)).ravel()
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], filled.astype(int), [0]])))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (rows > 8).astype(int), [0]])))
     return [int(rows[top:bottom].max()) for top, bottom in zip(edges[::2], edges[1::2], strict=True)]
 
 
@@ -50,6 +49,13 @@ def test_bars_are_as_long_as_their_values(tmp_path: Path) -> None:
     lengths = np.array(bar_lengths(read(tmp_path / "ate.png")))
     np.testing.assert_allclose(lengths / lengths[1], [0.25, 1.0, 0.5], atol=0.02)
     assert lengths[1] > 150
+
+
+def test_every_displacement_is_a_bar(tmp_path: Path) -> None:
+    values_mm = {"ours": np.array([1.0, 4.0, NAN, 2.0]), "none": np.full(4, NAN), "empty": np.empty(0)}
+    draw_displacements(values_mm, tmp_path / "bars.png", bar="match", where="world")
+    lengths = np.array(bar_lengths(read(tmp_path / "bars.png").transpose(1, 0, 2)))
+    np.testing.assert_allclose(lengths / lengths[1], [0.25, 1.0, 0.5], atol=0.03)
 
 
 def test_methods_that_hold_to_the_end_are_green(tmp_path: Path) -> None:
@@ -97,3 +103,14 @@ def test_a_reconstruction_shows_estimate_green_and_truth_red(tmp_path: Path) -> 
     assert is_colour(same, TRUTH_COLOUR).sum() > 500
     assert is_colour(alone, ESTIMATE_COLOUR).sum() > 500
     assert is_colour(alone, TRUTH_COLOUR).sum() == 0
+
+
+def test_a_box_of_the_surface_is_enlarged(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0).apply_translation([0.0, 0.0, 60.0])
+    shown = {}
+    for zoom in ((0.5, 0.5, 0.2), (0.1, 0.1, 0.2)):
+        draw_reconstruction(ball, np.zeros((2, 3)), None, tmp_path / "mesh.png", np.eye(4), zoom)
+        picture = read(tmp_path / "mesh.png")
+        assert is_colour(picture, BAR_COLOUR).sum() > 300
+        shown[zoom[0]] = float((picture[-460:, -460:] < 250).mean())
+    assert shown[0.5] > 0.9 > 0.1 > shown[0.1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,8 +13,11 @@ from front_door import call
 from small_networks import use_weights, write_weights
 from tiny_phantom import write_tiny
 
+from scopemap.errors import InputError
+from scopemap.io.opening import open_sequence
+from scopemap.io.weights import REGISTRY
 from scopemap_bench import runner
-from scopemap_bench.comparison import FinishedRun, write_results
+from scopemap_bench.comparison import FinishedRun, frame_pair, write_results
 from scopemap_bench.entry import Entry
 from scopemap_bench.plan import Plan, found_sequences, read_plan
 from scopemap_bench.result import RunResult
@@ -26,6 +30,7 @@ BASELINES = ("EDAM", "Park", "SB", "Po2Pl", "Po2Po")
 WITHOUT_OPEN3D = {f"{name}{depth}" for name in BASELINES[1:] for depth in ("", ", paper's depth")}
 OPEN3D_IS_THERE = find_spec("open3d") is not None
 IMPORTED = ("Endo-2DTAM", "OneSLAM", "BodySLAM")
+OF_A_SEQUENCE = {"orb_pairs", "orb_points", "orb_bars", "depth_change", "clouds", "mesh"}
 PAPERS_DEPTH = "depth-anything, anchor depth-pro"
 
 
@@ -59,7 +64,7 @@ def run(plan: Plan, data: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> t
     monkeypatch.setattr(runner, "_run_in_process", in_this_process)
     benchmark = run_plan(plan, out, data=data)
     pairs = zip(benchmark.entries, benchmark.results, strict=True)
-    runs = [FinishedRun(result, entry.run_folder, entry.open) for entry, result in pairs]
+    runs = [FinishedRun(result, entry.run_folder, entry.open, entry.sequence.figure) for entry, result in pairs]
     files = write_results(runs, out, title=plan.title, notes=benchmark.notes)
     return benchmark.results, {file.name for file in files if file.suffix == ".png"}
 
@@ -77,6 +82,7 @@ def only(name: str, path: str) -> Plan:
         ("scared", ".", ["dataset_1/keyframe_1", "dataset_2/keyframe_3", "dataset_3/keyframe_4"]),
         ("scared-c", "scared-c", ["dataset_1/keyframe_2"]),
         ("hamlyn", "hamlyn", ["rectified01", "rectified14"]),
+        ("temporal-consistency", ".", ["rectified01", "rectified14", "dataset_1/keyframe_1", "dataset_2/keyframe_3"]),
         ("c3vd-mono", "c3vd", ["cecum_t1_a_under_review"]),
     ],
 )
@@ -101,9 +107,8 @@ def test_scared_runs_to_the_last_row_and_figure(data: Path, tmp_path: Path, monk
     by_depth = dict.fromkeys(depths, "scopenet") | {"MDE (per-frame Depth Pro)": "depth-pro", "OneSLAM": ""}
     by_depth |= {name: PAPERS_DEPTH for name in depths if name.startswith("paper's") or name.endswith("paper's depth")}
     assert depths == by_depth
-    names = {"orb_pairs", "orb_points", "depth_change", "clouds", "mesh"}
     drawn = {name.partition("_dataset")[0] for name in figures}
-    assert drawn == {"ate.png", "frames_until_loss.png", "orb_bars.png"} | names
+    assert drawn == {"ate.png", "frames_until_loss.png"} | OF_A_SEQUENCE
     table = list(csv.DictReader((tmp_path / "tables" / "table2.csv").open()))
     assert [row["framework"] for row in table if row["source"] == "measured"] == list(rows)
     assert {row["depth"] for row in table if row["framework"] == "paper's preset"} == {PAPERS_DEPTH}
@@ -134,15 +139,25 @@ def test_hamlyn_is_drawn_by_the_estimated_poses(data: Path, tmp_path: Path, monk
     assert {row.method for row in rows if row.status != "done"} == absent
     assert all(row.figure("poses", "frames_until_loss") > 0 for row in rows if row.status == "done")
     shown = {name.removesuffix(".png").partition("_rectified14")[0] for name in figures if "rectified14" in name}
-    assert shown == {"orb_pairs", "orb_points", "depth_change", "clouds", "mesh"}
-    assert {"frames_until_loss.png", "orb_bars.png"} <= figures
+    assert shown == OF_A_SEQUENCE
+    assert "frames_until_loss.png" in figures
     assert "ate.png" not in figures
+
+
+def test_the_reader_chooses_the_frames_that_are_drawn(data: Path) -> None:
+    frames = open_sequence(data / "hamlyn" / "rectified01")
+    assert [[frame.index for frame, _ in frame_pair(frames, wanted)] for wanted in (None, 1)] == [[1, 2], [0, 1]]
+    for beyond in (0, 9):
+        with pytest.raises(InputError, match=f"drawing frame {beyond} of .*: it has no such frames"):
+            frame_pair(frames, beyond)
 
 
 def test_a_dry_run_lists_rows_missing_weights_and_hours(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
+    refused = tmp_path / REGISTRY["raft-large"].place
+    refused.write_bytes(b"half a download")
     assert call("bench", "scared", "--data", data / "scared", "--dry-run") == 0
     lines = capfd.readouterr().out.splitlines()
     assert lines[:3] == [
@@ -154,8 +169,12 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     assert set(rows) == {method.name for method in read_plan("scared").method}
     assert rows["scopemap"] == "1 min"
     assert rows["MDE (per-frame Depth Pro)"] == "needs weights: depth-pro (scopemap models pull NAME)"
-    assert rows["paper's preset"].startswith("needs weights: depth-anything, depth-pro, raft-large, alexnet (")
+    assert rows["paper's preset"].startswith("needs weights: depth-anything, depth-pro, raft-large (damaged), alexnet")
     assert rows["OneSLAM"].count(" min; not supplied: ") == 1
-    assert "weights that are missing: alexnet, depth-anything, depth-pro, raft-large" in lines
+    assert "weights that are missing or damaged: alexnet, depth-anything, depth-pro, raft-large (damaged)" in lines
     assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about ")
-    assert not list(tmp_path.iterdir())
+    assert list(tmp_path.iterdir()) == [refused]
+    copy = Path(shutil.copytree(data / "scared", tmp_path / "scared"))
+    (copy / "dataset_1/keyframe_1/data/rgb.mp4").write_bytes(b"half a download")
+    assert call("bench", "scared", "--data", copy, "--dry-run") == 0
+    assert "  dataset_1/keyframe_1: reading the video " in capfd.readouterr().out

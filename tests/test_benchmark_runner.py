@@ -133,6 +133,8 @@ def test_failed_and_changed_rows_are_run_again(plan: Plan, tmp_path: Path, monke
     assert run("raise ValueError('again')").status == "done"
     (tmp_path / "colon.txt").write_text("a file that the plan names")
     assert run("print('ran')").error == "ended without a result"
+    (tmp_path / "camera.yaml").write_text("a calibration beside the frames")
+    assert run(FINISHES).status == "done"
     other = alone.model_copy(update={"settings": alone.settings | {"fusion.enabled": False}})
     assert run(FINISHES, other).status == "done"
 

@@ -71,10 +71,10 @@ def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | N
     )
 
 
-def missing_weights(config: Config, *other_flows: str) -> list[str]:
+def missing_weights(config: Config, *other_flows: str, verified: bool = False) -> list[str]:
     """Return the names of the weights that the settings need and this machine does not have; nothing is loaded.
 
-    other_flows : names of flows that are needed besides.
+    other_flows : names of flows that are needed besides. verified : also "NAME (damaged)" where a hash is wrong.
     """
     depth, networks = config.depth, config.networks
     models = {depth.backend: depth.model} if depth.backend in ("depth-anything", "depth-pro") else {}
@@ -87,6 +87,8 @@ def missing_weights(config: Config, *other_flows: str) -> list[str]:
     needed += [names for size, names in RAFT_CHECKPOINTS.items() if f"raft-{size}" in flows]
     if networks.perceptual == "lpips":
         needed.append(PERCEPTUAL_CHECKPOINTS)
+    if verified:
+        return [fault for names in needed if (fault := weights.fault(*names))]
     return [names[0] for names in needed if not weights.is_present(*names)]
 
 

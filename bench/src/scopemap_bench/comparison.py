@@ -1,7 +1,7 @@
 """Runs side by side: scored without a plan for `compare`, and their tables and figures, also for `bench`.
 
-OUT/results.md, OUT/tables/NAME.{md,csv,tex}, OUT/figures/: ate.png, frames_until_loss.png, orb_bars.png; per sequence
-orb_pairs, orb_points, depth_change, clouds; per run its mesh with the camera paths. Without true poses, points and
+OUT/results.md, OUT/tables/NAME.{md,csv,tex}, OUT/figures/: ate.png, frames_until_loss.png; per sequence orb_pairs,
+orb_points, orb_bars, depth_change, clouds; per run its mesh with the camera paths. Without true poses, points and
 meshes are drawn by the estimated ones, and the figures state so.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ from scopemap_bench.entry import FILE_NAME as ENTRY
 from scopemap_bench.entry import Entry
 from scopemap_bench.evaluation.consistency import FrameMatcher, lifted_matches
 from scopemap_bench.evaluation.failure import LIMIT_PX, LIMITS_PX
-from scopemap_bench.plan import ProtocolPlan, folder_name
+from scopemap_bench.plan import FigurePlan, ProtocolPlan, folder_name
 from scopemap_bench.result import FILE_NAME, RunResult
 from scopemap_bench.scene_pictures import draw_depth_change, draw_reconstruction, draw_registered_clouds
 from scopemap_bench.scoring import default_protocol, pose_groups, score
@@ -52,6 +52,7 @@ class FinishedRun:
     result: RunResult
     folder: Path
     open: Callable[[], Frames] | None = None
+    figure: FigurePlan = field(default_factory=FigurePlan)
 
 
 def write_results(
@@ -94,12 +95,6 @@ def _bars(results: Sequence[RunResult], folder: Path) -> Iterator[Path]:
         }
         pictures.draw_frames_until_contradicted(over, folder / "frames_until_contradicted.png")
         yield folder / "frames_until_contradicted.png"
-    orb = f"consistency.orb_{_world_poses(results)}"
-    if (medians_mm := of_all(f"{orb}.median_mm")).notna().any(axis=None):
-        means_mm, stds_mm = of_all(f"{orb}.mean_mm"), of_all(f"{orb}.std_mm")
-        file = folder / "orb_bars.png"
-        pictures.draw_displacement_bars(means_mm, stds_mm, medians_mm, file, where=_WORLD[_world_poses(results)])
-        yield file
 
 
 def _world_poses(results: Sequence[RunResult]) -> str:
@@ -115,8 +110,10 @@ def _figures_of_sequence(sequence: str, runs: Sequence[FinishedRun], folder: Pat
     pairs = {run.result.method: _pair_medians(run.result, poses) for run in runs}
     measured = {method: medians for method, medians in pairs.items() if np.isfinite(medians).any()}
     if measured:
-        pictures.draw_displacement_scatter(measured, folder / f"orb_pairs_{name}.png", where=_WORLD[poses])
-        yield folder / f"orb_pairs_{name}.png"
+        file = folder / f"orb_pairs_{name}.png"
+        bar = "pair of consecutive frames, its median"
+        pictures.draw_displacements(measured, file, bar=bar, where=_WORLD[poses])
+        yield file
     open_frames = next((run.open for run in runs if run.open is not None), None)
     try:
         frames = None if open_frames is None else open_frames()
@@ -138,8 +135,8 @@ def _pair_medians(result: RunResult, poses: str) -> np.ndarray:
 
 
 def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, folder: Path) -> Iterator[Path]:
-    """Draw two frames in the middle: their depth, their clouds by each method's poses, ORB's matches in space."""
-    (previous, true_previous), (current, true_current) = _middle(frames)
+    """Draw two frames: their depth, their clouds by each method's poses, ORB's matches in space and as bars."""
+    (previous, true_previous), (current, true_current) = frame_pair(frames, runs[0].figure.frame)
     depths, own_poses = {}, {}
     for run in runs[:_MAX_DEPTHS]:
         reader, scale = DepthReader(run.folder), run.result.figure("consistency", "scale")
@@ -175,6 +172,10 @@ def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, fold
         }
         pictures.draw_matched_points(points, folder / f"orb_points_{name}.png", where=_WORLD[where])
         yield folder / f"orb_points_{name}.png"
+        apart_mm = {method: np.linalg.norm(before - now, axis=1) for method, (before, now) in points.items()}
+        file, bar = folder / f"orb_bars_{name}.png", f"matched point of frames {previous.index} and {current.index}"
+        pictures.draw_displacements(apart_mm, file, bar=bar, where=_WORLD[where])
+        yield file
 
 
 def _poses_of(run: FinishedRun, indices: tuple[int, int], scale: float) -> tuple[np.ndarray, np.ndarray] | None:
@@ -200,15 +201,17 @@ def _clouds(
     return points, np.concatenate([image[k] for image, k in zip(images, known, strict=True)])
 
 
-def _middle(frames: Frames) -> list[tuple[Frame, Truth | None]]:
-    """Return the two frames in the middle, masked as for the measures, with their truth."""
+def frame_pair(frames: Frames, wanted: int | None) -> list[tuple[Frame, Truth | None]]:
+    """Return the frame of number `wanted` (None: in the middle) after the one before it, masked as for the measures."""
     stamps = frames.source.stamps(frames.selection) or []
     masker = Masker(MaskSettings())
     last: list[tuple[Frame, Truth | None]] = []
-    for number, (frame, truth) in enumerate(frames):
+    for place, (frame, truth) in enumerate(frames):
         last = [*last[-1:], (masker(frame), truth)]
-        if number > len(stamps) // 2 and len(last) == 2:
+        if place and (place > len(stamps) // 2 if wanted is None else frame.index >= wanted):
             break
+    if len(last) < 2 or wanted not in (None, last[-1][0].index):
+        raise InputError(f"drawing frame {wanted} of {frames.path} and the one before: it has no such frames")
     return last
 
 
@@ -229,7 +232,8 @@ def _draw_mesh(run: FinishedRun, frames: Frames, file: Path) -> bool:
         mesh.vertices = matched.similarity.transform_points(np.asarray(mesh.vertices))
         tracked, poses = matched.tracked, matched.aligned
         true_mm, T_view = matched.reference[:, :3, 3], matched.reference[0]
-    draw_reconstruction(mesh, np.where(tracked[:, None], poses[:, :3, 3], np.nan), true_mm, file, T_view)
+    positions_mm = np.where(tracked[:, None], poses[:, :3, 3], np.nan)
+    draw_reconstruction(mesh, positions_mm, true_mm, file, T_view, run.figure.zoom)
     return True
 
 
@@ -264,8 +268,10 @@ def _of_benchmark(path: Path, name: str, protocol: ProtocolPlan) -> FinishedRun:
     if protocol.consistency and "consistency" not in result.figures and result.status == "done":
         raise InputError(f"comparing {path}: its benchmark measured no consistency; its figures are not measured again")
     result = replace(result, method=name or result.method)
-    entry = Entry.load(path / ENTRY) if (path / ENTRY).is_file() else None
-    return FinishedRun(result, path / "run", entry.open if entry else None)
+    if not (path / ENTRY).is_file():
+        return FinishedRun(result, path / "run")
+    entry = Entry.load(path / ENTRY)
+    return FinishedRun(result, path / "run", entry.open, entry.sequence.figure)
 
 
 def _scored(path: Path, name: str, truth: Path, protocol: ProtocolPlan, unit: Unit) -> FinishedRun:

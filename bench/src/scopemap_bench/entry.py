@@ -16,6 +16,7 @@ from scopemap.config import Config
 from scopemap.errors import SettingsError
 from scopemap.io.opening import open_sequence
 from scopemap.io.sequence import Sequence
+from scopemap.io.source import OWN_CALIBRATION
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 from scopemap_bench.plan import MethodPlan, Plan, ProtocolPlan, SequencePlan, folder_name, spec_of
@@ -61,16 +62,23 @@ class Entry(BaseModel):
     @property
     def flows(self) -> Path:
         """Folder of the flow that all methods of this sequence are measured with."""
-        return self.out / "flows" / f"{folder_name(self.label)}-{_digest([self.sequence.model_dump(mode='json')])[:8]}"
+        described = self.sequence.model_dump(mode="json", exclude={"figure"})
+        return self.out / "flows" / f"{folder_name(self.label)}-{_digest([described])[:8]}"
 
     @property
     def key(self) -> str:
         """Fingerprint of all that decides the figures but the code: the plan, and size and time of the files in it."""
-        described = self.model_dump(mode="json", exclude={"out", "data"})
+        described = self.model_dump(mode="json", exclude={"out": True, "data": True, "sequence": {"figure"}})
         named = [self.method.files.format(sequence=self.sequence.name, seed=self.seed), self.sequence.camera or ""]
         named += [self.sequence.depth.partition("files:")[2], (self.sequence.phantom or {}).get("path_file", "")]
         stamps = [_stamp(self.data / name) for name in named if name and self.data is not None]
         return _digest([described, stamps, version("scopemap")])[:16]
+
+    @property
+    def inputs(self) -> list[list[int]]:
+        """Size and time of the sequence's files and of calibrations beside it: where they change, a failure may end."""
+        beside = (folder / name for folder in self.source.parents[:3] for name in (OWN_CALIBRATION, "calibration"))
+        return [_stamp(path) for path in (self.source, *beside)]
 
     def open(self) -> Sequence:
         """Open the sequence; raises as `open_sequence`."""
@@ -148,8 +156,8 @@ def render_once(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], 
 
 
 def _stamp(path: Path) -> list[int]:
-    """Return number, size and latest time of a file or of the files in a folder; [] where there is none."""
-    files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
+    """Return number, size and latest time of a file or of the files below a folder; [] where there is none."""
+    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
     stats = [file.stat() for file in files]
     return [len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)] if stats else []
 

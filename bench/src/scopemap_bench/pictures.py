@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _LETTERS_PER_INCH = 12
 BAR_COLOUR, _NOTE_COLOUR, _MEAN_COLOUR = "#4575b4", "#666666", "#d95f02"
 _PANELS_ACROSS, _LONGEST_NAME, _SHOWN_MATCHES = 4, 34, 400
+_BARS_PT = 140.0  # width of a panel, less the gaps between its bars
 
 
 def draw_ate(ate_mm: pd.DataFrame, file: Path, *, alignment: str) -> None:
@@ -70,42 +71,33 @@ def draw_frames_until_contradicted(frames: Mapping[str, pd.DataFrame], file: Pat
     figure.savefig(file)
 
 
-def draw_displacement_bars(
-    mean_mm: pd.DataFrame, std_mm: pd.DataFrame, median_mm: pd.DataFrame, file: Path, *, where: str
-) -> None:
-    """Draw the mean ORB displacement, mm, `where` it was compared; whiskers: standard deviation, diamonds: median."""
-    figure, panels = _bar_panels(mean_mm)
-    figures = (mean_mm.to_numpy(), std_mm.to_numpy(), median_mm.to_numpy())
-    for axes, means, stds, medians in zip(panels, *figures, strict=True):
-        _draw_bars(axes, means, ".2f", spreads=stds)
-        places = range(len(medians))
-        axes.plot(medians, places, "D", color="white", markeredgecolor="black", markersize=6, linestyle="none")
-        axes.set_xlabel("displacement, mm")
-    marks = "bar: mean, whisker: standard deviation, diamond: median; lower is better"
-    _headline(figure, f"ORB displacement between consecutive frames, {where}; {marks}")
-    figure.savefig(file)
+def draw_displacements(displacements_mm: Mapping[str, np.ndarray], file: Path, *, bar: str, where: str) -> None:
+    """Draw ORB displacements (N,), mm, NaN = unmatched, as bars, one panel per method; `bar` names what each is of.
 
-
-def draw_displacement_scatter(pair_median_mm: Mapping[str, np.ndarray], file: Path, *, where: str) -> None:
-    """Draw the median ORB displacement of each pair of consecutive frames (P,), mm, NaN = unmatched."""
-    across, down = _grid_size(len(pair_median_mm))
+    The paper's experiment 2, `where` the poses that took the points into one world are named.
+    """
+    across, down = _grid_size(len(displacements_mm))
     figure = _new_figure(3.4 * across + 0.6, 2.7 * down + 0.7)
     grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
-    for axes, (name, medians_mm) in zip(grid, pair_median_mm.items(), strict=False):
-        axes.plot(np.arange(1, len(medians_mm) + 1), medians_mm, ".", color=BAR_COLOUR, markersize=4, alpha=0.7)
-        known = medians_mm[np.isfinite(medians_mm)]
-        if len(known):
-            axes.axhline(known.mean(), color=_MEAN_COLOUR, linewidth=1.2)
-        result = f"mean {known.mean():.2f} mm" if len(known) else "no match"
+    for axes, (name, values_mm) in zip(grid, displacements_mm.items(), strict=False):
+        known, result = np.isfinite(values_mm), "no match"
+        # Lines, not bars of their own: there may be thousands.
+        width_pt = max(0.5, _BARS_PT / len(values_mm)) if len(values_mm) else 1.0
+        axes.vlines(1 + np.flatnonzero(known), 0, values_mm[known], BAR_COLOUR, linewidth=width_pt)
+        if known.any():
+            mean, median = values_mm[known].mean(), np.median(values_mm[known])
+            axes.axhline(mean, color=_MEAN_COLOUR, linewidth=1.2)
+            axes.axhline(median, color="black", linewidth=1.2, linestyle="--")
+            result = f"mean {mean:.2f}, median {median:.2f} mm"
         axes.set_title(f"{_short(name)}\n{result}", fontsize=10)
         axes.grid(alpha=0.3)
     grid[0].set_ylim(bottom=0)
     for place, axes in enumerate(grid):
-        axes.set_visible(place < len(pair_median_mm))
-        axes.tick_params(labelbottom=place + across >= len(pair_median_mm))
-    figure.supxlabel("pair of consecutive frames")
+        axes.set_visible(place < len(displacements_mm))
+        axes.tick_params(labelbottom=place + across >= len(displacements_mm))
+    figure.supxlabel(bar)
     figure.supylabel("displacement, mm")
-    _headline(figure, f"ORB displacement, median of each pair, {where}; line: mean of the pairs")
+    _headline(figure, f"ORB displacement of each {bar}, {where}; line: mean, dashed: median; lower is better")
     figure.savefig(file)
 
 
@@ -178,18 +170,13 @@ def _bar_panels(values: pd.DataFrame) -> tuple[Figure, list[Axes]]:
     return figure, panels[: len(values)]
 
 
-def _draw_bars(
-    axes: Axes, values: np.ndarray, form: str, *, spreads: np.ndarray | None = None, at_least: float = 0.0
-) -> BarContainer:
+def _draw_bars(axes: Axes, values: np.ndarray, form: str, *, at_least: float = 0.0) -> BarContainer:
     """Draw one sequence's bars with their values at the end; the axis reaches to `at_least`."""
-    spreads = np.zeros(len(values)) if spreads is None else np.nan_to_num(np.where(np.isfinite(values), spreads, 0.0))
     lengths = np.nan_to_num(values)
-    # A distance below zero is impossible.
-    whiskers = np.stack([np.minimum(spreads, lengths), spreads]) if spreads.any() else None
-    bars = axes.barh(np.arange(len(values)), lengths, xerr=whiskers, color=BAR_COLOUR, height=0.7, capsize=3)
+    bars = axes.barh(np.arange(len(values)), lengths, color=BAR_COLOUR, height=0.7)
     labels = [format(value, form) if np.isfinite(value) else "no figure" for value in values]
     axes.bar_label(bars, labels, padding=4, fontsize=8)
-    axes.set_xlim(0, 1.22 * (max(float((lengths + spreads).max()), at_least) or 1.0))
+    axes.set_xlim(0, 1.22 * (max(float(lengths.max()), at_least) or 1.0))
     axes.grid(axis="x", alpha=0.3)
     axes.set_axisbelow(True)
     return bars

@@ -12,7 +12,7 @@ from dataclasses import replace
 from importlib import resources
 from itertools import groupby
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -70,6 +70,17 @@ class ProtocolPlan(_Part):
         return self
 
 
+class FigurePlan(_Part):
+    """What the figures of a sequence show; it changes no row.
+
+    frame : number of the second of the two consecutive frames, by default in the middle.
+    zoom : middle and side of the enlarged square of the mesh's picture, from left and top, over the picture's side.
+    """
+
+    frame: int | None = None
+    zoom: tuple[float, float, Annotated[float, Field(gt=0, le=1)]] = (0.5, 0.5, 0.25)
+
+
 class SequencePlan(_Part):
     """One sequence, or all that a pattern finds.
 
@@ -82,6 +93,7 @@ class SequencePlan(_Part):
     depth : "": from the settings; "true": the data set's files; "files:FOLDER" below the data folder; or a
     `depth.backend`.
     near_far_mm : metric anchor of the first frame. align : replaces the protocol's. settings : dotted names to values.
+    figure : what its figures show.
     """
 
     name: str = ""
@@ -95,6 +107,7 @@ class SequencePlan(_Part):
     near_far_mm: tuple[float, float] | None = None
     align: AlignMode | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
+    figure: FigurePlan = FigurePlan()
 
     @model_validator(mode="after")
     def _one_source(self) -> SequencePlan:

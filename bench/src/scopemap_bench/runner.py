@@ -48,7 +48,7 @@ Listener = Callable[[Entry, RunResult, bool], None]
 def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:
     """Yield the lines that `scopemap bench PLAN --dry-run` prints; raises as `run_plan`, but writes nothing."""
     entries, notes = planned(plan, out, data)
-    lengths = {entry.label: _frames(entry) for entry in entries}
+    lengths = {label: _length(entry) for label, entry in {entry.label: entry for entry in entries}.items()}
     rows: defaultdict[str, list[str]] = defaultdict(list)
     hours: defaultdict[str, float] = defaultdict(float)
     lacking: set[str] = set()
@@ -58,18 +58,20 @@ def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:
             done += 1
         elif reason := what_is_missing(entry):
             rows[entry.method.name].append(reason)
-            lacking |= set(missing_weights(config)) if (config := _config(entry)) else set()
+            flows = [entry.protocol.flow] * entry.protocol.consistency
+            lacking |= set(missing_weights(_config(entry) or Config(), *flows, verified=True))
         else:
-            hours[entry.method.name] += _seconds(entry, lengths[entry.label]) / 3600
-    yield f"{plan.title}: {len(lengths)} sequences, {sum(lengths.values())} frames, {len(plan.method)} methods"
-    yield from (f"  {label}: {count} frames" for label, count in lengths.items())
+            hours[entry.method.name] += _seconds(entry, lengths[entry.label][0]) / 3600
+    frames = sum(count for count, _ in lengths.values())
+    yield f"{plan.title}: {len(lengths)} sequences, {frames} frames, {len(plan.method)} methods"
+    yield from (f"  {label}: {fault or f'{count} frames'}" for label, (count, fault) in lengths.items())
     yield from (f"note: {note}" for note in notes)
     yield "rows:"
     for method in dict.fromkeys(entry.method.name for entry in entries):
         reasons = dict.fromkeys(rows[method])
         expected = [_duration(hours[method])] if method in hours else []
         yield f"  {method}: {'; '.join([*expected, *reasons]) or 'done'}"
-    yield f"weights that are missing: {', '.join(sorted(lacking)) or 'none'}"
+    yield f"weights that are missing or damaged: {', '.join(sorted(lacking)) or 'none'}"
     waiting = sum(map(len, rows.values()))
     yield (
         f"{len(entries)} runs: {done} done, {waiting} missing, {len(entries) - done - waiting} to run in about "
@@ -81,14 +83,14 @@ def _duration(hours: float) -> str:
     return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.0f} min"
 
 
-def _frames(entry: Entry) -> int:
-    """Return the number of frames of an entry's sequence; 0 where its file does not state it."""
+def _length(entry: Entry) -> tuple[int, str]:
+    """Return the frames of an entry's sequence, 0 where its file does not state them, and why it cannot be opened."""
     if entry.sequence.phantom is not None:
-        return spec_of(entry.sequence.phantom, entry.seed, entry.data).frames or 0
+        return spec_of(entry.sequence.phantom, entry.seed, entry.data).frames or 0, ""
     try:
-        return entry.open().count or 0
-    except ScopemapError:  # the run reports it
-        return 0
+        return entry.open().count or 0, ""
+    except ScopemapError as error:
+        return 0, str(error)
 
 
 def _config(entry: Entry) -> Config | None:
@@ -134,9 +136,10 @@ def run_plan(
 ) -> Benchmark:
     """Run the entries that are not done yet and return all rows.
 
-    An entry is done when its `result.json` has its fingerprint; failed rows are run again with `retry`, those of status
-    "missing" always. `listener` is called with each row, and whether it was kept. A method that takes longer than
-    `timeout_s` is ended and fails. Raises `InputError` where no sequence is found or `out` cannot be written.
+    An entry is done when its `result.json` has its fingerprint; failed rows are run again with `retry` or where their
+    input changed, those of status "missing" always. `listener` is called with each row, and whether it was kept. A
+    method that takes longer than `timeout_s` is ended and fails. Raises `InputError` where no sequence is found or
+    `out` cannot be written.
     """
     out = Path(out).resolve()
     entries, notes = planned(plan, out, data)
@@ -211,19 +214,22 @@ def end_with_parent() -> None:
 
 
 def kept_result(entry: Entry, *, retry: bool = False) -> RunResult | None:
-    """Return the row of an earlier call, if it belongs to this entry; None for a failed one with `retry`."""
+    """Return the row of an earlier call, if it belongs to this entry; None for a failed one to be run again."""
     try:
         result = RunResult.load(entry.folder)
     except InputError:  # none, or a damaged one
         return None
-    stale = result.facts.get("key") != entry.key or (retry and result.status == "failed")
+    stale = result.facts.get("key") != entry.key
+    if result.status == "failed":
+        stale |= retry or result.facts.get("inputs") != entry.inputs
     return None if stale else result
 
 
 def what_is_missing(entry: Entry) -> str:
     """Return what an entry needs and this machine does not have, in one line; "" where it can run."""
     try:
-        if entry.protocol.consistency and (names := missing_weights(Config(), entry.protocol.flow)):
+        flows = [entry.protocol.flow] * entry.protocol.consistency
+        if names := missing_weights(Config(), *flows, verified=True):
             return f"its measure needs weights: {', '.join(names)} (scopemap models pull NAME)"
         return method_of(entry).missing(entry.shared_settings())
     except ScopemapError:  # the run reports it
@@ -262,7 +268,8 @@ def _cause(code: int, log: Path) -> str:
 
 
 def _without_figures(entry: Entry, status: Literal["failed", "missing"], reason: str) -> RunResult:
-    return RunResult(entry.label, entry.method.name, entry.seed, status, reason, facts=_facts(entry))
+    facts = _facts(entry) | ({"inputs": entry.inputs} if status == "failed" else {})
+    return RunResult(entry.label, entry.method.name, entry.seed, status, reason, facts=facts)
 
 
 def _facts(entry: Entry) -> dict[str, Any]:

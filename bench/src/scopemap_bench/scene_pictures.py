@@ -13,6 +13,8 @@ from scopemap.report.depth_figures import colour_depth, percentiles
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     TRUTH_COLOUR,
+    MeshView,
+    content,
     cropped,
     draw_path,
     mesh_picture,
@@ -21,7 +23,8 @@ from scopemap.report.mesh_figures import (
     view_from_behind,
     view_of,
 )
-from scopemap.report.sheet import picture_grid
+from scopemap.report.sheet import Sheet, picture_grid
+from scopemap_bench.pictures import BAR_COLOUR
 
 
 def draw_depth_change(
@@ -53,11 +56,13 @@ def draw_reconstruction(
     reference_positions_mm: np.ndarray | None,
     file: Path,
     T_world_view: np.ndarray,
+    zoom: tuple[float, float, float] = (0.5, 0.5, 0.25),
 ) -> None:
     """Draw a mesh with the estimated (N, 3) and the true (M, 3) camera positions over it, all world mm, as a PNG.
 
     Views: from behind `T_world_view` (4, 4), the first camera, and from two sides outside. A dot marks the start; rows
-    of NaN (lost frames) are gaps.
+    of NaN (lost frames) are gaps. The last picture enlarges the blue square of the first: its middle from left and top
+    and its side, over the first one's side.
     """
     # The truth is drawn first and broader: where both agree it is the edge of the estimate.
     paths = [] if reference_positions_mm is None else [(reference_positions_mm, TRUTH_COLOUR, 5)]
@@ -71,8 +76,24 @@ def draw_reconstruction(
         for positions, colour, thickness_px in paths:
             draw_path(picture, view, positions, colour, thickness_px=thickness_px)
         pictures[title] = cropped(picture)
+        if len(pictures) == 1:
+            enlarged = _enlarged(mesh, view, picture, zoom)
+    pictures["the square, enlarged"] = enlarged
     of_truth = "no true poses are known" if reference_positions_mm is None else "red: true path"
     picture_grid([pictures], (460, 460), f"green: estimated path, its start a dot; {of_truth}").save(file)
+
+
+def _enlarged(
+    mesh: trimesh.Trimesh, view: MeshView, picture: np.ndarray, zoom: tuple[float, float, float]
+) -> np.ndarray:
+    """Draw the square of `draw_reconstruction` on a view's picture (H, H, 3), in place, and return it as large."""
+    left, top, shown = content(picture)
+    side = max(2, round(zoom[2] * shown))
+    x, y = (round(start + middle * shown - side / 2) for start, middle in ((left, zoom[0]), (top, zoom[1])))
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * side + [x - 0.5, y - 0.5]
+    Sheet.over(picture).line(corners, BAR_COLOUR, 2)
+    camera = view.camera.cropped(x, y, side, side).resized(view.camera.width, view.camera.height)
+    return mesh_picture(mesh, MeshView(view.T_world_camera, camera))
 
 
 def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:

@@ -81,6 +81,14 @@ def is_present(*names: str) -> bool:
     return any(_is_there(find(name)) for name in names)
 
 
+def fault(*names: str) -> str:
+    """Return "" where `locate` finds one of `names`, else the name of what is missing, or "NAME (damaged)"."""
+    there = next((one for one in map(find, names) if _is_there(one)), None)
+    if there is None:
+        return names[0]
+    return f"{there.name} (damaged)" if _state(there) == "damaged" else ""
+
+
 def locate(*names: str) -> Path:
     """Return the checked file or folder of the first of `names` that is there, no download; raises `WeightsError`."""
     for checkpoint in map(find, names):

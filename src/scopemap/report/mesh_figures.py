@@ -157,10 +157,16 @@ def draw_path(
 
 def cropped(picture: np.ndarray) -> np.ndarray:
     """Return the square part of a square picture (H, H, 3) that holds all that is not white, and a margin."""
+    left, top, side = content(picture)
+    return picture[top : top + side, left : left + side]
+
+
+def content(picture: np.ndarray) -> tuple[int, int, int]:
+    """Return left, top and side, px, of the square that `cropped` leaves of a picture."""
     rows, columns = np.nonzero((picture != 255).any(axis=-1))
     if not len(rows):
-        return picture
+        return 0, 0, len(picture)
     low, high = np.array([rows.min(), columns.min()]), np.array([rows.max(), columns.max()])
     side = min(int((high - low).max()) + 2 * _MARGIN_PX, len(picture))
     top, left = np.clip((low + high - side) // 2, 0, len(picture) - side)
-    return picture[top : top + side, left : left + side]
+    return int(left), int(top), side

@@ -86,7 +86,7 @@ def bench(
 
     benchmark = run_plan(read_plan(plan), out, data=data, retry=retry, timeout_s=timeout_s, listener=tell)
     pairs = zip(benchmark.entries, benchmark.results, strict=True)
-    runs = [FinishedRun(result, entry.run_folder, entry.open) for entry, result in pairs]
+    runs = [FinishedRun(result, entry.run_folder, entry.open, entry.sequence.figure) for entry, result in pairs]
     title = benchmark.plan.title
     files = write_results(runs, out, title=title, notes=benchmark.notes, paper_units=paper_units)
     for note in [] if quiet else benchmark.notes:

@@ -50,8 +50,8 @@ class PipelineMethod:
         return Config.load(self.plan.preset, settings={**settings, **self.plan.settings, **plain})
 
     def missing(self, settings: Mapping[str, Any]) -> str:
-        """Return the weights that are not on this machine."""
-        names = missing_weights(self.config(settings))
+        """Return the weights that are not on this machine, or damaged."""
+        names = missing_weights(self.config(settings), verified=True)
         return f"needs weights: {', '.join(names)} (scopemap models pull NAME)" if names else ""
 
     def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
