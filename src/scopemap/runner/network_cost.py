@@ -1,7 +1,7 @@
 """What the networks of the extra `networks` will cost a run on a CPU, in one sentence before it starts.
 
-Measured at 400x320 to 1350x1080 px, but for Depth Pro, which is estimated by the size of its weights. RAFT compares all pairs of pixels of an eighth of the
-working size: a part of its time, and nearly all of its memory, grow with the square of the pixels.
+Measured at 400x320 to 1350x1080 px, but for Depth Pro, estimated by the size of its weights. RAFT compares all pairs of
+pixels of an eighth of the working size: a part of its time, and nearly all of its memory, grow with their square.
 """
 
 from __future__ import annotations
