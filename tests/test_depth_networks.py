@@ -13,9 +13,11 @@ from small_networks import saved, small_depth_anything, small_depth_pro
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import DepthSettings
+from scopemap.depth.anchor import AnchoredDepth
 from scopemap.depth.backends import create_anchor, create_depth
 from scopemap.depth.depth_anything import DepthAnything
 from scopemap.depth.depth_pro import DepthPro
+from scopemap.depth.estimate import DepthEstimate
 from scopemap.errors import WeightsError
 from scopemap.frame import Frame
 
@@ -145,3 +147,16 @@ def test_depth_pro_by_hand(
     facts = estimator.provenance()
     assert len(facts["sha256 model.safetensors"]) == 64
     assert "revision" not in facts  # nothing tells which one was copied
+
+
+@pytest.mark.parametrize("every", [0, 5])
+def test_the_anchors_network_is_freed_once_it_has_served(frame: Frame, every: int) -> None:
+    constants = replace(DepthSettings(backend="depth-anything").constants, reanchor_every=every)
+    settings = DepthSettings(backend="depth-anything", anchor="depth-pro").model_copy(update={"constants": constants})
+    anchor = AnchoredDepth(settings, DepthPro(*small_depth_pro(), device="cpu"))
+    values = np.random.default_rng(1).uniform(1, 2, (HEIGHT, WIDTH)).astype(np.float32)
+    before = anchor.metric(DepthEstimate(values, "depth"), frame)
+    assert np.isfinite(before.depth_mm).any()
+    assert (anchor.reference._network is None) == (every == 0)
+    np.testing.assert_array_equal(anchor.metric(DepthEstimate(values, "depth"), frame).depth_mm, before.depth_mm)
+    assert anchor.reference.provenance()["depth"] == "depth-pro"

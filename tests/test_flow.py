@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,18 @@ def test_dis_finds_a_known_shift() -> None:
     assert error < 0.2 * np.abs(_texture().astype(float) - _texture(*shift))[inner].mean()
 
 
+def test_flow_that_is_not_checked_is_computed_one_way() -> None:
+    class OneWay(DisFlow):
+        def estimate_checked(self, *images: Any) -> Any:
+            raise AssertionError("the way back serves nothing")
+
+    flow = pair_flow(OneWay(), _texture(), _texture(5), math.inf)
+    inside = np.arange(SHAPE[1]) + flow.to_previous[..., 0]
+    rows = slice(10, -10)
+    np.testing.assert_array_equal(flow.consistent[rows], ((inside >= 0) & (inside <= SHAPE[1] - 1))[rows])
+    assert not flow.consistent[rows].all()
+
+
 def test_checked_dis_flow_begins_at_its_start() -> None:
     # Further than the texture's own size: without a start other parts of it fit.
     shift = np.full((*SHAPE, 2), (20.0, 0.0), np.float32)
@@ -140,6 +153,7 @@ def test_raft_agrees_with_torchvision_by_hand(tmp_path: Path) -> None:
     forth, back = estimator.estimate_both(*images)
     np.testing.assert_allclose(forth, expected, atol=1e-3)
     np.testing.assert_allclose(back, estimator.estimate(*images[::-1]), atol=1e-3)
+    assert estimator._network.corr_block.corr_pyramid == []  # gigabytes for large images
 
 
 def test_unfit_checkpoints_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

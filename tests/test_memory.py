@@ -21,6 +21,7 @@ from scopemap.fusion.surface_fusion import SurfaceFusion
 from scopemap.fusion.tsdf import VoxelBlocks, pack
 from scopemap.mapping.backend import MOST_OBSERVATIONS
 from scopemap.runner.memory import MemoryPlan, memory_plan
+from scopemap.runner.network_cost import network_cost
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +110,31 @@ def test_a_limited_run_says_what_was_chosen_and_its_settings_repeat_it(
     assert "memory_mb = 800" in (tmp_path / "limited" / "config.toml").read_text()
     faces = [len(trimesh.load_mesh(tmp_path / name / "mesh.ply").faces) for name in ("free", "limited")]
     assert faces[0] > 2 * faces[1] > 200
+
+
+def test_what_networks_cost_is_said_before_the_run(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    strict, sequence = Config.load("paper-strict", settings={"networks.device": "cpu"}), open_sequence(folder)
+    large = open_sequence(folder, size=(1350, 1080))
+    said = network_cost(strict, large)
+    assert said.startswith("cost of depth-anything, depth-pro, lpips, raft-large at 1350x1080 px on 2 core(s): about 3")
+    small = network_cost(strict, sequence)
+    seconds, gigabytes = (
+        [float(re.search(rf"([\d.]+) {unit}", text)[1]) for text in (small, said)] for unit in ("s a frame", "GB of m")
+    )
+    assert seconds[1] > 10 * seconds[0]
+    assert gigabytes[1] - gigabytes[0] > 2.7  # the correlations of all pairs
+    checked = network_cost(Config.load("paper", settings={"networks.device": "cpu"}), large)
+    assert float(re.search(r"([\d.]+) s a", checked)[1]) > 1.8 * seconds[1]  # flow both ways
+    monkeypatch.setattr("scopemap.runner.network_cost._available_gb", lambda: 1.0)
+    assert "of 1.0 GB that are free. That is not enough." in network_cost(strict, sequence)
+    assert network_cost(Config(), sequence) == ""
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(folder / "none"))
+    asked = ("run", folder, "--out", folder.parent / "out", "--flow", "raft-small")
+    assert call(*asked) == 1
+    assert "cost of" not in capfd.readouterr().err  # without its weights nothing will run
+    monkeypatch.setattr("scopemap.estimators.missing_weights", lambda config: [])
+    assert call(*asked) == 1
+    assert capfd.readouterr().err.startswith("cost of raft-small at 160x128 px")

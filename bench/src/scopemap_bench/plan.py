@@ -125,7 +125,7 @@ class SequencePlan(_Part):
 class MethodPlan(_Part):
     """One method.
 
-    name : for tables and folders. use : "scopemap", "import", or a baseline (`benchmark.methods.method.BASELINES`).
+    name : for tables and folders. use : "scopemap", "import", "colmap", or a baseline (`methods.method.BASELINES`).
     preset, settings : what it changes; a preset comes before the plan's and the sequence's settings, these after them.
     files : of `use = "import"`: trajectory below the data folder; may hold {sequence} and {seed}.
     unit, kind : of these files.

@@ -141,8 +141,10 @@ def run(
     chosen = {key: value for key, value in given.items() if value is not None} | options.parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)
 
+    from scopemap.estimators import missing_weights
     from scopemap.io.opening import open_sequence
     from scopemap.runner.checkpoints import check_resumable, discard_unfinished
+    from scopemap.runner.network_cost import network_cost
     from scopemap.runner.with_report import reconstruct_with_report
 
     sequence = open_sequence(
@@ -158,6 +160,8 @@ def run(
         check_resumable(out, sequence, resolved)
     elif resume is not None:
         discard_unfinished(out)
+    if not (quiet or as_json or missing_weights(resolved)) and (cost := network_cost(resolved, sequence)):
+        typer.echo(cost, err=True)
     with run_progress(sequence.count, silent=quiet or as_json) as shown, Interruption() as interruption:
         seen = (*shown.observers, interruption.observe)
         result = reconstruct_with_report(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -85,7 +86,7 @@ class MapisConstants:
     sigma_fading: float = 0.3  # growth of the warped depth's variance per frame, share of its gap to the frame's
     filter_sigma_px: float = 2.0  # sigma_d of the bilateral filter; 0: off
     filter_sigma_mm: float = 2.0  # sigma_r of the bilateral filter
-    consistency_px: float = 1.0  # largest forward-backward error of flow
+    consistency_px: float = 1.0  # largest forward-backward error of flow; inf: not checked (the paper)
     # refine-first: warp depth values unchanged, then track (the paper).
     order: Literal["track-first", "refine-first"] = "track-first"
     # Weight of the warped depth; auto: linear for predicted depth, none for measured.
@@ -103,7 +104,7 @@ MAPIS: dict[str, dict[str, Any]] = {
         **{"frame_scale": "none", "order": "refine-first", "blend": "linear"},
         **{"recursive": False, "compare_warped": False, "perceptual_score": True},
     },
-    "no-flow-check": {"consistency_px": 1e6},
+    "no-flow-check": {"consistency_px": math.inf},
     "no-frame-scale": {"frame_scale": "none"},
     "no-blend": {"blend": "none"},
     "exponential-blend": {"blend": "exponential"},

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from scopemap.config import DepthSettings
-from scopemap.depth.estimate import DepthEstimate, DepthEstimator, DepthKind
+from scopemap.depth.estimate import DepthEstimate, DepthEstimator, DepthKind, Releasable
 from scopemap.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.errors import InputError, SettingsError
 from scopemap.frame import Frame
@@ -86,6 +86,8 @@ class AnchoredDepth:
         first_mm, limit_note = self._anchor(estimate, frame) if self._is_due(estimate) else (None, "")
         if self.conversion is None:
             return MetricDepth(np.full(estimate.values.shape, np.nan, dtype=np.float32), None, limit_note)
+        if isinstance(self.reference, Releasable) and not self._settings.constants.reanchor_every:
+            self.reference.release()  # a resumed run has it anew
         depth_mm = self.conversion.depth_mm(estimate.values) if first_mm is None else first_mm
         sigma_mm = self.conversion.sigma_mm(estimate.sigma) if first_mm is None else None
         if estimate.kind != "measured":

@@ -70,6 +70,11 @@ class DepthPro(PretrainedNetwork):
         focal_px = None if found_deg is None else 0.5 * width / math.tan(0.5 * math.radians(float(found_deg)))
         return DepthEstimate(self._values(outputs, frame) * MM_PER_M, "depth", focal_px)
 
+    def release(self) -> None:
+        """Free the memory of the network and of its last answer; nothing can be estimated any more."""
+        super().release()
+        self._last = None
+
     def provenance(self) -> dict[str, str]:
         """Return the name, whose focal length scaled the depth, the model, its commit and its weights' hashes."""
         return {"depth": self.name, "focal": "camera" if self.use_known_focal else "network", **self._origin}

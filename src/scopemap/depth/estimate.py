@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -51,6 +51,15 @@ class DepthEstimator(Protocol):
 
     def provenance(self) -> dict[str, str]:
         """Return what the result depends on, as text: names, versions, hashes."""
+        ...
+
+
+@runtime_checkable
+class Releasable(Protocol):
+    """A network whose memory can be had back; Depth Pro holds 4 GB, and serves the anchor alone."""
+
+    def release(self) -> None:
+        """Free the memory; nothing can be estimated any more."""
         ...
 
 

@@ -34,7 +34,7 @@ class PretrainedNetwork:
     ) -> None:
         self._device = choose_device(device)
         untyped: Any = network
-        self._network = untyped.to(self._device).eval()
+        self._network: Any = untyped.to(self._device).eval()
         self._processor: Any = processor
         self._origin = origin or {}
 
@@ -52,6 +52,10 @@ class PretrainedNetwork:
         result = self._processor.post_process_depth_estimation(outputs, target_sizes=[size])[0]
         values: np.ndarray = result["predicted_depth"].float().cpu().numpy()
         return values
+
+    def release(self) -> None:
+        """Free the network's memory; nothing can be estimated any more."""
+        self._network = None
 
     def provenance(self) -> dict[str, str]:
         """Return the name, the model, its commit if it was pulled, and the hashes of its weights."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Lock
@@ -107,10 +108,17 @@ class Flow:
 def pair_flow(
     estimator: FlowEstimator, rgb_previous: np.ndarray, rgb_current: np.ndarray, consistency_px: float
 ) -> Flow:
-    """Return the flow from a frame (H, W, 3) uint8 to the previous one, checked both ways to `consistency_px`."""
+    """Return the flow from a frame (H, W, 3) uint8 to the previous one, checked both ways to `consistency_px`.
+
+    Where that is infinite the flow back is not computed, and all that stays in the image is consistent.
+    """
     check_shape("rgb_previous", rgb_previous, (None, None, 3))
     check_shape("rgb_current", rgb_current, rgb_previous.shape)
-    to_previous, to_current = estimator.estimate_checked(rgb_current, rgb_previous)
+    if math.isinf(consistency_px):
+        to_previous = estimator.estimate(rgb_current, rgb_previous)
+        to_current = np.zeros_like(to_previous)
+    else:
+        to_previous, to_current = estimator.estimate_checked(rgb_current, rgb_previous)
     return Flow(to_previous, agree(to_previous, to_current, consistency_px))
 
 

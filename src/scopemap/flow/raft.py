@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -72,16 +73,20 @@ class RaftFlow(FlowEstimator):
             )
         except RuntimeError as error:
             raise WeightsError(f"{self._checkpoint} does not hold the weights of {self.name}: {error}") from None
+        # The correlation volume has H^2 W^2 / 1024 floats, 2 GB at 1350x1080 px, and torchvision's own has a copy.
+        network.corr_block._compute_corr_volume = _correlations
         self._network = network.to(self._device).eval()
 
     def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
         """Return the flow (H, W, 2) float32, px, of two (H, W, 3) uint8 images of one size."""
-        return self._estimate([rgb_from], [rgb_to])[0]
+        import torch
 
-    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flows a to b and b to a, computed as one batch."""
-        a_to_b, b_to_a = self._estimate([rgb_a, rgb_b], [rgb_b, rgb_a])
-        return a_to_b, b_to_a
+        height, width = rgb_from.shape[:2]
+        check_shape("rgb_to", rgb_to, rgb_from.shape)
+        with torch.inference_mode():
+            flows = self._network(self._tensor(rgb_from), self._tensor(rgb_to), num_flow_updates=self.iterations)
+        self._network.corr_block.corr_pyramid = []  # held until the next pair else
+        return flows[-1][0, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy()
 
     def provenance(self) -> dict[str, str]:
         """Return the name, the refinement steps, and the weights' file and SHA-256."""
@@ -92,24 +97,14 @@ class RaftFlow(FlowEstimator):
             "sha256": weights.sha256_of(self._checkpoint),
         }
 
-    def _estimate(self, rgb_from: list[np.ndarray], rgb_to: list[np.ndarray]) -> np.ndarray:
+    def _tensor(self, rgb: np.ndarray) -> torch.Tensor:
+        """Return (1, 3, H', W') float32 in -1..1 with the right and lower border repeated up to a size RAFT takes."""
         import torch
 
-        height, width = rgb_from[0].shape[:2]
-        with torch.inference_mode():
-            flows = self._network(self._tensor(rgb_from), self._tensor(rgb_to), num_flow_updates=self.iterations)
-        return flows[-1][:, :, :height, :width].permute(0, 2, 3, 1).contiguous().cpu().numpy()
-
-    def _tensor(self, images: list[np.ndarray]) -> torch.Tensor:
-        """Return (B, 3, H', W') float32 in -1..1 with the right and lower border repeated up to a size RAFT takes."""
-        import torch
-
-        height, width = images[0].shape[:2]
-        for image in images:
-            check_shape("image for RAFT", image, (height, width, 3))
-        padding = [(0, _padded(height) - height), (0, _padded(width) - width), (0, 0)]
-        batch = np.stack([np.pad(image, padding, mode="edge") for image in images])
-        return torch.from_numpy(batch).to(self._device).permute(0, 3, 1, 2).float() / 127.5 - 1.0
+        check_shape("image for RAFT", rgb, (None, None, 3))
+        padding = [*((0, _padded(side) - side) for side in rgb.shape[:2]), (0, 0)]
+        padded = torch.from_numpy(np.pad(rgb, padding, mode="edge")[None])
+        return padded.to(self._device).permute(0, 3, 1, 2).float() / 127.5 - 1.0
 
 
 def torchvision_names(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -126,6 +121,15 @@ def torchvision_names(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tens
             raise WeightsError(f"RAFT checkpoint: '{name}' and another name of '{new}' hold different values")
         renamed[new] = tensor
     return renamed
+
+
+def _correlations(features_from: torch.Tensor, features_to: torch.Tensor) -> torch.Tensor:
+    """Return the correlation of all pairs of pixels, (B, H, W, 1, H, W), of features (B, C, H, W), over sqrt(C)."""
+    import torch
+
+    count, channels, height, width = features_from.shape
+    scaled = features_from.flatten(2).transpose(1, 2) / math.sqrt(channels)
+    return torch.matmul(scaled, features_to.flatten(2)).view(count, height, width, 1, height, width)
 
 
 def _padded(side_px: int) -> int:

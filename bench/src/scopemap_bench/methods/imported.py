@@ -33,26 +33,31 @@ class ImportedTrajectory:
         """Write the trajectory as a run's folder; its time is unknown."""
         file = self._file or Path(self._name)
         read = read_trajectory(file, unit=self._plan.unit, kind=self._plan.kind)
-        frames = [(frame.index, frame.time_s, frame.name) for frame in sequence.frames()]
-        indices, times_s = np.array([f[0] for f in frames]), np.array([f[1] for f in frames])
-        submaps = [on_frames(submap, indices, times_s) for submap in (read, *read.others)]
-        submaps = [submap for submap in submaps if submap.tracked.any()]
-        if not submaps:
-            raise InputError(f"{file}: none of its {len(read)} poses belongs to a frame of {sequence.path}")
-        for number, submap in enumerate(submaps):
-            folder = out / f"maps/{number}" if number else out
-            folder.mkdir(parents=True, exist_ok=True)
-            write_tum(folder / "trajectory.tum", submap)
-            with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as table:
-                writer = csv.writer(table)
-                writer.writerow(["index", "time_s", "name", "status", "map"])
-                for (index, time_s, name), status in zip(frames, submap.status.tolist(), strict=True):
-                    tracked = status in TRACKED
-                    if tracked or number == 0:
-                        writer.writerow([index, f"{time_s:.6f}", name, status, number if tracked else ""])
-        facts = {"input": str(sequence.path), "imported": str(file), "convention": read.source}
-        (out / "provenance.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+        write_trajectory(read, sequence, out, str(file))
         return {}
+
+
+def write_trajectory(read: Trajectory, sequence: Sequence, out: Path, imported: str) -> None:
+    """Write a trajectory and its `others` as a run's folder; imported : from what. `InputError`: no frame's."""
+    frames = [(frame.index, frame.time_s, frame.name) for frame in sequence.frames()]
+    indices, times_s = np.array([f[0] for f in frames]), np.array([f[1] for f in frames])
+    submaps = [on_frames(submap, indices, times_s) for submap in (read, *read.others)]
+    submaps = [submap for submap in submaps if submap.tracked.any()]
+    if not submaps:
+        raise InputError(f"{imported}: none of its {len(read)} poses belongs to a frame of {sequence.path}")
+    for number, submap in enumerate(submaps):
+        folder = out / f"maps/{number}" if number else out
+        folder.mkdir(parents=True, exist_ok=True)
+        write_tum(folder / "trajectory.tum", submap)
+        with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as table:
+            writer = csv.writer(table)
+            writer.writerow(["index", "time_s", "name", "status", "map"])
+            for (index, time_s, name), status in zip(frames, submap.status.tolist(), strict=True):
+                tracked = status in TRACKED
+                if tracked or number == 0:
+                    writer.writerow([index, f"{time_s:.6f}", name, status, number if tracked else ""])
+    facts = {"input": str(sequence.path), "imported": imported, "convention": read.source}
+    (out / "provenance.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
 
 def on_frames(trajectory: Trajectory, indices: np.ndarray, times_s: np.ndarray) -> Trajectory:

@@ -17,6 +17,7 @@ from scopemap.odometry import Step
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.tracking.track import FrameTracker
 from scopemap_bench.methods.baselines import Open3dTracker, StandingStill, create_endo_depth_and_motion
+from scopemap_bench.methods.colmap import Colmap
 from scopemap_bench.methods.imported import ImportedTrajectory
 from scopemap_bench.plan import MethodPlan
 
@@ -78,7 +79,7 @@ class PipelineMethod:
         }
 
 
-Method = PipelineMethod | ImportedTrajectory
+Method = PipelineMethod | ImportedTrajectory | Colmap
 """Turns frames, whose truth it must not read, and the settings of all methods into a run's folder."""
 
 
@@ -86,6 +87,9 @@ def create_method(plan: MethodPlan, data: Path | None, sequence: str = "", seed:
     """Return the method of a plan, for imports that of a sequence and seed; `SettingsError` for an unknown one."""
     if plan.use == "import":
         return ImportedTrajectory(plan, data, sequence, seed)
+    if plan.use == "colmap":
+        return Colmap(plan)
     if plan.use != "scopemap" and plan.use not in BASELINES:
-        raise SettingsError(f"unknown method '{plan.use}': choose one of scopemap, import, {', '.join(BASELINES)}")
+        known = ", ".join(("scopemap", "import", "colmap", *BASELINES))
+        raise SettingsError(f"unknown method '{plan.use}': choose one of {known}")
     return PipelineMethod(plan)

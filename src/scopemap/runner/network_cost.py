@@ -1,0 +1,62 @@
+"""What the networks of the extra `networks` will cost a run on a CPU, in one sentence before it starts.
+
+Measured at 400x320 to 1350x1080 px, but for Depth Pro, estimated by the size of its weights. RAFT compares all pairs of
+pixels of an eighth of the working size: a part of its time, and nearly all of its memory, grow with their square.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from scopemap.config import Config
+from scopemap.io.device import choose_device, cpu_threads
+from scopemap.io.sequence import Sequence
+
+# Seconds of one core: of one flow, for each million pixels and each square of that; of depth, for a picture of any
+# size; of the perceptual distance and of the other stages, for each million pixels.
+_FLOW_S = {"raft-small": (7.5, 2.0), "raft-large": (26.0, 10.5)}
+_DEPTH_S = {"depth-anything": 2.2, "depth-pro": 200.0}
+_PERCEPTUAL_S, _STAGES_S = {"lpips": 0.8}, 2.3
+# GB: of Python with PyTorch and kernels, of the other stages for each million pixels, of the networks of depth, and of
+# the correlations of one flow for each square of a million pixels: 4 bytes a pair, and a third for its pyramid.
+_START_GB, _STAGES_GB, _FLOW_GB = 1.3, 0.75, 4 * 4 / 3 / 64**2 * 1e3
+_DEPTH_GB = {"depth-anything": 0.4, "depth-pro": 6.0}
+
+
+def network_cost(config: Config, sequence: Sequence) -> str:
+    """Return about how much time and memory a run will need; "" without such networks, and with them on a GPU."""
+    networks, mapis, depth = config.networks, config.mapis.constants, config.depth
+    refines = (mapis.blend, mapis.frame_scale) != ("none", "none")
+    flows = [networks.flow] * (1 if math.isinf(mapis.consistency_px) else 2) * refines + [networks.keyframe_flow] * 2
+    anchor, every_frame = [depth.anchor] * (depth.anchor != depth.backend), [depth.backend]
+    perceptual = [networks.perceptual] * refines
+    used = {*flows, *anchor, *every_frame, *perceptual} & {*_FLOW_S, *_DEPTH_S, *_PERCEPTUAL_S}
+    if not used or choose_device(networks.device) != "cpu":
+        return ""
+    c, cores = sequence.camera, cpu_threads()
+    mpx = c.width * c.height / 1e6
+    frame_s = sum(a * mpx + b * mpx**2 for a, b in (_FLOW_S.get(name, (0.0, 0.0)) for name in flows))
+    frame_s += sum(_DEPTH_S.get(name, 0.0) for name in every_frame) + _STAGES_S * mpx
+    frame_s += sum(_PERCEPTUAL_S.get(name, 0.0) * mpx for name in perceptual)
+    once_s = sum(_DEPTH_S.get(name, 0.0) for name in anchor)
+    gb = _START_GB + _STAGES_GB * mpx + _FLOW_GB * mpx**2 * any(name in _FLOW_S for name in flows)
+    gb += sum(_DEPTH_GB.get(name, 0.0) for name in {*anchor, *every_frame})
+    frames = sequence.count
+    all_s = "" if frames is None else f", {(once_s + frames * frame_s) / cores / 60:.0f} min for {frames} frames,"
+    free_gb = _available_gb()
+    free = "" if free_gb is None else f" of {free_gb:.1f} GB that are free"
+    short = " That is not enough." if free_gb is not None and gb > free_gb else ""
+    return (
+        f"cost of {', '.join(sorted(used))} at {c.width}x{c.height} px on {cores} core(s): about "
+        f"{frame_s / cores:.1f} s a frame{all_s} and {gb:.1f} GB of memory{free}.{short} A smaller --size costs less"
+    )
+
+
+def _available_gb() -> float | None:
+    """Return the memory that a process could still take, GB; None where the system does not tell."""
+    try:
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        return int(lines["MemAvailable"].split()[0]) / 1e6
+    except (OSError, KeyError, ValueError):
+        return None
