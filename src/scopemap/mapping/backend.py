@@ -30,8 +30,9 @@ from scopemap.mapping.depth_correction import (
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
 from scopemap.mapping.map_merging import Part, merge_maps, split_maps
+from scopemap.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
 from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
-from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.mapping.pose_interpolation import FrameCorrection, TissueMotion, TrackedPose
 from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
 
@@ -95,6 +96,7 @@ class Backend:
     ) -> None:
         self.settings = settings.constants
         self._frames: list[int] = []
+        self._times_s: list[float] = []
         self._tracked: list[TrackedPose] = []
         self._log_scales: list[float] = []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
@@ -130,6 +132,7 @@ class Backend:
             reference = self._frames[-1] if self._frames else keyframe.index
             tracked = TrackedPose(0, reference, keyframe.T_world_camera)
         self._frames.append(keyframe.index)
+        self._times_s.append(keyframe.time_s)
         self._tracked.append(tracked)
         self._log_scales.append(math.log(keyframe.depth_scale))
         grid = depth_grid(keyframe.depth_mm, keyframe.valid)
@@ -199,7 +202,8 @@ class Backend:
             together = self._adjusted(more, map_number)
             if together.accepted(alone, self.settings.max_sigma_px):
                 found, worlds = together, more
-        return replace(found.correction, S_common_map=worlds, tracked=tracked or {})
+        correction = found.correction if len(worlds) > 1 else self._with_moving_tissue(found.correction, worlds)
+        return replace(correction, S_common_map=worlds, tracked=tracked or {})
 
     def _observe(self, keyframe: Frame, map_number: int) -> None:
         """Add a keyframe's feature tracks and loop closures."""
@@ -266,6 +270,20 @@ class Backend:
         main_px, support = within[list(worlds).index(main)], _support(accepted, map_of, main)
         return _Adjusted(correction, main_px, largest_px, between_px, graph_px, support)
 
+    def _with_moving_tissue(self, rigid: FrameCorrection, worlds: Mapping[int, Similarity]) -> FrameCorrection:
+        """Return the correction with tissue that moves where left-out tracks confirm it, else the rigid one."""
+        chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
+        if self._camera is None or not rigid.sigma_px >= RIGID_CORE_PX:
+            return rigid
+        problem, _ = self._problem(chosen, worlds, self._camera)
+        solution = adjust_moving_tissue(problem)
+        if solution is None:
+            return rigid
+        found, deformation, left_out = solution
+        rate = deformation.rate_per_min(np.array(self._times_s)[chosen])
+        fields, tissue = self._fields(chosen, problem.points, found), TissueMotion(deformation, left_out, rate)
+        return replace(self._correction(chosen, worlds, found), depth_fields=fields, tissue=tissue)
+
     def _problem(
         self, chosen: list[int], worlds: Mapping[int, Similarity], camera: PinholeCamera
     ) -> tuple[BundleProblem, np.ndarray]:
@@ -310,14 +328,18 @@ class Backend:
         """Return why a solution is refused, None where it is not, and its depth correction fields."""
         if reason := contradiction(problem.points, found, self.settings):
             return Notice("mapping-not-rigid", {"reason": reason, "merged": ""}), ()
-        fields: tuple[DepthCorrectionField, ...] = ()
-        if (step_sigma := self.settings.depth_step_sigma) > 0:
-            assert self._camera is not None
-            points, drift = problem.points, self._path.drift[chosen]
-            as_tracked = replace(points, log_depth=points.log_depth + drift[points.host])
-            error = _depth_change(points, found), found.log_depth_sigma
-            fields = fit_depth_corrections(self._camera, as_tracked, len(drift), *error, step_sigma)
+        fields = self._fields(chosen, problem.points, found)
         return self._depth_contradiction(chosen, found, fields, worlds), fields
+
+    def _fields(self, chosen: list[int], points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
+        """Return the depth correction fields of chosen keyframes by a solution; () where depth is only scaled."""
+        if (step_sigma := self.settings.depth_step_sigma) <= 0:
+            return ()
+        assert self._camera is not None
+        drift = self._path.drift[chosen]
+        as_tracked = replace(points, log_depth=points.log_depth + drift[points.host])
+        error = _depth_change(points, found), found.log_depth_sigma
+        return fit_depth_corrections(self._camera, as_tracked, len(drift), *error, step_sigma)
 
     def _depth_contradiction(
         self,

@@ -43,6 +43,11 @@ class Deformation:
         """Displacement (K, N, 3) mm of the nodes at the keyframes."""
         return np.einsum("kl,lnc->knc", self.basis, self.modes)
 
+    def in_world(self, T_new_world: np.ndarray) -> Deformation:
+        """Return the motion in another world; `T_new_world` (4, 4) takes points of this one to it."""
+        nodes = self.nodes @ T_new_world[:3, :3].T + T_new_world[:3, 3]
+        return Deformation(nodes, self.basis, self.modes @ T_new_world[:3, :3].T)
+
     def rate_per_min(self, time_s: np.ndarray) -> float:
         """Return how often the first curve repeats itself, times (K,) s of the keyframes; NaN where it does not."""
         return periodic_rate(time_s, self.basis[:, 0]) * 60
@@ -116,7 +121,7 @@ def hat_functions(count: int, most: int) -> np.ndarray:
 
 
 def first_mode(displacement: np.ndarray) -> np.ndarray:
-    """Return the curve (K, 1), at most 1, of the first singular vector of displacements (K, N, 3) without their mean."""
+    """Return the curve (K, 1), at most 1, of the first singular vector of displacements (K, N, 3) less their mean."""
     flat = displacement.reshape(len(displacement), -1)
     curve = np.linalg.svd(flat - flat.mean(0), full_matrices=False)[0][:, :1]
     largest: np.ndarray = curve / np.abs(curve).max()

@@ -18,7 +18,7 @@ import numpy as np
 
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse, orthonormalised
-from scopemap.mapping.bundle_adjustment import BundleSolution, errors_px, log_depth_sigma, with_points
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust, errors_px, log_depth_sigma, with_points
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, State, reproject
 from scopemap.mapping.deformation_graph import (
     Deformation,
@@ -32,6 +32,8 @@ from scopemap.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, so
 
 LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 60
 """With fewer keyframes no curve is known; with more, time and memory of the adjustment would grow too much."""
+RIGID_CORE_PX = 0.4
+"""Robust standard deviation of a rigid solution below which most of the tissue is at rest: it is left as it is."""
 _NODES, _MOST_CURVES = 60, 30
 _THINNED = 3  # one of so many points finds the curve
 # Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
@@ -66,18 +68,19 @@ class NonRigidSolution(NamedTuple):
     left_out: LeftOut
 
 
-def adjust_moving_tissue(problem: BundleProblem, rigid: State) -> NonRigidSolution | None:
+def adjust_moving_tissue(problem: BundleProblem) -> NonRigidSolution | None:
     """Return the solution with moving tissue; None where tracks left out do not confirm it, or it is not tried.
 
-    problem : from the poses as tracked. rigid : solution of the rigid problem. It is tried with 6 to 60 keyframes,
-    where enough errors of the rigid solution are above 2 px.
+    It is tried with 6 to 60 keyframes, where the rigid solution leaves errors above 2 px and has no rigid core.
     """
-    count = len(problem.T_camera_world)
     observed = np.unique(problem.observations.point)
-    if not LEAST_KEYFRAMES <= count <= MOST_KEYFRAMES or len(observed) < _EVERY * _THINNED * _NODES:
+    few = len(observed) < _EVERY * _THINNED * _NODES
+    if few or not LEAST_KEYFRAMES <= len(problem.T_camera_world) <= MOST_KEYFRAMES:
         return None
-    if (errors_px(problem, rigid) > _WRONG_PX).mean() < _LEAST_FALL:
+    rigid = adjust(problem).state
+    if rigid.sigma_px < RIGID_CORE_PX or (errors_px(problem, rigid) > _WRONG_PX).mean() < _LEAST_FALL:
         return None
+    problem = replace(problem, start=None)
     column, row = np.floor(problem.points.pixel / _CELL_PX).astype(int).T
     outside = (column + 2 * row) % _EVERY == 0
     seen = np.zeros(len(outside), bool)

@@ -17,7 +17,15 @@ from scipy.linalg import cho_factor, cho_solve
 
 from scopemap.geometry import least_squares
 from scopemap.geometry.least_squares import CameraBlock, cauchy, minimise, robust_sigma_2d
-from scopemap.mapping.bundle_adjustment import CAUCHY, PER_KEYFRAME, camera_blocks, cost, odometry_edges, retract, weights
+from scopemap.mapping.bundle_adjustment import (
+    CAUCHY,
+    PER_KEYFRAME,
+    camera_blocks,
+    cost,
+    odometry_edges,
+    retract,
+    weights,
+)
 from scopemap.mapping.bundle_problem import BundleProblem, Reprojection, State, jacobians, reproject
 from scopemap.mapping.deformation_graph import Deformation, Skin
 
@@ -176,7 +184,9 @@ class NonRigidModel:
         step[6 : self._unknowns] = cho_solve(factor, rhs[6:], check_finite=False)
         change, log_scale = self._change(step)
         slope = linear.weight[:, None] * linear.by_depth
-        h, g = (np.bincount(seen.point, (slope * by).sum(1), len(points.host)) for by in (linear.by_depth, error + change))
+        h, g = (
+            np.bincount(seen.point, (slope * by).sum(1), len(points.host)) for by in (linear.by_depth, error + change)
+        )
         step[self._unknowns :] = -(g + linear.held * (self._off - log_scale)) / (h + linear.held)
         return step
 
