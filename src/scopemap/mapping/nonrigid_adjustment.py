@@ -37,7 +37,7 @@ RIGID_CORE_PX = 0.4
 _NODES, _MOST_CURVES = 60, 30
 _THINNED = 3  # one of so many points finds the curve
 # Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
-_FREE, _ONE_CURVE, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.01), MotionPrior(0.2, 0.1, 0.01), 0.05
+_FREE, _ONE_CURVE, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05
 _CELL_PX, _EVERY = 16, 5  # cells of the picture, and which share of them is left out
 # Left-out errors: that count as wrong, and beyond which an error counts no more, px.
 _WRONG_PX, _FALSE_PX = 2.0, 10.0
