@@ -272,9 +272,9 @@ class Backend:
 
     def _with_moving_tissue(self, rigid: FrameCorrection, worlds: Mapping[int, Similarity]) -> FrameCorrection:
         """Return the correction with tissue that moves where left-out tracks confirm it, else the rigid one."""
-        chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
-        if self._camera is None or not rigid.sigma_px >= RIGID_CORE_PX:
+        if self._camera is None or not self.settings.moving_tissue or not rigid.sigma_px >= RIGID_CORE_PX:
             return rigid
+        chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
         problem, _ = self._problem(chosen, worlds, self._camera)
         solution = adjust_moving_tissue(problem)
         if solution is None:
