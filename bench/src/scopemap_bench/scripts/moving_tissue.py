@@ -3,8 +3,8 @@
     python -m scopemap_bench.scripts.moving_tissue [--out FOLDER] [--seeds 31 32 33]
 
 Phantoms of 100 frames: tissue pushed two ways, breathing of 4 mm twice, a part that is poked, and tissue at rest.
-Shape: median distance, over every tenth frame, of the points of its depth map, at its pose, from the true tissue at that
-time; one Sim(3) for all, fitted without what is farther off than three medians. ATE is after a Sim(3) of the path.
+Shape: median distance, over every tenth frame, of the points of its depth map, at its pose, from the true tissue then;
+one Sim(3) for all, fitted without what is farther off than three medians. ATE is after a Sim(3) of the path.
 """
 
 from __future__ import annotations
