@@ -46,7 +46,7 @@ _RESCALINGS = 3
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeftOutTracks:
     """Errors of tracks left out: root mean square, px, and share above 2 px; of the rigid solution, and of this one."""
 
     rigid_px: float
@@ -65,7 +65,7 @@ class NonRigidSolution(NamedTuple):
 
     found: BundleSolution
     deformation: Deformation
-    left_out: LeftOut
+    left_out: LeftOutTracks
 
 
 def adjust_moving_tissue(problem: BundleProblem) -> NonRigidSolution | None:
@@ -128,13 +128,13 @@ def _solved(problem: NonRigidProblem) -> NonRigidState:
     return solve(problem, NonRigidState(problem.rigid.tracked, at_rest))
 
 
-def _compared(part: BundleProblem, rigid: State, state: NonRigidState, deformation: Deformation) -> LeftOut:
+def _compared(part: BundleProblem, rigid: State, state: NonRigidState, deformation: Deformation) -> LeftOutTracks:
     """Return the errors of points that were left out, in the keyframes of two solutions."""
     moving = _problem(part, deformation.nodes, deformation.basis, _ONE_CURVE).moved(state.modes)
     (rigid_px, rigid_wrong), (px, wrong) = (
         _errors(part, keyframes, moved) for keyframes, moved in ((rigid, np.zeros_like(moving)), (state.rigid, moving))
     )
-    return LeftOut(rigid_px, px, rigid_wrong, wrong)
+    return LeftOutTracks(rigid_px, px, rigid_wrong, wrong)
 
 
 def _errors(part: BundleProblem, keyframes: State, moved: np.ndarray) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
 from scopemap.mapping.bundle_adjustment import LensResidual
 from scopemap.mapping.deformation_graph import Deformation
 from scopemap.mapping.depth_correction import DepthCorrectionField
-from scopemap.mapping.nonrigid_adjustment import LeftOut
+from scopemap.mapping.nonrigid_adjustment import LeftOutTracks
 from scopemap.notices import Notice
 
 _AT_REST = 1e-6  # rad
@@ -46,7 +46,7 @@ class TissueMotion(NamedTuple):
     """
 
     deformation: Deformation
-    left_out: LeftOut
+    left_out: LeftOutTracks
     rate_per_min: float
 
 
