@@ -34,7 +34,7 @@ LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 60
 """With fewer keyframes no curve is known; with more, time and memory of the adjustment would grow too much."""
 RIGID_CORE_PX = 0.4
 """Robust standard deviation of a rigid solution below which most of the tissue is at rest: it is left as it is."""
-_NODES, _MOST_CURVES = 60, 30
+_NODES, _CURVE_NODES, _MOST_CURVES = 60, 30, 30
 _THINNED = 3  # one of so many points finds the curve
 # Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
 _FREE, _ONE_CURVE, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05
@@ -87,7 +87,7 @@ def adjust_moving_tissue(problem: BundleProblem) -> NonRigidSolution | None:
     seen[observed] = True
     inside = _part(problem, ~outside & seen)
     nodes = spread_nodes(_in_world(inside, inside.tracked), _NODES)
-    curve = _curve(inside, nodes)
+    curve = _curve(inside, nodes[:_CURVE_NODES])  # far from each other, too
     state = _with_curve(inside, nodes, curve)
     left_out = _compared(_part(problem, outside & seen), rigid, state, Deformation(nodes, curve, state.modes))
     if not left_out.accepts:

@@ -87,13 +87,15 @@ def _modes_of(unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class _Linear(NamedTuple):
-    """Derivatives of all observations, their weights, and the weights of the estimated depths."""
+    """Errors, derivatives and weights of all observations; of points, ln depth's error and weight of the estimate."""
 
+    error: np.ndarray  # (N, 2) px
     by_camera: np.ndarray  # (N, 2, 6)
     by_host: np.ndarray  # (N, 2, 6)
     by_depth: np.ndarray  # (N, 2)
     by_world: np.ndarray  # (N, 2, 3), px / mm of the point's motion in the world
     weight: np.ndarray  # (N,)
+    off: np.ndarray  # (P,)
     held: np.ndarray  # (P,)
 
 
@@ -121,7 +123,7 @@ class NonRigidModel:
         by_world = by_camera[:, :, 3:] / rigid.unit_mm @ R
         held = cauchy((self._off / rigid.points.sigma) ** 2, CAUCHY)[1] / rigid.points.sigma**2
         weight = weights(state, self._seen) / rigid.correlated
-        return _Linear(by_camera, by_host, by_depth, by_world, weight, held)
+        return _Linear(self._seen.error, by_camera, by_host, by_depth, by_world, weight, self._off, held)
 
     @cached_property
     def _priors(self) -> list[CameraBlock]:
@@ -164,12 +166,12 @@ class NonRigidModel:
 
     def gauss_newton_step(self) -> np.ndarray:
         """Return the step to the minimum."""
-        problem, linear, error = self._problem, self._linear, self._seen.error
+        problem, linear = self._problem, self._linear
         points, seen = problem.rigid.points, problem.rigid.observations
         matrix, rhs = np.zeros((self._unknowns, self._unknowns)), np.zeros(self._unknowns)
         start = np.searchsorted(seen.point, np.arange(len(points.host) + 1))
         ends = _Ends(start, points.host, seen.keyframe)
-        _add_points(matrix, rhs, ends, error, self._off, linear, problem.skin, problem.basis)
+        _add_points(matrix, rhs, ends, linear, problem.skin, problem.basis)
         for prior in self._priors:
             matrix[np.ix_(prior.columns, prior.columns)] += prior.A
             rhs[prior.columns] -= prior.b
@@ -185,7 +187,8 @@ class NonRigidModel:
         change, log_scale = self._change(step)
         slope = linear.weight[:, None] * linear.by_depth
         h, g = (
-            np.bincount(seen.point, (slope * by).sum(1), len(points.host)) for by in (linear.by_depth, error + change)
+            np.bincount(seen.point, (slope * by).sum(1), len(points.host))
+            for by in (linear.by_depth, linear.error + change)
         )
         step[self._unknowns :] = -(g + linear.held * (self._off - log_scale)) / (h + linear.held)
         return step
@@ -210,14 +213,7 @@ class _Ends(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _add_points(
-    matrix: np.ndarray,
-    rhs: np.ndarray,
-    ends: _Ends,
-    error: np.ndarray,
-    off: np.ndarray,
-    linear: _Linear,
-    skin: Skin,
-    basis: np.ndarray,
+    matrix: np.ndarray, rhs: np.ndarray, ends: _Ends, linear: _Linear, skin: Skin, basis: np.ndarray
 ) -> None:
     """Add the normal equations of keyframes and modes, without the points, to matrix and right-hand side."""
     curves, size = basis.shape[1], len(rhs)
@@ -228,11 +224,11 @@ def _add_points(
     E, touched, known = np.zeros(size), np.empty(size, np.int64), np.zeros(size, np.bool_)
     for p in range(len(ends.host)):
         host, held = ends.host[p], linear.held[p]
-        h, g, count = held, held * off[p], 1
+        h, g, count = held, held * linear.off[p], 1
         touched[0] = scale = PER_KEYFRAME * host + 6
         known[scale], E[scale] = True, -held
         matrix[scale, scale] += held
-        rhs[scale] += held * off[p]
+        rhs[scale] += held * linear.off[p]
         for k in range(ends.start[p], ends.start[p + 1]):
             used = 12
             columns[:6] = PER_KEYFRAME * ends.keyframe[k] + np.arange(6)
@@ -250,14 +246,14 @@ def _add_points(
             for side in range(2):
                 depth = linear.weight[k] * linear.by_depth[k, side]
                 h += depth * linear.by_depth[k, side]
-                g += depth * error[k, side]
+                g += depth * linear.error[k, side]
                 for i in range(used):
                     column, by = columns[i], row[side, i]
                     if not known[column]:
                         known[column], touched[count] = True, column
                         count += 1
                     E[column] += depth * by
-                    rhs[column] -= linear.weight[k] * by * error[k, side]
+                    rhs[column] -= linear.weight[k] * by * linear.error[k, side]
                     for j in range(used):
                         matrix[column, columns[j]] += linear.weight[k] * by * row[side, j]
         for i in range(count):
