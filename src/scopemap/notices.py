@@ -121,6 +121,12 @@ KINDS: dict[str, _Kind] = {
         "mapping: poses are as tracked{merged}; the scene is not rigid or the focal length is wrong: {reason}",
         "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed",
     ),
+    "mapping-tissue-moves": _Kind(
+        "doubtful",
+        "mapping: {keyframes} keyframes adjusted with tissue that moves, at {nodes} nodes by up to {moved:.0%} of the "
+        "median depth{periodic}; errors of tracks left out {px:.2f} px, {rigid_px:.2f} px if it were rigid",
+        "The tissue moved while it was filmed{periodic}: the surface is a mean of its states",
+    ),
     "mapping-depth-disagrees": _Kind(
         "doubtful",
         "mapping: poses are as tracked{merged}; depths of keyframes would disagree by {adjusted:.0%}, as tracked by "

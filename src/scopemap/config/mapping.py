@@ -30,6 +30,8 @@ class MappingConstants:
     # larger.
     max_sigma_px: float = 0.8
     max_depth_change: float = 0.3
+    # Where a rigid scene leaves errors, try tissue that moves by one curve over time; False: poses stay as they are.
+    moving_tissue: bool = True
 
 
 MAPPING: dict[str, dict[str, Any]] = {
@@ -39,7 +41,8 @@ MAPPING: dict[str, dict[str, Any]] = {
     "no-triangulation": {"triangulate_depth": False},
     "previous-keyframe-only": {"keyframe_gaps": (1,)},
     "fixed-depth": {"scale_sigma": 1e-3},
-    "always-adjusted": {"max_sigma_px": 99.0, "max_depth_change": 9.0},
+    "rigid": {"moving_tissue": False},
+    "always-adjusted": {"max_sigma_px": 99.0, "max_depth_change": 9.0, "moving_tissue": False},
 }
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -45,6 +45,24 @@ def cauchy(square: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
 def huber_weight(residuals: np.ndarray, threshold: float) -> np.ndarray:
     """Return the weights of absolute residuals under Huber's kernel: 1 up to `threshold`, then threshold / residual."""
     return np.minimum(1.0, threshold / np.maximum(residuals, 1e-300))
+
+
+class Model(Protocol):
+    """Quadratic model of a cost around a state; the cost is infinite where the state is impossible."""
+
+    @property
+    def cost(self) -> float:
+        """At the state."""
+
+    @property
+    def gradient(self) -> np.ndarray:
+        """First derivative (n,)."""
+
+    def gauss_newton_step(self) -> np.ndarray:
+        """Return the step (n,) to the minimum."""
+
+    def curvature(self, step: np.ndarray) -> float:
+        """Return step^T H step."""
 
 
 class DenseModel(NamedTuple):
@@ -247,7 +265,3 @@ class SchurModel:
             own, some = cameras[block.columns], points[block.points]
             total += float(own @ block.A @ own + 2 * some @ (block.E @ own) + some @ (block.h * some))
         return total
-
-
-Model = DenseModel | SchurModel
-"""Quadratic model of a cost around a state; the cost is infinite where the state is impossible."""

@@ -29,9 +29,10 @@ from scopemap.mapping.depth_correction import (
 )
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
-from scopemap.mapping.map_merging import Part, merge_maps, split_maps
+from scopemap.mapping.map_merging import Part, loop_support, merge_maps, split_maps
+from scopemap.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
 from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
-from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.mapping.pose_interpolation import FrameCorrection, TissueMotion, TrackedPose
 from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
 
@@ -96,6 +97,7 @@ class Backend:
     ) -> None:
         self.settings = settings.constants
         self._frames: list[int] = []
+        self._times_s: list[float] = []
         self._tracked: list[TrackedPose] = []
         self._log_scales: list[float] = []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
@@ -131,6 +133,7 @@ class Backend:
             reference = self._frames[-1] if self._frames else keyframe.index
             tracked = TrackedPose(0, reference, keyframe.T_world_camera)
         self._frames.append(keyframe.index)
+        self._times_s.append(keyframe.time_s)
         self._tracked.append(tracked)
         self._log_scales.append(math.log(keyframe.depth_scale))
         grid = depth_grid(keyframe.depth_mm, keyframe.valid)
@@ -200,7 +203,8 @@ class Backend:
             together = self._adjusted(more, map_number)
             if together.accepted(alone, self.settings.max_sigma_px):
                 found, worlds = together, more
-        return replace(found.correction, S_common_map=worlds, tracked=tracked or {})
+        correction = found.correction if len(worlds) > 1 else self._with_moving_tissue(found.correction, worlds)
+        return replace(correction, S_common_map=worlds, tracked=tracked or {})
 
     def _observe(self, keyframe: Frame, map_number: int) -> None:
         """Add a keyframe's feature tracks and loop closures."""
@@ -267,8 +271,22 @@ class Backend:
             correction = FrameCorrection(index, as_tracked, np.zeros(len(index)), found.sigma_px, refused=refused)
         # A map of one keyframe has no observations: NaN.
         largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
-        main_px, support = within[list(worlds).index(main)], _support(accepted, map_of, main)
+        main_px, support = within[list(worlds).index(main)], loop_support(accepted, map_of, main)
         return _Adjusted(correction, main_px, largest_px, between_px, graph_px, support)
+
+    def _with_moving_tissue(self, rigid: FrameCorrection, worlds: Mapping[int, Similarity]) -> FrameCorrection:
+        """Return the correction with tissue that moves where left-out tracks confirm it, else the rigid one."""
+        if self._camera is None or not self.settings.moving_tissue or not rigid.sigma_px >= RIGID_CORE_PX:
+            return rigid
+        chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
+        problem, _ = self._problem(chosen, worlds, self._camera)
+        solution = adjust_moving_tissue(problem)
+        if solution is None:
+            return rigid
+        found, deformation, left_out = solution
+        rate = deformation.rate_per_min(np.array(self._times_s)[chosen])
+        fields, tissue = self._fields(chosen, problem.points, found), TissueMotion(deformation, left_out, rate)
+        return replace(self._correction(chosen, worlds, found), depth_fields=fields, tissue=tissue)
 
     def _problem(
         self, chosen: list[int], worlds: Mapping[int, Similarity], camera: PinholeCamera
@@ -314,14 +332,18 @@ class Backend:
         """Return why a solution is refused, None where it is not, and its depth correction fields."""
         if reason := contradiction(problem.points, found, self.settings):
             return Notice("mapping-not-rigid", {"reason": reason, "merged": ""}), ()
-        fields: tuple[DepthCorrectionField, ...] = ()
-        if (step_sigma := self.settings.depth_step_sigma) > 0:
-            assert self._camera is not None
-            points, drift = problem.points, self._path.drift[chosen]
-            as_tracked = replace(points, log_depth=points.log_depth + drift[points.host])
-            error = _depth_change(points, found), found.log_depth_sigma
-            fields = fit_depth_corrections(self._camera, as_tracked, len(drift), *error, step_sigma)
+        fields = self._fields(chosen, problem.points, found)
         return self._depth_contradiction(chosen, found, fields, worlds), fields
+
+    def _fields(self, chosen: list[int], points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
+        """Return the depth correction fields of chosen keyframes by a solution; () where depth is only scaled."""
+        if (step_sigma := self.settings.depth_step_sigma) <= 0:
+            return ()
+        assert self._camera is not None
+        drift = self._path.drift[chosen]
+        as_tracked = replace(points, log_depth=points.log_depth + drift[points.host])
+        error = _depth_change(points, found), found.log_depth_sigma
+        return fit_depth_corrections(self._camera, as_tracked, len(drift), *error, step_sigma)
 
     def _depth_contradiction(
         self,
@@ -348,17 +370,6 @@ class Backend:
                 values = {"adjusted": float(now), "tracked": float(was), "merged": ""}
                 return Notice("mapping-depth-disagrees", values)
         return None
-
-
-def _support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
-    """Return the fewest keyframes, on either side, of the loops (A, 2) of a map with others; 0: a map has none."""
-    least = []
-    for number in sorted(set(map_of.tolist()) - {main}):
-        inside = map_of[loops] == number
-        ends = loops[inside.sum(1) == 1]
-        own = map_of[ends] == number
-        least.append(min(len(np.unique(ends[own])), len(np.unique(ends[~own]))))
-    return min(least, default=0)
 
 
 def contradiction(points: Points, found: BundleSolution, settings: MappingConstants) -> str:

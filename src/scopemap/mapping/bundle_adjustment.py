@@ -39,8 +39,8 @@ from scopemap.mapping.bundle_problem import (
     reproject,
 )
 
-_PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
-_CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
+PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
+CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 _POINT_STEPS = 5  # of the points alone, after the keyframes
@@ -144,12 +144,12 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
         return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
 
     options = least_squares.Options(np.inf, max_iterations, min_step=0.0, min_decrease=min_decrease)
-    search = least_squares.Problem(partial(linearised, problem), partial(_retract, problem), rescaled)
+    search = least_squares.Problem(partial(linearised, problem), partial(retract, problem), rescaled)
     found = minimise(search, rescaled(start), options)
     state = found.state._replace(T_camera_world=np.stack([orthonormalised(T) for T in found.state.T_camera_world]))
     if problem.correlated > 1:
-        state = _with_points(problem, state)
-    return BundleSolution(state, _log_depth_sigma(problem, state), found.iterations)
+        state = with_points(problem, state)
+    return BundleSolution(state, log_depth_sigma(problem, state), found.iterations)
 
 
 def lens_residual(problem: BundleProblem, found: BundleSolution) -> LensResidual:
@@ -182,33 +182,35 @@ def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
     return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
 
 
-def _weights(state: State, seen: Reprojection) -> np.ndarray:
-    return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, _CAUCHY)[1], 0) / state.sigma_px**2
+def weights(state: State, seen: Reprojection) -> np.ndarray:
+    """Return the robust weights (N,) of the observations, 1/px^2."""
+    return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, CAUCHY)[1], 0) / state.sigma_px**2
 
 
 def linearised(problem: BundleProblem, state: State) -> SchurModel:
     """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
     count, lens = len(state.T_camera_world), 0 if problem.lens is None else len(problem.lens.sigma)
     seen = reproject(problem, state)
-    edges = _odometry_edges(problem, state)
-    held = [6 + _PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
-    held += [np.arange(6), np.arange(_PER_KEYFRAME * problem.held)]
-    unknowns = _PER_KEYFRAME * count + lens
+    edges = odometry_edges(problem, state)
+    held = [6 + PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
+    held += [np.arange(6), np.arange(PER_KEYFRAME * problem.held)]
+    unknowns = PER_KEYFRAME * count + lens
     free = np.setdiff1d(np.arange(unknowns), np.concatenate(held))
 
     def build() -> tuple[list[PointBlock], list[CameraBlock]]:
-        parts = _Rows(seen.error, _weights(state, seen) / problem.correlated, *jacobians(problem, state, seen))
+        parts = _Rows(seen.error, weights(state, seen) / problem.correlated, *jacobians(problem, state, seen))
         hosts = [_host_block(problem, state, host, parts) for host in np.unique(problem.points.host)]
-        return hosts, _camera_blocks(problem, state, edges)
+        return hosts, camera_blocks(problem, state, edges)
 
-    return SchurModel(_cost(problem, state, seen, edges), build, free, unknowns, len(state.log_depth))
+    return SchurModel(cost(problem, state, seen, edges), build, free, unknowns, len(state.log_depth))
 
 
-def _cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[_OdometryEdge]) -> float:
+def cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[OdometryEdge]) -> float:
+    """Return what is minimised, at a state."""
     points, priors = problem.points, problem.priors
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
     depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
-    cost = cauchy(square, _CAUCHY)[0].sum() / problem.correlated + cauchy(depth**2, _CAUCHY)[0].sum()
+    cost = cauchy(square, CAUCHY)[0].sum() / problem.correlated + cauchy(depth**2, CAUCHY)[0].sum()
     cost += 0.5 * sum(float(edge.error @ (edge.information * edge.error)) for edge in edges)
     if priors.scale > 0:
         cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
@@ -218,34 +220,37 @@ def _cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[
     return float(cost)
 
 
-class _OdometryEdge(NamedTuple):
+class OdometryEdge(NamedTuple):
+    """Deviation of two keyframes from the tracked motion between them."""
+
     i: int
     j: int
     error: np.ndarray  # (6,) twist
     information: np.ndarray  # (6,)
 
 
-def _odometry_edges(problem: BundleProblem, state: State) -> list[_OdometryEdge]:
+def odometry_edges(problem: BundleProblem, state: State) -> list[OdometryEdge]:
     """Deviations from the tracked motion between neighbours."""
     priors, tracked, T = problem.priors, problem.T_camera_world, state.T_camera_world
     information = np.repeat([priors.rotation_rad, priors.translation_share * problem.unit_mm], 3) ** -2.0
     return [
-        _OdometryEdge(i, j, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
+        OdometryEdge(i, j, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
         for i, j in problem.neighbours
     ]
 
 
-def _camera_blocks(problem: BundleProblem, state: State, edges: list[_OdometryEdge]) -> list[CameraBlock]:
+def camera_blocks(problem: BundleProblem, state: State, edges: list[OdometryEdge]) -> list[CameraBlock]:
+    """Return the normal equations of the priors of keyframes, and of the lens."""
     T, unit, blocks = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), []
     for i, j, error, information in edges:
-        own = np.append(_PER_KEYFRAME * i + np.arange(6), _PER_KEYFRAME * j + np.arange(6))
+        own = np.append(PER_KEYFRAME * i + np.arange(6), PER_KEYFRAME * j + np.arange(6))
         J = np.hstack([-_adjoint(T[j] @ inverse(T[i])), np.eye(6)]) * np.tile(unit, 2)
         blocks.append(CameraBlock(own, J.T @ (information[:, None] * J), J.T @ (information * error)))
     if problem.priors.scale > 0:
-        information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + _PER_KEYFRAME * np.arange(len(T))
+        information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + PER_KEYFRAME * np.arange(len(T))
         blocks.append(CameraBlock(own, np.diag(information), information * state.log_scale))
     if problem.lens is not None:
-        information, own = problem.lens.sigma**-2.0, _PER_KEYFRAME * len(T) + np.arange(len(problem.lens.sigma))
+        information, own = problem.lens.sigma**-2.0, PER_KEYFRAME * len(T) + np.arange(len(problem.lens.sigma))
         change = (state.lens - problem.tracked.lens)[: len(own)]
         blocks.append(CameraBlock(own, np.diag(information), information * change))
     return blocks
@@ -272,13 +277,13 @@ def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -
     number, observer = observations.point[some] - here.start, np.searchsorted(keyframes, observations.keyframe[some])
     A, scores, E, h, g = _summed(_Rows(*(part[some] for part in parts)), number, observer, at, count, len(keyframes))
     # The prior of the estimated depth, up to the host's scale.
-    off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], _PER_KEYFRAME * at + 6
-    held = cauchy((off / points.sigma[here]) ** 2, _CAUCHY)[1] / points.sigma[here] ** 2
+    off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], PER_KEYFRAME * at + 6
+    held = cauchy((off / points.sigma[here]) ** 2, CAUCHY)[1] / points.sigma[here] ** 2
     E[:, column] -= held
     A[column, column] += held.sum()
     scores[:, column] -= held * off
-    columns = (_PER_KEYFRAME * keyframes[:, None] + np.arange(_PER_KEYFRAME)).ravel()
-    columns = np.append(columns, _PER_KEYFRAME * len(state.T_camera_world) + np.arange(parts.by_lens.shape[2]))
+    columns = (PER_KEYFRAME * keyframes[:, None] + np.arange(PER_KEYFRAME)).ravel()
+    columns = np.append(columns, PER_KEYFRAME * len(state.T_camera_world) + np.arange(parts.by_lens.shape[2]))
     return PointBlock(columns, A, scores, here, h + held, g + held * off, E)
 
 
@@ -289,17 +294,17 @@ def _summed(
     """Return A, scores, E, h and g of a `PointBlock`, summed over the observations of a host's points."""
     error, weight, by_camera, by_host, by_depth, by_lens = rows
     lens = by_lens.shape[2]
-    last = _PER_KEYFRAME * keyframes
+    last = PER_KEYFRAME * keyframes
     size = last + lens
     A = np.zeros((size, size))
     scores, E = np.zeros((points, size)), np.zeros((points, size))
     h, g = np.zeros(points), np.zeros(points)
     touched = np.empty(12 + lens, np.int64)
-    touched[6:12] = _PER_KEYFRAME * host + np.arange(6)
+    touched[6:12] = PER_KEYFRAME * host + np.arange(6)
     touched[12:] = last + np.arange(lens)
     row = np.empty(12 + lens)
     for k in range(len(weight)):
-        touched[:6] = _PER_KEYFRAME * observer[k] + np.arange(6)
+        touched[:6] = PER_KEYFRAME * observer[k] + np.arange(6)
         for axis in range(2):
             row[:6], row[6:12], row[12:] = by_camera[k, axis], by_host[k, axis], by_lens[k, axis]
             depth, off = weight[k] * by_depth[k, axis], weight[k] * error[k, axis]
@@ -313,24 +318,25 @@ def _summed(
     return A, scores, E, h, g
 
 
-def _with_points(problem: BundleProblem, state: State) -> State:
-    """Return the state with the points where all observations place them, keyframes held."""
+def with_points(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> State:
+    """Return the state with the points where all observations place them, keyframes and motion of tissue held."""
     points, number = problem.points, problem.observations.point
     for _ in range(_POINT_STEPS):
-        seen = reproject(problem, state)
-        by_depth, weight = jacobians(problem, state, seen)[2], _weights(state, seen)
+        seen = reproject(problem, state, moved)
+        by_depth, weight = jacobians(problem, state, seen)[2], weights(state, seen)
         h, g = (np.bincount(number, weight * (by_depth * by).sum(1), len(points.host)) for by in (by_depth, seen.error))
         off = state.log_depth - points.log_depth - state.log_scale[points.host]
-        held = cauchy((off / points.sigma) ** 2, _CAUCHY)[1] / points.sigma**2
+        held = cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2
         step = -(g + held * off) / (h + held)
         state = state._replace(log_depth=state.log_depth - np.log(np.clip(1 - step, *_INVERSE_DEPTH_STEP)))
     return state
 
 
-def _log_depth_sigma(problem: BundleProblem, state: State) -> np.ndarray:
-    seen = reproject(problem, state)
+def log_depth_sigma(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> np.ndarray:
+    """Return the standard deviation of ln depth (P,) by the observations alone; infinite without any."""
+    seen = reproject(problem, state, moved)
     by_depth = jacobians(problem, state, seen)[2]
-    information = _weights(state, seen) * (by_depth**2).sum(1)
+    information = weights(state, seen) * (by_depth**2).sum(1)
     with np.errstate(divide="ignore"):
         return 1 / np.sqrt(np.bincount(problem.observations.point, information, len(state.log_depth)))
 
@@ -343,10 +349,10 @@ def _adjoint(T: np.ndarray) -> np.ndarray:
     return adjoint
 
 
-def _retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
+def retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
     """Return the state after a step; points move along their rays in inverse depth, which parallax is linear in."""
-    count = _PER_KEYFRAME * len(state.T_camera_world)
-    own = step[:count].reshape(-1, _PER_KEYFRAME)
+    count = PER_KEYFRAME * len(state.T_camera_world)
+    own = step[:count].reshape(-1, PER_KEYFRAME)
     twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
     T = np.stack([se3_exp(twist) @ pose for twist, pose in zip(twists, state.T_camera_world, strict=True)])
     lens = state.lens.copy()

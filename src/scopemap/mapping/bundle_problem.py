@@ -126,8 +126,11 @@ class Reprojection(NamedTuple):
     straight: np.ndarray  # (N, 2) px, through a lens without distortion
 
 
-def reproject(problem: BundleProblem, state: State) -> Reprojection:
-    """Return where the points of a state are projected, against where they were observed."""
+def reproject(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> Reprojection:
+    """Return where the points of a state are projected, against where they were observed.
+
+    moved : (N, 3) mm, by how much a point has moved in the world when it is observed; None: tissue is rigid.
+    """
     points, observations, T = problem.points, problem.observations, state.T_camera_world
     focal, host = np.exp(state.lens[0]), points.host[observations.point]
     centred = points.pixel - state.lens[2:]
@@ -137,6 +140,8 @@ def reproject(problem: BundleProblem, state: State) -> Reprojection:
     between = T[pairs % len(T)] @ inverse(T[pairs // len(T)])
     R = between[which, :3, :3]
     seen = np.einsum("nij,nj->ni", R, in_host) + between[which, :3, 3]
+    if moved is not None:
+        seen += np.einsum("nij,nj->ni", T[observations.keyframe, :3, :3], moved)
     ahead = seen[:, 2] > _LEAST_Z * np.linalg.norm(seen, axis=1)
     straight = focal * seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
     pixel = _distorted(problem, straight, state.lens[1])

@@ -106,6 +106,17 @@ def merge_maps(
     return {number: moved.after(S) for number, S in S_common_map.items()}
 
 
+def loop_support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
+    """Return the fewest keyframes, on either side, of the loops (A, 2) of a map with others; 0: a map has none."""
+    least = []
+    for number in sorted(set(map_of.tolist()) - {main}):
+        inside = map_of[loops] == number
+        ends = loops[inside.sum(1) == 1]
+        own = map_of[ends] == number
+        least.append(min(len(np.unique(ends[own])), len(np.unique(ends[~own]))))
+    return min(least, default=0)
+
+
 def _hypothesis(
     T_world_camera: np.ndarray, map_of: Sequence[int], loop: Loop, S_common_map: dict[int, Similarity], number: int
 ) -> _Hypothesis:

@@ -12,7 +12,9 @@ import numpy as np
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
 from scopemap.mapping.bundle_adjustment import LensResidual
+from scopemap.mapping.deformation_graph import Deformation
 from scopemap.mapping.depth_correction import DepthCorrectionField
+from scopemap.mapping.nonrigid_adjustment import LeftOutTracks
 from scopemap.notices import Notice
 
 _AT_REST = 1e-6  # rad
@@ -37,6 +39,17 @@ class TrackedPose(NamedTuple):
     segment: int = 0
 
 
+class TissueMotion(NamedTuple):
+    """Motion of the tissue over the keyframes, in the adjusted world, and what confirms it.
+
+    rate_per_min : how often it repeats itself; NaN where it does not.
+    """
+
+    deformation: Deformation
+    left_out: LeftOutTracks
+    rate_per_min: float
+
+
 @dataclass(frozen=True)
 class FrameCorrection:
     """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
@@ -47,7 +60,7 @@ class FrameCorrection:
     None where it is. loops : number of accepted loop closures. depth_fields : (K,) further factors of each pixel's
     depth; (): none. S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked :
     poses as tracked by number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad.
-    lens_residual : what the observations ask of the lens.
+    lens_residual : what the observations ask of the lens. tissue : how it moves; None: it is taken to be at rest.
     """
 
     index: np.ndarray
@@ -61,6 +74,7 @@ class FrameCorrection:
     tracked: Mapping[int, TrackedPose] = field(default_factory=dict)
     depth_mm: float = 1.0
     lens_residual: LensResidual = field(default_factory=LensResidual)
+    tissue: TissueMotion | None = None
 
     @property
     def notices(self) -> list[Notice]:
@@ -84,9 +98,16 @@ class FrameCorrection:
             merged = len(self.S_common_map)
             by_loops = f", {merged} maps merged by {self.loops} loop closures" if merged > 1 else ""
             return replace(self.refused, values={**self.refused.values, "merged": by_loops})
+        if self.tissue is not None:
+            motion, left_out, rate = self.tissue
+            moved = np.linalg.norm(np.ptp(motion.displacement, axis=0), axis=1).max() / self.depth_mm
+            facts = {"keyframes": len(self.index), "nodes": len(motion.nodes), "moved": float(moved)}
+            facts |= {"rigid_px": left_out.rigid_px, "px": left_out.px}
+            periodic = f", {rate:.0f} times a minute" if np.isfinite(rate) else ""
+            return Notice("mapping-tissue-moves", facts | {"periodic": periodic})
         rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
         changes = [np.abs(depth_field.values).mean() for depth_field in self.depth_fields]
-        facts: dict[str, float] = {"keyframes": len(self.index), "loops": self.loops}
+        facts = {"keyframes": len(self.index), "loops": self.loops}
         facts["maps"] = max(len(self.S_common_map), 1)
         facts |= {"rotation_deg": float(rotation_deg), "sigma_px": float(self.sigma_px)}
         return Notice("mapping-adjusted", facts | {"depth_change": float(np.expm1(np.median(changes or [0.0])))})
@@ -98,6 +119,7 @@ class FrameCorrection:
             self,
             T_world_world=T_new_world @ self.T_world_world @ inverse(T_new_world),
             S_common_map={number: moved.after(S) for number, S in self.S_common_map.items()},
+            tissue=self.tissue and self.tissue._replace(deformation=self.tissue.deformation.in_world(T_new_world)),
         )
 
     def pose(self, index: int, T_world_camera: np.ndarray) -> np.ndarray:

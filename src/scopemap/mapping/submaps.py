@@ -231,7 +231,7 @@ class FinalFrames:
     def __init__(self, submap: Submap, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]) -> None:
         """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
         self._stored, self._tracked, self._correction = read, T_world_camera, submap.correction
-        rigid = submap.correction is not None and not submap.correction.refused
+        rigid = submap.correction is not None and not (submap.correction.refused or submap.correction.tissue)
         correct = submap.correction.pose if submap.correction is not None else lambda _, pose: pose
         self.T_world_camera = {index: correct(index, pose) for index, pose in sorted(T_world_camera.items())}
         adjusted = submap.correction.index.tolist() if rigid and submap.correction is not None else []

@@ -1,0 +1,170 @@
+"""Non-rigid adjustment: where tissue moves, one curve over time moves the nodes of a deformation graph.
+
+Nodes that are free at every keyframe explain parallax by motion, and the shape falls back to the estimated depth. So
+they are found in two steps: nodes that move step by step give the curve, their first singular vector; then the nodes'
+modes, keyframes and points are solved anew with this curve alone, from the poses as tracked.
+
+The solution is accepted by tracks left out of it, a fifth of the picture's cells: tissue at rest gains nothing there.
+Motion of all tissue against the camera is not determined: the tracked motion decides. Tissue of which a part alone
+moves has a rigid core, which the robust rigid adjustment finds better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.geometry.least_squares import robust_sigma_2d
+from scopemap.geometry.se3 import inverse, orthonormalised
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust, errors_px, log_depth_sigma, with_points
+from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, State, reproject
+from scopemap.mapping.deformation_graph import (
+    Deformation,
+    MotionPrior,
+    first_mode,
+    hat_functions,
+    skin_of,
+    spread_nodes,
+)
+from scopemap.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, solve
+
+LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 60
+"""With fewer keyframes no curve is known; with more, time and memory of the adjustment would grow too much."""
+RIGID_CORE_PX = 0.4
+"""Robust standard deviation of a rigid solution below which most of the tissue is at rest: it is left as it is."""
+_NODES, _CURVE_NODES, _MOST_CURVES = 60, 30, 30
+_THINNED = 3  # one of so many points finds the curve
+# Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
+_FREE, _ONE_CURVE, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05
+_CELL_PX, _EVERY = 16, 5  # cells of the picture, and which share of them is left out
+# Left-out errors: that count as wrong, and beyond which an error counts no more, px.
+_WRONG_PX, _FALSE_PX = 2.0, 10.0
+_LEAST_FACTOR, _LEAST_FALL = 1.5, 0.05
+_RESCALINGS = 3
+
+
+@dataclass(frozen=True)
+class LeftOutTracks:
+    """Errors of tracks left out: root mean square, px, and share above 2 px; of the rigid solution, and of this one."""
+
+    rigid_px: float
+    px: float
+    rigid_wrong: float
+    wrong: float
+
+    @property
+    def accepts(self) -> bool:
+        """Whether a non-rigid solution explains clearly more than the rigid one."""
+        return self.rigid_px >= _LEAST_FACTOR * self.px and self.rigid_wrong - self.wrong >= _LEAST_FALL
+
+
+class NonRigidSolution(NamedTuple):
+    """Keyframes and points where their hosts see them, the motion of tissue, and the errors of tracks left out."""
+
+    found: BundleSolution
+    deformation: Deformation
+    left_out: LeftOutTracks
+
+
+def adjust_moving_tissue(problem: BundleProblem) -> NonRigidSolution | None:
+    """Return the solution with moving tissue; None where tracks left out do not confirm it, or it is not tried.
+
+    It is tried with 6 to 60 keyframes, where the rigid solution leaves errors above 2 px and has no rigid core.
+    """
+    observed = np.unique(problem.observations.point)
+    few = len(observed) < _EVERY * _THINNED * _NODES
+    if few or not LEAST_KEYFRAMES <= len(problem.T_camera_world) <= MOST_KEYFRAMES:
+        return None
+    rigid = adjust(problem).state
+    if rigid.sigma_px < RIGID_CORE_PX or (errors_px(problem, rigid) > _WRONG_PX).mean() < _LEAST_FALL:
+        return None
+    problem = replace(problem, start=None)
+    column, row = np.floor(problem.points.pixel / _CELL_PX).astype(int).T
+    outside = (column + 2 * row) % _EVERY == 0
+    seen = np.zeros(len(outside), bool)
+    seen[observed] = True
+    inside = _part(problem, ~outside & seen)
+    nodes = spread_nodes(_in_world(inside, inside.tracked), _NODES)
+    curve = _curve(inside, nodes[:_CURVE_NODES])  # far from each other, too
+    state = _with_curve(inside, nodes, curve)
+    left_out = _compared(_part(problem, outside & seen), rigid, state, Deformation(nodes, curve, state.modes))
+    if not left_out.accepts:
+        return None
+    state = _with_curve(problem, nodes, curve)
+    motion = _problem(problem, nodes, curve, _ONE_CURVE).moved(state.modes)
+    T = np.stack([orthonormalised(pose) for pose in state.rigid.T_camera_world])
+    final = with_points(problem, state.rigid._replace(T_camera_world=T), motion)
+    found = BundleSolution(final, log_depth_sigma(problem, final, motion), 0)
+    return NonRigidSolution(found, Deformation(nodes, curve, state.modes), left_out)
+
+
+def _curve(problem: BundleProblem, nodes: np.ndarray) -> np.ndarray:
+    """Return the curve (K, 1) of nodes that move step by step."""
+    thinned = _part(problem, np.arange(len(problem.points.host)) % _THINNED == 0)
+    basis = hat_functions(len(problem.T_camera_world), _MOST_CURVES)
+    state = _solved(_problem(thinned, nodes, basis, _FREE))
+    return first_mode(Deformation(nodes, basis, state.modes).displacement)
+
+
+def _with_curve(problem: BundleProblem, nodes: np.ndarray, curve: np.ndarray) -> NonRigidState:
+    """Return the solution with one curve, held more closely to the tracked motion."""
+    priors = problem.priors
+    rotation_rad, translation = priors.rotation_rad * _TRACKED_SHARE, priors.translation_share * _TRACKED_SHARE
+    tight = priors._replace(rotation_rad=rotation_rad, translation_share=translation)
+    return _solved(_problem(replace(problem, priors=tight), nodes, curve, _ONE_CURVE))
+
+
+def _problem(rigid: BundleProblem, nodes: np.ndarray, basis: np.ndarray, prior: MotionPrior) -> NonRigidProblem:
+    # Nodes and skin stay where poses and depth as tracked have them: points of all hosts share the same errors.
+    skin = skin_of(nodes, _in_world(rigid, rigid.tracked))
+    return NonRigidProblem(rigid, nodes, basis, skin, prior.normal_matrix(nodes, basis, rigid.unit_mm))
+
+
+def _solved(problem: NonRigidProblem) -> NonRigidState:
+    """Return the solution from the poses as tracked, and from tissue at rest."""
+    at_rest = np.zeros((problem.basis.shape[1], len(problem.nodes), 3))
+    return solve(problem, NonRigidState(problem.rigid.tracked, at_rest))
+
+
+def _compared(part: BundleProblem, rigid: State, state: NonRigidState, deformation: Deformation) -> LeftOutTracks:
+    """Return the errors of points that were left out, in the keyframes of two solutions."""
+    moving = _problem(part, deformation.nodes, deformation.basis, _ONE_CURVE).moved(state.modes)
+    (rigid_px, rigid_wrong), (px, wrong) = (
+        _errors(part, keyframes, moved) for keyframes, moved in ((rigid, np.zeros_like(moving)), (state.rigid, moving))
+    )
+    return LeftOutTracks(rigid_px, px, rigid_wrong, wrong)
+
+
+def _errors(part: BundleProblem, keyframes: State, moved: np.ndarray) -> tuple[float, float]:
+    """Return root mean square, px, and share above 2 px of the errors of points placed by their own observations."""
+    state = keyframes._replace(log_depth=part.points.log_depth + keyframes.log_scale[part.points.host])
+    for _ in range(_RESCALINGS):
+        seen = reproject(part, state, moved)
+        sigma_px = robust_sigma_2d(np.linalg.norm(seen.error, axis=1), part.least_sigma_px)
+        state = with_points(part, state._replace(sigma_px=sigma_px), moved)
+    seen = reproject(part, state, moved)
+    lengths_px = np.where(seen.ahead, np.minimum(np.linalg.norm(seen.error, axis=1), _FALSE_PX), _FALSE_PX)
+    return float(np.sqrt((lengths_px**2).mean())), float((lengths_px > _WRONG_PX).mean())
+
+
+def _part(problem: BundleProblem, chosen: np.ndarray) -> BundleProblem:
+    """Return the problem of some points alone, (P,) bool, from the poses as tracked."""
+    points, seen = problem.points, problem.observations
+    kept = chosen[seen.point]
+    number = np.cumsum(chosen) - 1
+    return replace(
+        problem,
+        points=Points(points.host[chosen], points.pixel[chosen], points.log_depth[chosen], points.sigma[chosen]),
+        observations=Observations(number[seen.point[kept]], seen.keyframe[kept], seen.pixel[kept]),
+        start=None,
+    )
+
+
+def _in_world(problem: BundleProblem, state: State) -> np.ndarray:
+    """Return the points (P, 3), mm, where their hosts see them."""
+    points = problem.points
+    rays = np.column_stack([points.pixel / np.exp(state.lens[0]), np.ones(len(points.host))])
+    T = inverse(state.T_camera_world)[points.host]
+    return np.einsum("nij,nj->ni", T[:, :3, :3], np.exp(state.log_depth)[:, None] * rays) + T[:, :3, 3]

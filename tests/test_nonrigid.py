@@ -1,0 +1,183 @@
+"""Tissue that moves by one curve is recovered with its shape; tissue at rest is left to the rigid adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drawn_bundle import FOCAL_PX, tracked
+
+from scopemap.geometry.align import umeyama
+from scopemap.geometry.se3 import inverse, se3_exp, transform
+from scopemap.mapping import FrameCorrection
+from scopemap.mapping.bundle_adjustment import adjust, errors_px
+from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
+from scopemap.mapping.deformation_graph import MotionPrior, hat_functions, periodic_rate, skin_of, spread_nodes
+from scopemap.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
+from scopemap.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
+from scopemap.mapping.pose_interpolation import TissueMotion
+
+KEYFRAMES, PER_KEYFRAME, GAPS = 16, 120, (1, 2, 3, 5)
+LINE = np.column_stack([np.arange(KEYFRAMES - 1), np.arange(1, KEYFRAMES)])
+BREATH = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(KEYFRAMES) / 9)
+NOISE_PX = 0.15
+
+
+def _moved(rest: np.ndarray, breath: float) -> np.ndarray:
+    """Tissue (n, 3) mm at rest, 4 mm up on one side, down on the other, and forth in the middle."""
+    x, y = rest[:, 0] / 25, rest[:, 1] / 25
+    return rest + breath * np.column_stack([0.5 * np.cos(y), 4 * np.sin(1.3 * x), 1.5 * np.cos(x + y)])
+
+
+def _scene(curve: np.ndarray, false_share: float = 0.0, noise_px: float = NOISE_PX) -> tuple[BundleProblem, np.ndarray]:
+    """A bundle problem with wrong depth and nearly right poses, and the true points (P, K, 3) over time."""
+    rng = np.random.default_rng(5)
+    twists = [
+        np.append(rng.normal(0, 0.01, 3), [4 * np.sin(0.6 * k), 3 * np.cos(0.5 * k), 0.3 * k]) for k in range(KEYFRAMES)
+    ]
+    T = np.stack([inverse(se3_exp(twist)) for twist in twists])
+    T = T @ inverse(T[0])
+    # Of all tissue at rest each keyframe sees other points.
+    flat = rng.uniform(-22, 22, (KEYFRAMES * PER_KEYFRAME, 2))
+    rest = np.column_stack([flat, 42 + 5 * np.sin(flat[:, 0] / 9) * np.cos(flat[:, 1] / 7)])
+    over_time = np.stack([_moved(rest, breath) for breath in curve], 1)
+    host, seen = np.repeat(np.arange(KEYFRAMES), PER_KEYFRAME), []
+    pixel, depth = np.empty((len(host), 2)), np.empty(len(host))
+    for p, h in enumerate(host):
+        x = transform(T[h], over_time[p, h])
+        pixel[p], depth[p] = FOCAL_PX * x[:2] / x[2], x[2]
+        for t in (h + sign * gap for gap in GAPS for sign in (-1, 1)):
+            if 0 <= t < KEYFRAMES:
+                x = transform(T[t], over_time[p, t])
+                seen.append((p, t, *(FOCAL_PX * x[:2] / x[2] + rng.normal(0, noise_px, 2))))
+    table = np.array(seen)
+    false = rng.random(len(table)) < false_share
+    table[false, 2:] += rng.uniform(-9, 9, (false.sum(), 2))
+    estimated = np.log(depth) + 0.2 * np.sin(pixel[:, 0] / 40) + 0.1 * np.cos(pixel[:, 1] / 30)
+    points = Points(host, pixel, estimated, np.full(len(host), 0.2))
+    observations = Observations(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+    T_tracked = tracked(T, rng, rotation_rad=0.002, translation_mm=0.1)
+    return BundleProblem(T_tracked, points, observations, Priors(), LINE, FOCAL_PX, correlated=4.0), over_time
+
+
+def _over_time(problem: BundleProblem, found: NonRigidSolution) -> np.ndarray:
+    """The points (P, K, 3) of a solution at the times of all keyframes."""
+
+    def in_world(T_camera_world: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
+        points = problem.points
+        x = np.exp(log_depth)[:, None] * np.column_stack([points.pixel / FOCAL_PX, np.ones(len(log_depth))])
+        return np.stack([transform(inverse(T_camera_world[h]), each) for h, each in zip(points.host, x, strict=True)])
+
+    state, motion, host = found.found.state, found.deformation, problem.points.host
+    skin = skin_of(motion.nodes, in_world(problem.T_camera_world, problem.points.log_depth))
+    number, at_host = np.arange(len(host)), in_world(state.T_camera_world, state.log_depth)
+    moved = [skin.moved(motion.displacement, number, host, np.full(len(host), k)) for k in range(KEYFRAMES)]
+    return at_host[:, None] + np.stack(moved, 1)
+
+
+def _shape_error_mm(points: np.ndarray, true: np.ndarray) -> float:
+    """Median distance after the Sim(3) of all points."""
+    return float(np.median(np.linalg.norm(umeyama(points, true, True).transform_points(points) - true, axis=-1)))
+
+
+@pytest.fixture(scope="module")
+def breathing() -> NonRigidSolution:
+    found = adjust_moving_tissue(_scene(BREATH)[0])
+    assert found is not None
+    return found
+
+
+def test_tissue_that_breathes_is_recovered_with_its_curve_and_shape(breathing: NonRigidSolution) -> None:
+    found, (problem, true) = breathing, _scene(BREATH)
+    assert found.left_out.px < 0.6 < 2.0 < found.left_out.rigid_px
+    curve = found.deformation.basis[:, 0]
+    assert abs(np.corrcoef(curve, BREATH)[0, 1]) > 0.9
+    assert found.deformation.rate_per_min(np.arange(KEYFRAMES) / 2) == pytest.approx(120 / 9, rel=0.1)
+    rigid = adjust(problem).state
+    as_rigid = NonRigidSolution(
+        found.found._replace(state=rigid), replace(found.deformation, basis=0 * curve[:, None]), found.left_out
+    )
+    errors = [
+        _shape_error_mm(_over_time(problem, each).reshape(-1, 3), true.reshape(-1, 3)) for each in (found, as_rigid)
+    ]
+    assert errors[0] < 2.0
+    assert errors[0] < errors[1] / 2
+    assert np.isfinite(found.found.log_depth_sigma).all()
+
+
+def test_tissue_at_rest_is_left_to_the_rigid_adjustment_whatever_the_matches_are() -> None:
+    still, _ = _scene(0 * BREATH)
+    assert adjust_moving_tissue(still) is None
+    # False matches and noise take the shortcuts away: tracks left out refuse it.
+    wrong, _ = _scene(0 * BREATH, false_share=0.15, noise_px=0.6)
+    rigid = adjust(wrong).state
+    assert rigid.sigma_px > 0.4
+    assert (errors_px(wrong, rigid) > 2).mean() > 0.05
+    assert adjust_moving_tissue(wrong) is None
+
+
+@pytest.mark.parametrize("keyframes", [5, 61])
+def test_few_and_many_keyframes_are_not_tried(keyframes: int) -> None:
+    problem, _ = _scene(BREATH)
+    T = np.concatenate([problem.T_camera_world] * 6)[:keyframes]
+    kept = (problem.points.host[problem.observations.point] < 5) & (problem.observations.keyframe < 5)
+    seen = problem.observations
+    some = seen if keyframes > 60 else Observations(seen.point[kept], seen.keyframe[kept], seen.pixel[kept])
+    assert adjust_moving_tissue(replace(problem, T_camera_world=T, observations=some)) is None
+
+
+def _small() -> tuple[NonRigidProblem, NonRigidState]:
+    """A problem with 8 nodes and 4 curves, away from its solution."""
+    rigid, true = _scene(BREATH)
+    nodes, rng = spread_nodes(true[:, 0], 8), np.random.default_rng(2)
+    basis, at_host = hat_functions(KEYFRAMES, 4), true[np.arange(len(true)), rigid.points.host]
+    prior = MotionPrior(0.1, 0.03, 0.01).normal_matrix(nodes, basis, rigid.unit_mm)
+    problem = NonRigidProblem(rigid, nodes, basis, skin_of(nodes, at_host), prior)
+    state = rigid.tracked._replace(sigma_px=0.7, log_scale=rng.normal(0, 0.02, KEYFRAMES))
+    return problem, NonRigidState(state, rng.normal(0, 0.5, (4, 8, 3)))
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    problem, state = _small()
+    model, rng = NonRigidModel(problem, state), np.random.default_rng(3)
+    parts = [slice(6, 112), slice(112, 112 + 96), slice(208, None)]  # keyframes, modes, points
+    for part in parts:
+        step = np.zeros(len(model.gradient))
+        step[part] = rng.normal(size=len(step[part]))
+        ahead, behind = (NonRigidModel(problem, _retract(problem, state, s * step)).cost for s in (1e-6, -1e-6))
+        assert (ahead - behind) / 2e-6 == pytest.approx(model.gradient @ step, rel=1e-4)
+
+
+def test_the_step_without_points_solves_the_normal_equations_of_all_unknowns() -> None:
+    model = NonRigidModel(*_small())
+    step, rng = model.gauss_newton_step(), np.random.default_rng(4)
+    assert model.curvature(step) == pytest.approx(-model.gradient @ step, rel=1e-5)
+    other = rng.normal(size=len(step)) * np.abs(step).max()
+    other[:6] = 0
+    # H step = -gradient, seen from any other direction.
+    mixed = 0.25 * (model.curvature(step + other) - model.curvature(step - other))
+    assert 2 * mixed == pytest.approx(-2 * model.gradient @ other, rel=1e-4)
+
+
+def test_only_what_repeats_itself_has_a_rate() -> None:
+    time_s = np.arange(0, 10, 0.4)
+    assert periodic_rate(time_s, np.sin(2 * np.pi * 0.3 * time_s)) == pytest.approx(0.3, rel=0.03)
+    assert np.isnan(periodic_rate(time_s, np.clip(time_s - 4, 0, 2)))  # a push
+    assert np.isnan(periodic_rate(time_s, np.sin(2 * np.pi * 0.1 * time_s)))  # one breath
+    assert np.isnan(periodic_rate(time_s, 0 * time_s))
+
+
+def test_a_correction_states_the_motion_and_carries_it_into_another_world(breathing: NonRigidSolution) -> None:
+    found = breathing
+    index, at_rest = np.arange(KEYFRAMES), np.tile(np.eye(4), (KEYFRAMES, 1, 1))
+    motion = TissueMotion(found.deformation, found.left_out, 20.0)
+    correction = FrameCorrection(index, at_rest, np.zeros(KEYFRAMES), 0.2, depth_mm=40.0, tissue=motion)
+    assert correction.notice.code == "mapping-tissue-moves"
+    assert "60 nodes" in correction.notice.text
+    assert "20 times a minute" in correction.notice.text
+    T = se3_exp(np.array([0.1, 0.2, 0.3, 5, 6, 7]))
+    there = correction.in_world(T).tissue
+    assert there is not None
+    ends = found.deformation.nodes + found.deformation.displacement[3]
+    assert there.deformation.nodes + there.deformation.displacement[3] == pytest.approx(transform(T, ends))
