@@ -18,6 +18,7 @@ from scopemap.cli.evaluate import evaluate
 from scopemap.cli.export import export
 from scopemap.cli.inspect import inspect
 from scopemap.cli.live import live
+from scopemap.cli.locate import locate
 from scopemap.cli.measure import measure
 from scopemap.cli.report import report
 from scopemap.cli.run import run
@@ -33,7 +34,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_OWN = (run, batch, live, view, report, demo, inspect, evaluate, export, measure, verify, calibrate, models.app)
+_OWN = (run, batch, live, view, report, demo, inspect, evaluate, export, measure, locate, verify, calibrate, models.app)
 _COMMANDS = {getattr(command, "__name__", "models"): command for command in _OWN} | dict(plugins("scopemap.commands"))
 for name, command in _COMMANDS.items():
     if isinstance(command, typer.Typer):

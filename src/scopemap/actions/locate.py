@@ -1,0 +1,205 @@
+"""Locates the frames of another video in the map of a result: features of keyframes, PnP in RANSAC, all matches."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scopemap.actions.inputs import frames_again
+from scopemap.errors import InputError, reporting
+from scopemap.flow.corners import Correspondences2D3D
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, transform
+from scopemap.io.opening import open_sequence
+from scopemap.io.run_folder import RunFolder
+from scopemap.io.sequence import Sequence as FrameSequence
+from scopemap.masking.mask_files import create_masks
+from scopemap.masking.masker import Masker
+from scopemap.tracking.alike import AlikeFeatures
+from scopemap.tracking.corner_pose import pose_from_correspondences
+from scopemap.tracking.features import FeatureDetector, Features, relative_pose_pnp
+
+_CANDIDATES = 8  # keyframes whose matches are verified
+_STRONGEST, _MIN_SIMILARITY = 128, 0.8  # descriptors by which they are ranked, and the cosine above which these count
+_LEAST_INLIERS, _LEAST_SUPPORT = 20, 10  # of the best keyframe, and of another one whose matches are used
+_AGREE_DEPTH, _AGREE_RAD = 0.1, 0.1  # of the poses by two keyframes
+_LEAST_SPREAD = 0.08  # standard deviation of the inliers, over the picture's width and height
+_DEPTH_SIGMA = 0.05
+NOT_FOUND = "not found"
+
+
+@dataclass(frozen=True)
+class LocatedFrame:
+    """Where a frame of a video is in the map of a result.
+
+    status : "found", or "not found". map : number of the submap, 0 for the result; -1 where it is not found.
+    keyframe : number of the result's frame that has most in common with it, or -1. inliers : matched features that
+    agree with the pose. T_world_camera : (4, 4), mm of the result, in the world of that submap; NaN where not found.
+    """
+
+    index: int
+    time_s: float
+    status: str = NOT_FOUND
+    map: int = -1
+    keyframe: int = -1
+    inliers: int = 0
+    T_world_camera: np.ndarray = field(default_factory=lambda: np.full((4, 4), np.nan))
+
+
+class _Place(NamedTuple):
+    """A keyframe of a result: its submap, number, pose (4, 4), features with depth, and strongest descriptors."""
+
+    map: int
+    number: int
+    T_world_camera: np.ndarray
+    features: Features
+    strongest: np.ndarray
+
+
+class _Match(NamedTuple):
+    """A keyframe whose features place a frame: the pose (4, 4), and the matched points, world mm, and pixels."""
+
+    place: _Place
+    T_world_camera: np.ndarray
+    points_mm: np.ndarray
+    pixels: np.ndarray
+
+
+class PlaceMap:
+    """The keyframes of a result and of its submaps, in which frames are located.
+
+    source : where the result's input is now; else it is looked for. Raises `InputError` where the folder holds no
+    finished run, kept no depth, or its input is gone.
+    """
+
+    def __init__(self, folder: Path, source: Path | None = None, detector: FeatureDetector | None = None) -> None:
+        run = RunFolder(folder).checked()
+        if not run.depth.present:
+            raise InputError(f"the run {folder} kept no depth maps")
+        self._detector = detector or AlikeFeatures()
+        self._places: list[_Place] = []
+        poses: dict[int, tuple[int, np.ndarray]] = {}
+        for number, submap in enumerate(run.submaps):
+            tracked = submap.frames.only(submap.frames.tracked)
+            pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
+            known = pose_of.keys() & (set(tracked["keyframe"].tolist()) or pose_of.keys())
+            poses |= {index: (number, pose_of[index]) for index in known}
+        for frame in frames_again(folder, set(poses), source):
+            depth_mm = run.depth.read(frame.index)
+            if depth_mm is not None:
+                features = self._detector.detect(replace(frame, depth_mm=depth_mm))
+                self._places.append(_Place(*_placed(frame.index, poses), features, features.descriptors[:_STRONGEST]))
+
+    def __len__(self) -> int:
+        """Return the number of keyframes."""
+        return len(self._places)
+
+    def locate(self, frame: Frame) -> LocatedFrame:
+        """Return where a frame is, masked as those of a run."""
+        found, missing = self._matches(frame), LocatedFrame(frame.index, frame.time_s)
+        if not found:
+            return missing
+        best = max(found, key=lambda match: len(match.pixels))
+        spread = best.pixels.std(0) / [frame.camera.width, frame.camera.height]
+        if len(best.pixels) < _LEAST_INLIERS or spread.min() < _LEAST_SPREAD:
+            return missing
+        pose, inliers = _by_all(frame, best, [match for match in found if _agree(match, best, frame)])
+        place = best.place
+        return LocatedFrame(frame.index, frame.time_s, "found", place.map, place.number, inliers, pose)
+
+    def _matches(self, frame: Frame) -> list[_Match]:
+        """Return the poses by the most similar keyframes."""
+        current = self._detector.detect(replace(frame, depth_mm=None))
+        strongest = current.descriptors[:_STRONGEST]
+        similarity = [_similarity(strongest, place.strongest) for place in self._places]
+        found = []
+        for number in np.argsort(-np.array(similarity), kind="stable")[:_CANDIDATES]:
+            place = self._places[number]
+            relative = relative_pose_pnp(place.features, current, frame.camera, _LEAST_SUPPORT)
+            if similarity[number] > 0 and relative is not None:
+                own, new = relative.pairs.T
+                points_mm = transform(place.T_world_camera, place.features.points_mm[own])
+                T_world_camera = place.T_world_camera @ inverse(relative.T_current_reference)
+                found.append(_Match(place, T_world_camera, points_mm, current.pixels[new]))
+        return found
+
+
+def open_other(
+    folder: Path,
+    path: Path | str,
+    camera: Path | str | None = None,
+    dataset: str | None = None,
+    frames: slice | str | None = None,
+) -> FrameSequence:
+    """Return the frames of another video; without a calibration of its own it has the camera of a result's input.
+
+    The settings of the input, and the parameters, are those of `open_sequence`, which see for what is raised.
+    """
+    run = RunFolder(folder).checked()
+    kept, settings = run.source_camera_file, run.config.input
+    sequence = open_sequence(path, camera=camera, dataset=dataset, frames=frames, settings=settings)
+    if sequence.calibrated or kept is None:
+        return sequence
+    resized = settings.model_copy(update={"camera_fit": "scale"})
+    return open_sequence(path, camera=kept, dataset=dataset, frames=frames, settings=resized)
+
+
+def locate(folder: Path, sequence: FrameSequence, source: Path | None = None) -> Iterator[LocatedFrame]:
+    """Yield where each frame of a sequence is in the map of the result in a folder; raises as `PlaceMap` does.
+
+    Frames are masked by the result's settings. source : where the result's own input is now; else it is looked for.
+    """
+    places, settings = PlaceMap(folder, source), RunFolder(folder).config.mask.model_copy(update={"files": ""})
+    mask = Masker(settings, create_masks(settings, sequence.rectifier, sequence.source.masks))
+    return (places.locate(mask(frame)) for frame in sequence.frames())
+
+
+def write_located(frames: Sequence[LocatedFrame], file: Path) -> None:
+    """Write a table with a line for each frame; raises `InputError` where the file cannot be written."""
+    names = ["index", "time_s", "status", "map", "keyframe", "inliers", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
+    with reporting(f"cannot write {file}"), file.open("w", newline="", encoding="utf-8") as table:
+        rows = csv.writer(table)
+        rows.writerow(names)
+        for one in frames:
+            known = one.status != NOT_FOUND
+            T = one.T_world_camera
+            pose = [f"{x:.6f}" for x in (*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat())] if known else [""] * 7
+            place = [one.map, one.keyframe] if known else ["", ""]
+            rows.writerow([one.index, f"{one.time_s:.6f}", one.status, *place, one.inliers, *pose])
+
+
+def _placed(index: int, poses: dict[int, tuple[int, np.ndarray]]) -> tuple[int, int, np.ndarray]:
+    number, T_world_camera = poses[index]
+    return number, index, T_world_camera
+
+
+def _similarity(strongest: np.ndarray, other: np.ndarray) -> float:
+    """Return the sum over descriptors of the cosine to the nearest one of a keyframe, above the threshold."""
+    cosine = strongest @ other.T
+    return float(np.maximum(cosine.max(1) - _MIN_SIMILARITY, 0).sum()) if cosine.size else 0.0
+
+
+def _agree(match: _Match, best: _Match, frame: Frame) -> bool:
+    """Whether another keyframe of the same submap has a frame in about the same pose as the best one."""
+    if match.place.map != best.place.map:
+        return False
+    T = inverse(best.T_world_camera) @ match.T_world_camera
+    depth_mm = float(np.median(transform(inverse(best.T_world_camera), best.points_mm)[:, 2]))
+    near = np.linalg.norm(T[:3, 3]) <= _AGREE_DEPTH * depth_mm
+    return bool(near and rotation_angle_rad(T[:3, :3]) <= _AGREE_RAD)
+
+
+def _by_all(frame: Frame, best: _Match, agreeing: list[_Match]) -> tuple[np.ndarray, int]:
+    """Return the pose (4, 4) by the matches of all keyframes that agree, and the number of these matches."""
+    points_mm = transform(inverse(best.T_world_camera), np.concatenate([match.points_mm for match in agreeing]))
+    pixels = np.concatenate([match.pixels for match in agreeing])
+    matches = Correspondences2D3D(points_mm, pixels, 1.0, best.place.number)
+    T = pose_from_correspondences(matches, frame.camera, np.eye(4), _DEPTH_SIGMA)
+    pose = best.T_world_camera if T is None else best.T_world_camera @ inverse(T)
+    return pose, len(pixels)
