@@ -19,6 +19,12 @@ _SWAY_FRAMES = (90.0, 170.0)
 _FIXED_POINT_STEPS = 40
 _PUSH_MM, _PUSH_LENGTH_MM = 6.0, 110.0
 _POKE_MM, _POKED_SHARE = 8.0, 0.2
+_RISE_SHARE, _SWINGS, _DAMPING = 1 / 3, 2.0, 6.0
+_RING_MM, _RING_WIDTH_MM, _RING_LENGTH_MM, _RING_FRAMES = 2.5, 90.0, 70.0, 60.0
+# At this distance and beyond; less of both nearer.
+_PULL_MM, _PULL_WIDTH_MM, _PULLED_FROM_MM = 8.0, 12.0, 50.0
+# Shares of a grasp's time at which the instrument takes hold, has pulled, and lets go.
+_HOLDS, _PULLED, _LETS_GO = 0.25, 0.5, 0.75
 
 
 def lumen_path(frames: int, loop: bool, seed: int, straight: bool = False) -> np.ndarray:
@@ -185,23 +191,92 @@ class Breathing:
 
 @dataclass(frozen=True)
 class Push:
-    """A displacement that is 0 until the frame `first`, in full from `last` on."""
+    """A displacement that is 0 until the frame `first`, in full from `last` on.
+
+    springs : it is in full after a third of that time, is let go, and swings back past its place to rest.
+    """
 
     full: Displacement
     first: int
     last: int
+    springs: bool = False
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
-        share = np.clip((time - self.first) / max(self.last - self.first, 1), 0.0, 1.0)
-        return self.full.scaled(0.5 - 0.5 * np.cos(np.pi * share))
+        share = (time - self.first) / max(self.last - self.first, 1)
+        if not self.springs:
+            return self.full.scaled(_eased(share))
+        let_go = (share - _RISE_SHARE) / (1 - _RISE_SHARE)
+        return self.full.scaled(_eased(share / _RISE_SHARE) if let_go < 0 else _swing(let_go))
+
+
+@dataclass(frozen=True)
+class Contractions:
+    """Rings of narrower and wider lumen that travel along an axis, from frame `first` to `last`: peristalsis.
+
+    waves : (4, 7), those of `Displacement` at full strength. turn : (4,), which way the phase of each goes.
+    """
+
+    waves: np.ndarray
+    turn: np.ndarray
+    first: int
+    last: int
+
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames; it grows for a fifth of the time, and fades for one."""
+        share = (time - self.first) / max(self.last - self.first, 1)
+        moved = self.waves.copy()
+        moved[:, 6] += 2 * np.pi * (time - self.first) / _RING_FRAMES * self.turn
+        return Displacement(moved).scaled(_eased(5 * min(share, 1 - share)))
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Tissue at a rest point (3,) that an instrument holds, pulls by `pull_mm` (3,), and lets go, as `Push` springs.
+
+    Its bump moves with the point, so that the tissue held stays at the tip of the instrument.
+    """
+
+    point_mm: np.ndarray
+    pull_mm: np.ndarray
+    width_mm: float
+    first: int
+    last: int
+
+    @property
+    def let_go(self) -> float:
+        """Time, in frames, at which the instrument opens."""
+        return self.first + _LETS_GO * max(self.last - self.first, 1)
+
+    def holds(self, time: float) -> bool:
+        """Return whether the instrument is closed at a time, in frames."""
+        return self.first + _HOLDS * max(self.last - self.first, 1) <= time < self.let_go
+
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames."""
+        share = (time - self.first) / max(self.last - self.first, 1)
+        let_go = (share - _LETS_GO) / (1 - _LETS_GO)
+        pulled = (_eased((share - _HOLDS) / (_PULLED - _HOLDS)) if let_go < 0 else _swing(let_go)) * self.pull_mm
+        bump = np.concatenate([self.point_mm + pulled, pulled, [0.5 / self.width_mm**2]])
+        return Displacement(REST.waves, bump[None])
+
+
+def _eased(share: float) -> float:
+    """Return 0 for shares of time below 0, 1 above 1, half a cosine between."""
+    return float(0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0)))
+
+
+def _swing(share: float) -> float:
+    """Return what is left of a displacement of 1, let go at rest, at a share >= 0 of time: a damped oscillation."""
+    angle = 2 * np.pi * _SWINGS * share
+    return float(np.exp(-_DAMPING * share) * (np.cos(angle) + _DAMPING / (2 * np.pi * _SWINGS) * np.sin(angle)))
 
 
 @dataclass(frozen=True)
 class TissueMotion:
     """All that moves the tissue."""
 
-    parts: tuple[Breathing | Push, ...]
+    parts: tuple[Breathing | Push | Contractions | Grasp, ...]
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
@@ -209,13 +284,32 @@ class TissueMotion:
         return Displacement(np.concatenate([p.waves for p in parts]), np.concatenate([p.bumps for p in parts]))
 
 
-def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float) -> Push:
+def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float, springs: bool = False) -> Push:
     """Return a push of the tissue `distance_mm` ahead of a camera: up on the left of its view, down on the right."""
     right, down, ahead = T_world_camera[:3, :3].T
     along = 2 * np.pi / _PUSH_LENGTH_MM * right
     middle = T_world_camera[:3, 3] + distance_mm * ahead
     wave = np.concatenate([along, _PUSH_MM * (0.8 * down - 0.6 * ahead), [-along @ middle]])
-    return Push(Displacement(wave[None]), first, last)
+    return Push(Displacement(wave[None]), first, last, springs)
+
+
+def contractions(first: int, last: int, T_world_camera: np.ndarray) -> Contractions:
+    """Return contractions about the line of sight of a camera, which travel away from it."""
+    right, down, ahead = T_world_camera[:3, :3].T
+    along = 2 * np.pi / _RING_LENGTH_MM * ahead
+    # Each pair adds up to -sin(across) cos(along - turn): to the axis where the cosine is positive.
+    waves = []
+    for side in (right, down):
+        across = 2 * np.pi / _RING_WIDTH_MM * side
+        waves += [[across + along, -0.5 * _RING_MM * side], [across - along, -0.5 * _RING_MM * side]]
+    rows = [np.concatenate([*wave, [-wave[0] @ T_world_camera[:3, 3]]]) for wave in waves]
+    return Contractions(np.array(rows), np.array([-1.0, 1.0, -1.0, 1.0]), first, last)
+
+
+def grasp(first: int, last: int, point_mm: np.ndarray, direction: np.ndarray, distance_mm: float) -> Grasp:
+    """Return a grasp of the tissue at a point (3,), seen from so far, pulled along a unit vector (3,)."""
+    size = min(1.0, distance_mm / _PULLED_FROM_MM)
+    return Grasp(point_mm, size * _PULL_MM * direction, size * _PULL_WIDTH_MM, first, last)
 
 
 def poke(first: int, last: int, point_mm: np.ndarray, direction: np.ndarray, distance_mm: float) -> Push:

@@ -17,7 +17,20 @@ from scopemap.errors import SettingsError
 
 SceneName = Literal["colon", "laparoscopy", "abdominal_wall", "tube"]
 RouteName = Literal["wander", "sideways", "withdrawal"]
-EventName = Literal["black", "blur", "smoke", "fluid", "instrument", "turn", "contact", "push", "poke"]
+EventName = Literal[
+    "black",
+    "blur",
+    "smoke",
+    "fluid",
+    "instrument",
+    "turn",
+    "contact",
+    "push",
+    "rebound",
+    "poke",
+    "peristalsis",
+    "grasp",
+]
 
 DEFAULT_FRAMES = 200
 C3VD_DEPTH_SCALE_MM = 100.0 / 65535
@@ -30,7 +43,9 @@ class Event:
     black, blur, smoke, fluid : of the picture. instrument : one enters, works and leaves. turn : the camera turns by 30
     degrees and stays so, back with the next one; a cut where `first` is `last`. contact : the camera touches the wall
     and goes back. push : the tissue is pushed two ways and stays so. poke : the part on the right of the view alone is,
-    by 8 mm, half into the wall and half along it.
+    by 8 mm, half into the wall and half along it. rebound : a push that is let go after a third of the time, and swings
+    back. peristalsis : contractions travel along the view of the first frame. grasp : an instrument enters, holds the
+    tissue right of the middle, pulls it by 8 mm, lets go and leaves.
     """
 
     kind: EventName
