@@ -1,0 +1,106 @@
+"""Tissue that moves against its truth: its shape over time, and how far points of it are from where they truly went.
+
+Both are after one Sim(3) for the whole run, fitted to its depth maps, each placed by its pose, and the tissue then.
+A motion of all tissue against the camera counts as an error of displacement, though no view determines it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.actions.inputs import open_truth
+from scopemap.errors import reporting
+from scopemap.geometry.align import Similarity, umeyama
+from scopemap.geometry.se3 import transform
+from scopemap.io.depth_maps import DepthReader
+from scopemap.mapping.deformation_graph import skin_of
+from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.phantom.writer import DISPLACEMENT
+
+_MOTION = "tissue_motion.npz"
+_MOVED_MM = 1.0
+_FITS, _OUTLIER = 3, 3.0
+
+
+@dataclass(frozen=True)
+class ShapeOverTime:
+    """median_mm : median distance of placed depth maps from the true tissue, each at its time, after `S_truth_run`."""
+
+    median_mm: float
+    S_truth_run: Similarity
+
+
+@dataclass(frozen=True)
+class DisplacementError:
+    """Distance of points from their true places, by the estimated displacement since the first time.
+
+    median_mm : over points and times with a true displacement of more than 1 mm, all where there is none. rms_mm : over
+    all. still_mm, still_rms_mm : the same of an estimate in which nothing moves.
+    """
+
+    median_mm: float
+    rms_mm: float
+    still_mm: float
+    still_rms_mm: float
+
+
+def shape_over_time(run: Path, source: Path, every: int = 10, pixels: int = 8) -> ShapeOverTime:
+    """Compare every so many frames' depth maps of a run, a grid of so many pixels, with a data set's depth and poses.
+
+    The fit leaves out what is farther off than three medians. Raises `AlignmentError` without frames in common.
+    """
+    paths = [read_trajectory(folder).T_world_camera for folder in (run, source)]
+    depth = DepthReader(run)
+    clouds: tuple[list[np.ndarray], list[np.ndarray]] = ([np.zeros((0, 3))], [np.zeros((0, 3))])
+    for frame, truth in open_truth(run, source):
+        estimated_mm = depth.read(frame.index)
+        if frame.index % every or truth is None or truth.depth_mm is None or estimated_mm is None:
+            continue
+        row, column = np.mgrid[: frame.camera.height : pixels, : frame.camera.width : pixels].reshape(2, -1)
+        depths = [depth_mm[row, column] for depth_mm in (estimated_mm, truth.depth_mm)]
+        known = frame.valid[row, column] & np.isfinite(depths[0]) & (depths[1] > 0)
+        rays = frame.camera.unproject(np.column_stack([column, row])[known].astype(float))
+        for points, depth_mm, T in zip(clouds, depths, paths, strict=True):
+            points.append(transform(T[frame.index], depth_mm[known, None] * rays))
+    found, true = (np.concatenate(points) for points in clouds)
+    kept = np.isfinite(found).all(1)
+    for _ in range(_FITS):
+        aligned = umeyama(found[kept], true[kept], with_scale=True)
+        far = np.linalg.norm(aligned.transform_points(found) - true, axis=1)
+        median = float(np.nanmedian(far))
+        kept = far < _OUTLIER * median
+    return ShapeOverTime(median, aligned)
+
+
+def displacement_error(run: Path, source: Path, S_truth_run: Similarity, every: int = 10) -> DisplacementError:
+    """Compare a run's motion of tissue, none where it has none, with the phantom's at every so many frames."""
+    true_mm = np.load(source / DISPLACEMENT)["positions_mm"][::every].astype(float)
+    times_s = np.array([frame.time_s for frame, _ in open_truth(run, source)])[::every]
+    moved = estimated_displacement(run, S_truth_run.inverse().transform_points(true_mm[0]), times_s)
+    estimated = S_truth_run.scale * (moved - moved[0]) @ S_truth_run.R.T
+    true = true_mm - true_mm[0]
+    size, error = (np.linalg.norm(x, axis=-1)[np.isfinite(true).all(-1)] for x in (true, true - estimated))
+    counted = size > _MOVED_MM if (size > _MOVED_MM).any() else np.ones(size.shape, bool)
+    medians = [float(np.median(x[counted])) for x in (error, size)]
+    rms = [float(np.sqrt(np.mean(x**2))) for x in (error, size)]
+    return DisplacementError(medians[0], rms[0], medians[1], rms[1])
+
+
+def estimated_displacement(run: Path, points: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Return the displacement (T, P, 3) mm of points (P, 3), in a run's world, at times (T,) s; 0 without a motion.
+
+    `tissue_motion.npz` of the run holds nodes (N, 3), modes (L, N, 3) mm, and the values of the modes' curves (F, L) at
+    the times `time_s` (F,).
+    """
+    file = run / _MOTION
+    if not file.is_file():
+        return np.zeros((len(times_s), *points.shape))
+    with reporting(f"cannot read {file}"), np.load(file, allow_pickle=False) as arrays:
+        nodes, modes, time_s, curves = (arrays[name] for name in ("nodes", "modes", "time_s", "curves"))
+    strength = np.stack([np.interp(times_s, time_s, curve) for curve in curves.T], 1)
+    skin = skin_of(nodes, points)
+    of_points = np.einsum("pj,lpjc->lpc", skin.weight, modes[:, skin.node])
+    return np.tensordot(strength, of_points, 1)
