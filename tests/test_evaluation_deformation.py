@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from drawn_run import write_placed
 
 from scopemap.actions.inputs import open_truth
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import so3_exp
-from scopemap.io.depth_maps import DepthWriter
 from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.frame_table import FrameTable
-from scopemap.trajectory.trajectory import write_tum
 from scopemap_bench.evaluation.deformation import displacement_error, shape_over_time
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import DISPLACEMENT, write_phantom
@@ -34,16 +31,10 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(source: Path, tmp_path: Path) -> Path:
     """The truth of the phantom, as a result in a turned world of another scale."""
     poses = S_RUN_TRUTH.transform_poses(read_trajectory(source).T_world_camera)
-    writer, rows = DepthWriter(tmp_path), []
-    for frame, truth in open_truth(tmp_path, source):
-        assert truth is not None
-        writer(replace(frame, depth_mm=truth.depth_mm * np.float32(S_RUN_TRUTH.scale)))
-        facts = {"index": frame.index, "time_s": frame.time_s, "status": "ok", "T_world_camera": poses[frame.index]}
-        rows.append(facts)
-    writer.finish(scale_known=True)
-    FrameTable.of(rows).write(tmp_path / "frames.csv")
-    write_tum(tmp_path / "trajectory.tum", replace(read_trajectory(source), T_world_camera=poses))
-    return tmp_path
+    return write_placed(
+        tmp_path / "run",
+        [(f, S_RUN_TRUTH.scale * truth.depth_mm, poses[f.index]) for f, truth in open_truth(tmp_path, source)],
+    )
 
 
 def write_motion(run: Path, source: Path, share: float) -> None:
