@@ -1,4 +1,4 @@
-"""How a phantom's tissue moves: by the closed form, on the surface, in the depth, with the tip that holds it."""
+"""How a phantom's tissue moves: by the closed form, on the surface, in the depth, with a tip; cuts, and smoke."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
+from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.decoding import read_decoded
 from scopemap_bench.phantom.instrument import instrument
 from scopemap_bench.phantom.motion import Grasp, Push, contractions
-from scopemap_bench.phantom.render import Phantom, prepare
+from scopemap_bench.phantom.render import Phantom, prepare, render_frame
+from scopemap_bench.phantom.shading import veil
+from scopemap_bench.phantom.slit import in_wound
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import DISPLACEMENT, write_phantom
 
@@ -94,3 +98,47 @@ def test_contractions_narrow_the_lumen_and_travel_along_it() -> None:
     np.testing.assert_allclose(later, part.at(100.0).at(wall), atol=1e-9)
     assert np.abs(later[:, 2]).max() < 1e-12
     assert all(np.abs(part.at(t).at(wall)).max() < 1e-12 for t in (-1.0, 0.0, 200.0, 250.0))
+
+
+def test_a_cut_parts_the_tissue_and_stretches_nothing_across(tmp_path: Path) -> None:
+    settings = {"scene": "laparoscopy", "width": 160, "height": 128, "frames": 3, "seed": 3}
+    spec = PhantomSpec(events=parse_events("cut:0-2")).with_settings(settings)
+    phantom = prepare(spec)
+    motion, slits = phantom.motion.at(2), phantom.motion.at(2).slits
+    centre, across = slits[0, :3], slits[0, 3:6]
+    beside = centre + np.array([[-0.01], [0.01], [-30.0], [30.0]]) * across
+    gaps = [np.diff(phantom.motion.at(time).move(beside)[:2], axis=0) @ across for time in (0, 2)]
+    assert gaps[0] == pytest.approx(0.02)
+    assert gaps[1] == pytest.approx(4.4, abs=0.1)
+    assert np.abs(motion.move(beside) - beside)[2:].max() < 0.1
+    _, surface = render_frame(phantom, 2)
+    seen = transform(phantom.poses[2], spec.camera.rays.astype(float) * surface.depth_mm[..., None])
+    wound = in_wound(slits, surface.rest_mm)
+    assert 30 < wound.sum() < 400
+    known = np.isfinite(surface.depth_mm)
+    rest = surface.rest_mm.astype(float)
+    assert np.abs(phantom.volume.values_at(rest[known & ~wound])[0]).max() < 1e-3
+    np.testing.assert_allclose(motion.move(rest[known & ~wound]), seen[known & ~wound], atol=5e-3)
+    below = -phantom.volume.values_at(rest[wound])[0]
+    assert (below.min() > -0.01, 2.0 < below.max() < 3.6) == (True, True)
+    write_phantom(spec, tmp_path / "cut")
+    first, last = (trimesh.load(tmp_path / f"cut/mesh_truth/000{n}.ply", process=False) for n in (0, 2))
+    np.testing.assert_array_equal(first.faces, last.faces)
+    sides = [mesh.edges_unique_length for mesh in (first, last)]
+    assert (sides[1] / sides[0]).max() < 1.6
+    assert np.isfinite(np.load(tmp_path / "cut" / DISPLACEMENT)["positions_mm"]).all()
+
+
+def test_a_veil_hides_what_is_far_more_than_what_is_near_and_clears() -> None:
+    light = np.full((40, 50, 3), 0.05, np.float32)
+    distance = np.where(np.arange(50) < 25, 30.0, 90.0) * np.ones((40, 1))
+    near, far = (veil(light, distance, 0.5, 20.0)[:, columns].mean() for columns in (slice(25), slice(25, 50)))
+    assert 0.05 < near < far < 0.45
+    np.testing.assert_allclose(veil(light, distance, 0.0, 3.0), light, atol=1e-6)
+    drifted = veil(light, distance, 0.5, 20.0) - veil(light, distance, 0.5, 30.0)
+    assert np.abs(drifted).max() > 0.02
+
+
+def test_only_one_cut_is_possible() -> None:
+    with pytest.raises(SettingsError, match="one cut at most"):
+        PhantomSpec(events=parse_events("cut:1-2,cut:5-6"))

@@ -1,7 +1,7 @@
 """How the camera and the tissue move.
 
 Generated paths are hand-like; poses are camera to world, mm, OpenCV axes. Tissue moves by a smooth displacement: at the
-point p of space is that of the rest point p - u(p), with u a sum of plane waves and of bumps.
+point p of space is that of the rest point p - u(p), with u a sum of plane waves and of bumps, unless a slit parts it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from scopemap.geometry.se3 import se3, so3_exp
+from scopemap_bench.phantom.slit import UNCUT, cut_until, opened, slit
+from scopemap_bench.phantom.slit import in_grid as slits_in_grid
+from scopemap_bench.phantom.slit import stretch as stretch_of
 
 _SPEED_MM, _TURN_DEG = 0.45, 30.0
 _CONTACT_TURN_DEG, _CONTACT_MM, _CONTACT_STEP_MM = 55.0, 4.0, 0.25
@@ -21,8 +24,9 @@ _PUSH_MM, _PUSH_LENGTH_MM = 6.0, 110.0
 _POKE_MM, _POKED_SHARE = 8.0, 0.2
 _RISE_SHARE, _SWINGS, _DAMPING = 1 / 3, 2.0, 6.0
 _RING_MM, _RING_WIDTH_MM, _RING_LENGTH_MM, _RING_FRAMES = 2.5, 90.0, 70.0, 60.0
-# At this distance and beyond; less of both nearer.
-_PULL_MM, _PULL_WIDTH_MM, _PULLED_FROM_MM = 8.0, 12.0, 50.0
+_PULL_MM, _PULL_WIDTH_MM = 8.0, 12.0
+# A pull and a cut are in proportion to the distance where it is smaller than this.
+_FULL_FROM_MM = 50.0
 # Shares of a grasp's time at which the instrument takes hold, has pulled, and lets go.
 _HOLDS, _PULLED, _LETS_GO = 0.25, 0.5, 0.75
 
@@ -133,22 +137,24 @@ class Displacement:
     """The displacement of one instant.
 
     waves : (M, 7) float64, wave vector (rad/mm), amplitude (mm), phase (rad). bumps : (B, 7) float64, centre (mm),
-    amplitude (mm), and the q (1/mm^2) of a displacement of exp(-q distance^2) of it.
+    amplitude (mm), and the q (1/mm^2) of a displacement of exp(-q distance^2) of it. slits : (S, 20), as `UNCUT` has
+    it, S at most 1, of the tissue before waves and bumps displace it.
     """
 
     waves: np.ndarray
     bumps: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    slits: np.ndarray = field(default_factory=UNCUT.copy)
 
     @property
     def stretch(self) -> float:
-        """Upper bound of the slope of p -> p - u(p)."""
+        """Upper bound of the slope from points to rest points."""
         waves = np.linalg.norm(self.waves[:, :3], axis=1) * np.linalg.norm(self.waves[:, 3:6], axis=1)
         # A bump is steepest at the distance sqrt(1 / 2q).
         bumps = np.sqrt(2 * self.bumps[:, 6] / np.e) * np.linalg.norm(self.bumps[:, 3:6], axis=1)
-        return 1.0 + float(waves.sum() + bumps.sum())
+        return (1.0 + float(waves.sum() + bumps.sum())) * stretch_of(self.slits)
 
     def at(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return the displacement u (N, 3) in mm at points (N, 3) of space."""
+        """Return the displacement u (N, 3) in mm at points (N, 3) of space, without what slits do."""
         moved: np.ndarray = np.sin(points_mm @ self.waves[:, :3].T + self.waves[:, 6]) @ self.waves[:, 3:6]
         for bump in self.bumps:
             moved = moved + np.exp(-bump[6] * ((points_mm - bump[:3]) ** 2).sum(1))[:, None] * bump[3:6]
@@ -156,6 +162,8 @@ class Displacement:
 
     def move(self, rest_mm: np.ndarray) -> np.ndarray:
         """Return where rest points (N, 3) are now: the fixed point of p = q + u(p), to 1e-6 mm or better."""
+        for cut in self.slits:
+            rest_mm = opened(cut, np.ascontiguousarray(rest_mm, np.float64))
         points = rest_mm
         for _ in range(_FIXED_POINT_STEPS if len(self.waves) or len(self.bumps) else 0):
             points = rest_mm + self.at(points)
@@ -166,12 +174,13 @@ class Displacement:
         factors = [1, 1, 1, strength, strength, strength, 1]
         return Displacement(self.waves * factors, self.bumps * factors)
 
-    def in_grid(self, origin_mm: np.ndarray, voxel_mm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the waves (M, 7) and the bumps (B, 7) for coordinates in voxels from `origin_mm`."""
+    def in_grid(self, origin_mm: np.ndarray, voxel_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return waves (M, 7), bumps (B, 7) and slits (S, 20) for coordinates in voxels from `origin_mm`."""
         k, amplitude, phase = self.waves[:, :3], self.waves[:, 3:6], self.waves[:, 6:]
         waves = np.concatenate([k * voxel_mm, amplitude / voxel_mm, phase + (k @ origin_mm)[:, None]], axis=1)
         centre, poke, q = self.bumps[:, :3], self.bumps[:, 3:6], self.bumps[:, 6:]
-        return waves, np.concatenate([(centre - origin_mm) / voxel_mm, poke / voxel_mm, q * voxel_mm**2], axis=1)
+        bumps = np.concatenate([(centre - origin_mm) / voxel_mm, poke / voxel_mm, q * voxel_mm**2], axis=1)
+        return waves, bumps, slits_in_grid(self.slits, origin_mm, voxel_mm)
 
 
 REST = Displacement(np.zeros((0, 7)))
@@ -261,6 +270,20 @@ class Grasp:
         return Displacement(REST.waves, bump[None])
 
 
+@dataclass(frozen=True)
+class Cut:
+    """A slit (1, 20) that is cut from frame `first` to `last`, and gapes from then on."""
+
+    slits: np.ndarray
+    first: int
+    last: int
+
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames."""
+        share = np.clip((time - self.first) / max(self.last - self.first, 1), 0.0, 1.0)
+        return Displacement(REST.waves, slits=cut_until(self.slits, float(share)))
+
+
 def _eased(share: float) -> float:
     """Return 0 for shares of time below 0, 1 above 1, half a cosine between."""
     return float(0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0)))
@@ -272,16 +295,21 @@ def _swing(share: float) -> float:
     return float(np.exp(-_DAMPING * share) * (np.cos(angle) + _DAMPING / (2 * np.pi * _SWINGS) * np.sin(angle)))
 
 
+Part = Breathing | Push | Contractions | Grasp | Cut
+
+
 @dataclass(frozen=True)
 class TissueMotion:
     """All that moves the tissue."""
 
-    parts: tuple[Breathing | Push | Contractions | Grasp, ...]
+    parts: tuple[Part, ...]
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
         parts = [REST, *(part.at(time) for part in self.parts)]
-        return Displacement(np.concatenate([p.waves for p in parts]), np.concatenate([p.bumps for p in parts]))
+        return Displacement(
+            *(np.concatenate([getattr(p, kind) for p in parts]) for kind in ("waves", "bumps", "slits"))
+        )
 
 
 def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float, springs: bool = False) -> Push:
@@ -308,8 +336,13 @@ def contractions(first: int, last: int, T_world_camera: np.ndarray) -> Contracti
 
 def grasp(first: int, last: int, point_mm: np.ndarray, direction: np.ndarray, distance_mm: float) -> Grasp:
     """Return a grasp of the tissue at a point (3,), seen from so far, pulled along a unit vector (3,)."""
-    size = min(1.0, distance_mm / _PULLED_FROM_MM)
+    size = min(1.0, distance_mm / _FULL_FROM_MM)
     return Grasp(point_mm, size * _PULL_MM * direction, size * _PULL_WIDTH_MM, first, last)
+
+
+def cut(first: int, last: int, point_mm: np.ndarray, across: np.ndarray, normal: np.ndarray, distance_mm: float) -> Cut:
+    """Return a cut of the tissue at a point (3,), seen from so far, which opens along a unit vector (3,)."""
+    return Cut(slit(point_mm, across, normal, min(1.0, distance_mm / _FULL_FROM_MM)), first, last)
 
 
 def poke(first: int, last: int, point_mm: np.ndarray, direction: np.ndarray, distance_mm: float) -> Push:

@@ -13,13 +13,12 @@ from scopemap_bench.phantom.instrument import Capsules, insert, instrument
 from scopemap_bench.phantom.march import SurfaceBuffers, Volume, march
 from scopemap_bench.phantom.motion import (
     REST,
-    Breathing,
-    Contractions,
     Grasp,
-    Push,
+    Part,
     TissueMotion,
     breathing,
     contractions,
+    cut,
     grasp,
     lumen_path,
     poke,
@@ -39,10 +38,13 @@ from scopemap_bench.phantom.shading import (
     lagging_gains,
     pose_at,
     shade,
+    veil,
     vignette,
 )
+from scopemap_bench.phantom.slit import in_wound
 from scopemap_bench.phantom.spec import DEFAULT_FRAMES, Event, EventName, PhantomSpec
 
+_WOUND_RGB = np.array([0.7, 0.22, 0.2], np.float32)
 _COLON_RGB = np.array([0.64, 0.265, 0.165])
 _TUBE_RGB = np.array([0.55, 0.30, 0.22])
 # Exposure is measured in a small picture, as cameras do.
@@ -87,7 +89,7 @@ def _events(spec: PhantomSpec, kind: EventName) -> list[Event]:
 
 def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotion:
     """Breathing and what the events do to the tissue."""
-    parts: list[Breathing | Push | Contractions | Grasp] = []
+    parts: list[Part] = []
     if spec.deform:
         parts.append(breathing(spec.breath_mm, spec.breath_frames, spec.seed))
     away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene in _OPEN else "lumen"]
@@ -97,9 +99,11 @@ def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotio
             parts.append(push(first, last, pose, away_mm, springs=event.kind == "rebound"))
         elif event.kind == "peristalsis":
             parts.append(contractions(first, last, pose))
-        elif event.kind in ("poke", "grasp"):
+        elif event.kind in ("poke", "grasp", "cut"):
             point, normal, along, distance_mm = _touched(spec, event, pose, volume)
-            if event.kind == "poke":
+            if event.kind == "cut":
+                parts.append(cut(first, last, point, along, normal, distance_mm))
+            elif event.kind == "poke":
                 parts.append(poke(first, last, point, (along - normal) / np.sqrt(2), distance_mm))
             else:
                 parts.append(grasp(first, last, point, (along + normal) / np.sqrt(2), distance_mm))
@@ -179,9 +183,11 @@ def light(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
 def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers]:
     """Linear light at a moment, in frames, and the surface that it came from."""
     camera, look = phantom.spec.camera, phantom.appearance
-    surface = march(phantom.volume, camera, pose_at(phantom.poses, time), phantom.motion.at(time))
+    displacement = phantom.motion.at(time)
+    surface = march(phantom.volume, camera, pose_at(phantom.poses, time), displacement)
     rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.central.fx)
     albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
+    albedo[in_wound(displacement.slits, rest)] *= _WOUND_RGB
     radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
     for tool in _tools(phantom, time):
         radiance, surface = insert(tool, radiance, surface, camera)
@@ -209,4 +215,8 @@ def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffe
     gain = gain if isinstance(gain, float) else gain[index]
     rng = np.random.default_rng((spec.seed, 4, index))
     kinds = {event.kind for event in spec.events if event.first <= index <= event.last}
-    return develop(disturb(linear * np.float32(gain), kinds, rng, index), spec.noise, rng), surface
+    linear = linear * np.float32(gain)
+    for event in _events(spec, "veil"):
+        if event.first <= index <= event.last:
+            linear = veil(linear, surface.distance_mm, (index - event.first) / max(event.last - event.first, 1), index)
+    return develop(disturb(linear, kinds, rng, index), spec.noise, rng), surface

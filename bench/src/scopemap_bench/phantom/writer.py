@@ -4,7 +4,7 @@
 phantom.json
 
 `displacement_truth.npz` follows material points: `positions_mm` (frames, points, 3) float32, world mm, where points of
-the tissue that was seen, the same ones in all frames, are in each; NaN where a point is no surface any more.
+the tissue that was seen, the same ones in all frames, are in each.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from scopemap.io.decoding import write_encoded
 from scopemap_bench.phantom.march import Volume
 from scopemap_bench.phantom.render import Phantom, prepare, render_frame
 from scopemap_bench.phantom.shading import VideoCoding
+from scopemap_bench.phantom.slit import crossed
 from scopemap_bench.phantom.spec import PhantomSpec
 
 CLIPPED = 65535
@@ -96,6 +97,9 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
             if progress is not None:
                 progress(index + 1, len(phantom.poses))
         mesh = seen_surface(phantom.volume, seen)
+        # Nothing is stretched across a slit, at no time: meshes of all frames have the same faces.
+        parted = crossed(phantom.motion.at(len(phantom.poses)).slits, np.asarray(mesh.vertices), mesh.faces)
+        mesh.update_faces(~parted)
         _write_meshes(phantom, mesh, folder)
         np.savez_compressed(folder / DISPLACEMENT, positions_mm=_followed(phantom, np.asarray(mesh.vertices)))
     except OSError as error:
