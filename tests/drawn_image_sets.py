@@ -347,10 +347,12 @@ def write_d4d(root: Path) -> Path:
         write_picture(folder / "left_images_rect" / f"{number:06d}.png", number)
         np.save(folder / "stereo_depth" / f"{number:06d}.npy", levels(np.float32, 0.06 + 0.001 * number, 0.08))
     for end, place in (("start", 0), ("end", 3)):
-        np.savetxt(folder / f"curated_camera_pose_{end}.txt", d4d_pose(place))
+        T = d4d_pose(place)
+        np.savetxt(folder / f"curated_camera_pose_{end}.txt", T)
         (session / "pointcloud").mkdir(exist_ok=True)
-        points = np.array([[0.01, 0.02, 0.1 + 0.001 * place], [np.nan] * 3, [0.0, 0.0, 0.2]])
-        trimesh.PointCloud(points).export(session / "pointcloud" / f"{end}.ply")
+        x, y = (0.001 * side.ravel() for side in np.meshgrid(np.arange(-40, 41), np.arange(-40, 41)))
+        plane = np.column_stack([x, y, np.full(x.shape, 0.1 + 0.001 * place)]) @ T[:3, :3].T + T[:3, 3]
+        trimesh.PointCloud(np.vstack([plane, [[np.nan] * 3]])).export(session / "pointcloud" / f"{end}.ply")
     (folder / "camera_info").mkdir()
     camera = f"image_width: 80\nimage_height: 64\nprojection_matrix:\n  rows: 3\n  cols: 4\n  data: {D4D_P}\n"
     (folder / "camera_info" / "left_rect.yaml").write_text(camera)

@@ -118,16 +118,12 @@ def _bounds(folder: Path, content: Content) -> None:
     _damaged(folder / "poses_bounds.npy", content)
 
 
-def _arrays_and_ends(folder: Path, content: Content) -> None:
-    """Depth in metres, and the poses of the first and the last frame."""
+def _arrays(folder: Path, content: Content) -> None:
+    """Depth in metres."""
     for file in folder.glob("stereo_depth/*.npy"):
         file.unlink()
     for number, depth_mm in content.depth_mm.items():
         np.save(folder / f"stereo_depth/{number:06d}.npy", (depth_mm / 1000).astype(np.float32))
-    for end, number in (("start", content.numbers[0]), ("end", content.numbers[-1])):
-        stored = content.poses[number].copy()
-        stored[:3, 3] /= 1000
-        np.savetxt(folder / f"curated_camera_pose_{end}.txt", stored)
 
 
 def _unity_tables(folder: Path, content: Content) -> None:
@@ -296,7 +292,7 @@ KINDS: dict[str, Kind] = {
         poses="quaternions",
     ),
     "stir": Kind((movie("frames/1200ms-1440ms-visible.mp4"),), pictures="video"),
-    "d4d": Kind((pictures("left_images_rect/{:06d}.png"), _arrays_and_ends), depth="fine"),
+    "d4d": Kind((pictures("left_images_rect/{:06d}.png"), _arrays), depth="fine"),
     "endomapper": Kind((movie("Seq_001.mov"), _model_archive), pictures="video", poses="quaternions"),
     "climb": Kind((movie("../Seq_001_a.mp4"), _climb_reference), pictures="video", poses="quaternions"),
     "endomapper-sim": Kind(

@@ -17,7 +17,7 @@ from scopemap.io.opening import open_sequence
 from scopemap_bench.datasets.d4d import D4dClip
 from scopemap_bench.datasets.stir import StirClip
 from scopemap_bench.evaluation.tattoos import accuracy, followed
-from scopemap_bench.scripts import tattoos
+from scopemap_bench.scripts import deforming_clips
 
 
 def test_points_of_dye_are_the_centres_of_the_white_parts(tmp_path: Path) -> None:
@@ -51,9 +51,9 @@ def test_a_result_carries_the_points_by_depth_pose_and_motion_of_tissue(
     motion = {"nodes": nodes, "modes": np.tile([2.5, 3.0, 0], (1, 40, 1)), "curves": curves}
     np.savez(run / "tissue_motion.npz", time_s=[frame.time_s for frame in frames], **motion)
     np.testing.assert_allclose(followed(run, clip, start) - start, [[0, 3 / 60 * STIR_K[1][1]]] * 3, atol=0.01)
-    monkeypatch.setattr("sys.argv", ["tattoos", "--runs", str(run), "--clips", str(clip)])
-    tattoos.main()
-    assert "| seq03 | 3 | 0.60 / 0.53 | 0.33 / 0.00 |" in capsys.readouterr().out
+    monkeypatch.setattr("sys.argv", ["deforming_clips", "--runs", str(run), "--clips", str(clip)])
+    deforming_clips.main()
+    assert "| seq03 | 3 points | accuracy 0.60 / 0.53 | within_4_px 0.33 / 0.00 |" in capsys.readouterr().out
 
 
 def test_the_lens_of_a_clip_is_kept(tmp_path: Path) -> None:
@@ -73,16 +73,31 @@ def test_the_lens_of_a_clip_is_kept(tmp_path: Path) -> None:
         StirClip(folder).tattoos()
 
 
-def test_structured_light_comes_in_mm_in_the_world_of_the_poses(tmp_path: Path) -> None:
-    clip = D4dClip(write_d4d(tmp_path / "s"))
+def test_structured_light_is_the_depth_of_the_first_and_the_last_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, run = write_d4d(tmp_path / "s"), tmp_path / "run"
+    clip = D4dClip(folder)
+    # The plane that the cloud is of, 100 mm before the first camera; 3 mm farther before the last.
     for end, z_mm in (("start", 100.0), ("end", 103.0)):
-        points = clip.geometry_mm(end)
-        np.testing.assert_allclose(points, [[10, 20, z_mm], [0, 0, 200]], atol=1e-4)
-    (clip.path.parents[1] / "pointcloud" / "end.ply").write_bytes(b"ply")
+        light = clip.structured_light_mm(end)
+        assert light is not None
+        assert np.isfinite(light).mean() > 0.5
+        np.testing.assert_allclose(light[np.isfinite(light)], z_mm, rtol=1e-5)
+    # Of half the size, and of the right deformation but for 1 mm.
+    depth_mm = {0: 50.0, 3: 52.0}
+    frames = [frame for frame in open_sequence(folder).frames() if frame.index in depth_mm]
+    write_placed(run, [(frame, np.full(frame.valid.shape, depth_mm[frame.index]), np.eye(4)) for frame in frames])
+    monkeypatch.setattr("sys.argv", ["deforming_clips", "--runs", str(run), "--clips", str(folder)])
+    deforming_clips.main()
+    before, after, still = (float(cell.split()[-1]) for cell in capsys.readouterr().out.split("|")[2:5])
+    assert (before + after, still) == (pytest.approx(1.0, abs=0.06), pytest.approx(3.0, abs=0.01))
+    (folder.parents[1] / "pointcloud" / "end.ply").write_bytes(b"ply")
     with pytest.raises(InputError, match=r"clips\.json names for Clip_1"):
-        clip.geometry_mm("end")
-    (clip.path.parents[1] / "clips.json").unlink()
-    assert clip.geometry_mm("start") is None
+        clip.structured_light_mm("end")
+    (folder.parents[1] / "clips.json").unlink()
+    with pytest.raises(InputError, match="has no depth of frame 0 to compare"):
+        deforming_clips.main()
 
 
 def test_the_camera_of_the_session_is_used_where_the_clip_has_none(tmp_path: Path) -> None:
@@ -95,7 +110,6 @@ def test_the_camera_of_the_session_is_used_where_the_clip_has_none(tmp_path: Pat
 @pytest.mark.parametrize(
     ("alter", "message"),
     [
-        (lambda f: (f / "curated_camera_pose_end.txt").write_text("1 0 0 0\n"), "expected 4 rows of 4"),
         (
             lambda f: np.save(f / "stereo_depth/000000.npy", levels(np.uint16, 3, 3)),
             "expected 64x80 floats, found uint16",
@@ -109,6 +123,13 @@ def test_what_is_damaged_is_named(alter: Callable[[Path], object], message: str,
     alter(folder)
     with pytest.raises(InputError, match=message):
         D4dClip(folder).truth(0)
+
+
+def test_a_pose_that_is_none_is_named(tmp_path: Path) -> None:
+    folder = write_d4d(tmp_path / "s")
+    (folder / "curated_camera_pose_end.txt").write_text("1 0 0 0\n")
+    with pytest.raises(InputError, match="expected 4 rows of 4"):
+        D4dClip(folder).structured_light_mm("end")
 
 
 def test_depth_of_fewer_frames_belongs_to_those_of_its_names(tmp_path: Path) -> None:

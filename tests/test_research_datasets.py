@@ -154,8 +154,7 @@ CASES = {
         [*range(6)], pinhole(STIR_K, STEREO_SIZE), "kinematic", time_s=lambda n: n / 25, told=("points of dye",),
     ),
     "d4d": Case(
-        [0, 1, 2, 3], PinholeCamera(75.5, 76.0, 40.25, 30.5, 80, 64), "registered",
-        lambda n: None if n in (1, 2) else turned((0, 0, 1), 1, [n, -20, 50]), lambda n: (NAN, 60 + n, 80),
+        [0, 1, 2, 3], PinholeCamera(75.5, 76.0, 40.25, 30.5, 80, 64), "stereo", depth=lambda n: (NAN, 60 + n, 80),
         unit_mm=1000, told=("structured light", "stereo matching"),
     ),
     "endomapper": Case(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -20,31 +20,30 @@ import trimesh
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.parsing import Fields, calibration_bytes, read_tree
 from scopemap.errors import CalibrationError, InputError, reporting
+from scopemap.geometry.se3 import inverse, transform
 from scopemap.trajectory.formats.poses import rigid
 from scopemap.trajectory.formats.text import read_numbers
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 _MM_PER_M = 1000.0
-_ENDS = ("start", "end")
+End = Literal["start", "end"]
 _POSE = "curated_camera_pose_{}.txt"
 
 
 class D4dClip(LayoutFolder):
-    """The left view of one clip; poses are of its first and last frame."""
+    """The left view of one clip. Two poses fix no path: they serve to bring the structured light to their frames."""
 
     name = "d4d"
     places = (Place("left_images_rect"),)
     needs = (("stereo_depth/*.npy", _POSE.format("start")),)
-    quality = "registered"
+    quality = "stereo"
     remarks = (
-        "depth beside the images: stereo matching, m; poses: of the first and the last frame, where structured light "
-        "is registered to them; masks are not used: which value is tissue is not described",
+        "depth beside the images: stereo matching, m; no poses but those of the first and the last frame, to which "
+        "structured light is registered; masks are not used: which value is tissue is not described",
     )
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        ends = zip(_ENDS, (self.numbers[0], self.numbers[-1]), strict=True)
-        self.poses = {n: _read_pose(file) for end, n in ends if (file := path / _POSE.format(end)).is_file()}
         depth = sorted(path.glob("stereo_depth/*.npy"))
         by_stem = {file.stem: file for file in depth}
         if len(depth) == self.count:
@@ -54,21 +53,28 @@ class D4dClip(LayoutFolder):
             if depth:
                 self._warn(f"{path / 'stereo_depth'}: {len(depth)} files for {self.count} images; those of one name")
 
-    def geometry_mm(self, end: str) -> np.ndarray | None:
-        """Return the structured light's points (N, 3), world mm, at the "start" or the "end"; None without any.
+    def structured_light_mm(self, end: End) -> np.ndarray | None:
+        """Return the depth (H, W) float32, mm, of the first frame ("start") or the last ("end") by structured light.
 
-        Raises `InputError` where they cannot be read.
+        NaN where no point falls; None without points, pose or camera. Raises `InputError` for what cannot be read.
         """
-        session = self.path.absolute().parents[1]
-        listed = session / "clips.json"
-        with reporting(f"cannot read the points that {listed} names for {self.path.name}"):
+        session, own = self.path.absolute().parents[1], self.path.absolute().name
+        listed, pose = session / "clips.json", self.path / _POSE.format(end)
+        with reporting(f"cannot read the points that {listed} names for {own}"):
             clips = json.loads(listed.read_bytes())["clips"] if listed.is_file() else []
-            named = [clip.get(f"{end}_geometry") for clip in clips if clip["name"] == self.path.absolute().name]
-            if not any(named):
+            named = next(
+                (file for clip in clips if clip["name"] == own and (file := clip.get(f"{end}_geometry"))), None
+            )
+            if named is None or not pose.is_file() or self.camera is None:
                 return None
-            cloud: Any = trimesh.load(session / named[0], process=False)
-            points = np.asarray(cloud.vertices, np.float64)
-        return points[np.isfinite(points).all(1)] * _MM_PER_M
+            cloud: Any = trimesh.load(session / named, process=False)
+            points_m = np.asarray(cloud.vertices, np.float64)
+        points = transform(inverse(_read_pose(pose)), points_m[np.isfinite(points_m).all(1)])
+        column, row = np.rint(np.nan_to_num(self.camera.project(points), nan=-1.0)).T.astype(int)
+        seen = (points[:, 2] > 0) & (row >= 0) & (row < self.height) & (column >= 0) & (column < self.width)
+        depth_m = np.full((self.height, self.width), np.inf)
+        np.minimum.at(depth_m, (row[seen], column[seen]), points[seen, 2])
+        return np.where(np.isfinite(depth_m), depth_m * _MM_PER_M, np.nan).astype(np.float32)
 
     def _use_intrinsics(self) -> None:
         own = sorted(self.path.glob("camera_info/left_rect*.yaml")) + sorted(self.path.glob("camera_info/left.yaml"))
@@ -96,9 +102,7 @@ def _read_pose(file: Path) -> np.ndarray:
     table = read_numbers(file)
     if table.values.shape != (4, 4):
         raise InputError(f"reading {file}: expected 4 rows of 4 numbers")
-    T_world_camera = rigid(table.values[None], [str(file)])[0]
-    T_world_camera[:3, 3] *= _MM_PER_M
-    return T_world_camera
+    return rigid(table.values[None], [str(file)])[0]
 
 
 def _read_camera(file: Path, size: tuple[int, int]) -> PinholeCamera:

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.actions.inputs import open_truth
-from scopemap.errors import reporting
+from scopemap.errors import InputError, reporting
 from scopemap.geometry.align import Similarity, umeyama
 from scopemap.geometry.se3 import transform
 from scopemap.io.depth_maps import DepthReader
 from scopemap.mapping.deformation_graph import skin_of
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.datasets.d4d import D4dClip, End
 from scopemap_bench.phantom.writer import DISPLACEMENT
 
 _MOTION = "tissue_motion.npz"
@@ -87,6 +88,28 @@ def displacement_error(run: Path, source: Path, S_truth_run: Similarity, every: 
     medians = [float(np.median(x[counted])) for x in (error, size)]
     rms = [float(np.sqrt(np.mean(x**2))) for x in (error, size)]
     return DisplacementError(medians[0], rms[0], medians[1], rms[1])
+
+
+def structured_light_errors(run: Path, clip: Path) -> dict[str, float]:
+    """Compare a run's depth with the structured light before and after the deformation of a clip of D4D.
+
+    before_mm, after_mm : median differences, after one scale for both, the median ratio. still_mm : of the light after
+    from that before, pixel by pixel. Raises `InputError` without the light or the depth.
+    """
+    sequence, depth = open_truth(run, clip), DepthReader(run)
+    source = sequence.source
+    assert isinstance(source, D4dClip)
+    found, true = [], []
+    ends: dict[End, int] = {"start": source.numbers[0], "end": source.numbers[-1]}
+    for end, index in ends.items():
+        light_mm, estimated_mm = source.structured_light_mm(end), depth.read(index)
+        if light_mm is None or estimated_mm is None:
+            raise InputError(f"{clip if light_mm is None else run} has no depth of frame {index} to compare")
+        true.append(sequence.depth_rectifier.nearest(light_mm))
+        found.append(estimated_mm)
+    scale = np.nanmedian(np.stack(true) / np.stack(found))
+    before, after = (float(np.nanmedian(np.abs(scale * f - t))) for f, t in zip(found, true, strict=True))
+    return {"before_mm": before, "after_mm": after, "still_mm": float(np.nanmedian(np.abs(true[1] - true[0])))}
 
 
 def estimated_displacement(run: Path, points: np.ndarray, times_s: np.ndarray) -> np.ndarray:
