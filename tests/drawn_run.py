@@ -23,6 +23,7 @@ from scopemap.reconstruction import Reconstruction
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.trajectory.frame_table import ELSEWHERE, NOT_USED, ROTATED, FrameTable
 from scopemap.trajectory.frame_table import LOST as LOST_FRAME
+from scopemap.trajectory.tissue_states import TissueStates
 from scopemap.trajectory.trajectory import write_tum
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
@@ -94,7 +95,17 @@ def placed_frames(place: list[int], **columns: list[Any]) -> FrameTable:
     return FrameTable.of(rows)
 
 
-def draw_run(folder: Path, *, pictures: bool = True, name: str = "video.mp4", **facts: Any) -> Path:
+def wavering() -> TissueStates:
+    """Tissue whose near half is pulled aside, by more from frame to frame."""
+    nodes = tube().vertices[:: len(tube().vertices) // 40]
+    modes = np.where(nodes[:, 2:] < np.median(nodes[:, 2]), [[0.2, 0.1, 0.0]], 0.0)[None]
+    index = np.arange(FRAMES)
+    return TissueStates(nodes, modes, index, index / 25, index[:, None].astype(float), np.array([3.0]))
+
+
+def draw_run(
+    folder: Path, *, pictures: bool = True, name: str = "video.mp4", states: TissueStates | None = None, **facts: Any
+) -> Path:
     """Write the run's folder with its frames' pictures; `facts` replace those of its provenance."""
     mesh, kept, write = tube(), FramePictures(), DepthWriter(folder)
     for index in range(FRAMES):
@@ -106,7 +117,7 @@ def draw_run(folder: Path, *, pictures: bool = True, name: str = "video.mp4", **
         kept.observe(Shown(frame))
     if pictures:
         kept.save(folder)
-    drawn_result(name, **facts).save(folder)
+    replace(drawn_result(name, **facts), states=states).save(folder)
     return folder
 
 

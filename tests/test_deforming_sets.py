@@ -14,6 +14,7 @@ from drawn_video_sets import FRAMES, STIR_K, TATTOOS, write_stir
 from scopemap.cameras.lenses import OpenCvCamera
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.opening import open_sequence
+from scopemap.trajectory.tissue_states import TissueStates
 from scopemap_bench.datasets.d4d import D4dClip
 from scopemap_bench.datasets.stir import StirClip
 from scopemap_bench.evaluation.tattoos import accuracy, followed
@@ -48,8 +49,8 @@ def test_a_result_carries_the_points_by_depth_pose_and_motion_of_tissue(
     np.testing.assert_allclose(camera_moved - start, [[-2.5 / 60 * STIR_K[0][0], 0]] * 3, atol=0.01)
     nodes = np.random.default_rng(2).uniform([-50, -40, 55], [50, 40, 65], (40, 3))
     curves = np.linspace(0, 1, FRAMES)[:, None]
-    motion = {"nodes": nodes, "modes": np.tile([2.5, 3.0, 0], (1, 40, 1)), "curves": curves}
-    np.savez(run / "tissue_motion.npz", time_s=[frame.time_s for frame in frames], **motion)
+    modes, times_s = np.tile([2.5, 3.0, 0], (1, 40, 1)), np.array([frame.time_s for frame in frames])
+    TissueStates(nodes, modes, np.arange(FRAMES), times_s, curves, curves[0]).save(run)
     np.testing.assert_allclose(followed(run, clip, start) - start, [[0, 3 / 60 * STIR_K[1][1]]] * 3, atol=0.01)
     monkeypatch.setattr("sys.argv", ["deforming_clips", "--runs", str(run), "--clips", str(clip)])
     deforming_clips.main()

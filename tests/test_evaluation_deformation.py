@@ -12,6 +12,7 @@ from scopemap.actions.inputs import open_truth
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import so3_exp
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.tissue_states import TissueStates
 from scopemap_bench.evaluation.deformation import displacement_error, shape_over_time
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import DISPLACEMENT, write_phantom
@@ -42,7 +43,8 @@ def write_motion(run: Path, source: Path, share: float) -> None:
     positions = S_RUN_TRUTH.transform_points(np.load(source / DISPLACEMENT)["positions_mm"].astype(float))
     times_s = np.array([frame.time_s for frame, _ in open_truth(run, source)])
     modes = share * (positions - positions[0]) + 3.0  # which state is that of the nodes does not matter
-    np.savez(run / "tissue_motion.npz", nodes=positions[0], modes=modes, time_s=times_s, curves=np.eye(len(times_s)))
+    index, curves = np.arange(len(times_s)), np.eye(len(times_s))
+    TissueStates(positions[0], modes, index, times_s, curves, curves[0]).save(run)
 
 
 def test_shape_over_time_is_that_of_the_tissue_at_each_time(run: Path, source: Path) -> None:

@@ -12,16 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.actions.inputs import open_truth
-from scopemap.errors import InputError, reporting
+from scopemap.errors import InputError
 from scopemap.geometry.align import Similarity, umeyama
 from scopemap.geometry.se3 import transform
 from scopemap.io.depth_maps import DepthReader
-from scopemap.mapping.deformation_graph import skin_of
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.trajectory.tissue_states import TissueStates
 from scopemap_bench.datasets.d4d import D4dClip, End
 from scopemap_bench.phantom.writer import DISPLACEMENT
 
-_MOTION = "tissue_motion.npz"
 _MOVED_MM = 1.0
 _FITS, _OUTLIER = 3, 3.0
 
@@ -113,17 +112,9 @@ def structured_light_errors(run: Path, clip: Path) -> dict[str, float]:
 
 
 def estimated_displacement(run: Path, points: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Return the displacement (T, P, 3) mm of points (P, 3), in a run's world, at times (T,) s; 0 without a motion.
-
-    `tissue_motion.npz` of the run holds nodes (N, 3), modes (L, N, 3) mm, and the values of the modes' curves (F, L) at
-    the times `time_s` (F,).
-    """
-    file = run / _MOTION
-    if not file.is_file():
+    """Return the displacement (T, P, 3) mm of points (P, 3), in a run's world, at times (T,) s; 0 without a motion."""
+    states = TissueStates.read(run)
+    if states is None:
         return np.zeros((len(times_s), *points.shape))
-    with reporting(f"cannot read {file}"), np.load(file, allow_pickle=False) as arrays:
-        nodes, modes, time_s, curves = (arrays[name] for name in ("nodes", "modes", "time_s", "curves"))
-    strength = np.stack([np.interp(times_s, time_s, curve) for curve in curves.T], 1)
-    skin = skin_of(nodes, points)
-    of_points = np.einsum("pj,lpjc->lpc", skin.weight, modes[:, skin.node])
-    return np.tensordot(strength, of_points, 1)
+    strength = np.stack([np.interp(times_s, states.time_s, curve) for curve in states.curves.T], 1)
+    return np.tensordot(strength, states.motion(points), 1)
