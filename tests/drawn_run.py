@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from scopemap.report.frame_pictures import FramePictures
 from scopemap.trajectory.frame_table import ELSEWHERE, NOT_USED, ROTATED, FrameTable
 from scopemap.trajectory.frame_table import LOST as LOST_FRAME
 from scopemap.trajectory.tissue_states import TissueStates
+from scopemap.trajectory.trajectory import write_tum
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 IN_RESULT, IN_FIRST_MAP, FRAMES = 14, 7, 24
@@ -127,6 +129,21 @@ def draw_run_of_frames(root: Path) -> Path:
     for index in range(FRAMES):
         cv2.imwrite(str(frames / f"{index:06d}.png"), render_mesh(mesh, CAMERA, pose_of(index)).rgb[..., ::-1])
     return draw_run(root / "result", name=str(frames))
+
+
+def write_placed(folder: Path, placed: Iterable[tuple[Frame, np.ndarray, np.ndarray]]) -> Path:
+    """Write frames with their depth (H, W), mm, and poses (4, 4): what of a result is needed to place its depth."""
+    folder.mkdir(exist_ok=True)
+    writer, rows = DepthWriter(folder), []
+    for frame, depth_mm, T_world_camera in placed:
+        writer(replace(frame, depth_mm=depth_mm.astype(np.float32)))
+        known = {"index": frame.index, "time_s": frame.time_s, "status": "ok", "T_world_camera": T_world_camera}
+        rows.append(known)
+    writer.finish(scale_known=True)
+    table = FrameTable.of(rows)
+    table.write(folder / "frames.csv")
+    write_tum(folder / "trajectory.tum", table.trajectory)
+    return folder
 
 
 def _row(index: int, number: int) -> dict[str, Any]:
