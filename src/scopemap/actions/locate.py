@@ -27,7 +27,8 @@ from scopemap.tracking.features import FeatureDetector, Features, relative_pose_
 
 _CANDIDATES = 8  # keyframes whose matches are verified
 _STRONGEST, _MIN_SIMILARITY = 128, 0.8  # descriptors by which they are ranked, and the cosine above which these count
-_LEAST_INLIERS, _LEAST_SUPPORT = 20, 10  # of the best keyframe, and of another one whose matches are used
+# Of the best keyframe, where chance gives up to 26 on phantoms, and of another one whose matches are used.
+_LEAST_INLIERS, _LEAST_SUPPORT = 30, 10
 _AGREE_DEPTH, _AGREE_RAD = 0.1, 0.1  # of the poses by two keyframes
 _LEAST_SPREAD = 0.08  # standard deviation of the inliers, over the picture's width and height
 _DEPTH_SIGMA = 0.05

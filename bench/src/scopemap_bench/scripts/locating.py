@@ -71,7 +71,7 @@ def main() -> None:
                 if other != name:
                     print_located(name, run, other, place, "::5", table, truth=False)
             if name == "cecum_t1_a":
-                print_located(name, run, "trans_t1_a", c3vd / "trans_t1_a", "::5", table, truth=False)
+                print_located(name, run, "trans_t1_a", c3vd / "trans_t1_a", ":", table, truth=False)
 
 
 if __name__ == "__main__":
