@@ -152,6 +152,11 @@ KINDS: dict[str, _Kind] = {
         "fusion: as seen at second {second:g} where tissue moves on its own, {where}",
         "",
     ),
+    "fusion-free-space": _Kind(
+        "note",
+        "fusion: {share:.1%} of the pixels, in {frames} frames, are left out, because other frames look through there",
+        "",
+    ),
     "fusion-too-far": _Kind(
         "doubtful",
         "most of the scene is not fused: its median depth is {median_mm:.0f} mm, fusion.max_depth_mm {max_depth_mm:g}; "
