@@ -7,6 +7,7 @@ point, contradicts it where its depth is clearly larger, and tells nothing where
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -30,6 +31,10 @@ _LEAST_VIEWS = 2  # never on the word of one
 _TOLERANCE, _SIGMAS = 0.05, 3.0
 # A region is left out that has so many points which at least half of the views contradict by twice that.
 _LEAST_POINTS, _CERTAIN = 8, 2.0
+# Difference of colour to the views from which on something else is there, and over that of the frame's median point:
+# tissue that moved has its colour.
+_OTHER_COLOUR, _TIMES_USUAL = 0.3, 5.0
+_DARK = 8.0  # grey levels, up to which colours are noise
 _SOME_POINTS = 40  # one of so many tells whether a view sees a frame's points
 _SOME_RATIOS = 8  # and what frame and view differ by
 _AROUND = np.ones((3, 3), np.uint8)
@@ -38,12 +43,14 @@ _AROUND = np.ones((3, 3), np.uint8)
 class _View(NamedTuple):
     """Smallest and largest depth around each cell of a frame, (h, w) float32, mm, 0: unknown; its number and matrix.
 
-    P : (3, 4), takes a point of the world, mm, to its place in cells times its depth, and that depth.
+    colour : (h, w, 2) float32, as `_colour`. P : (3, 4), takes a point of the world, mm, to its place in cells times its
+    depth, and that depth.
     """
 
     number: int
     nearest_mm: np.ndarray
     farthest_mm: np.ndarray
+    colour: np.ndarray
     P: np.ndarray
 
 
@@ -94,14 +101,17 @@ class FreeSpace:
         depth_mm = np.where(shown, np.asarray(frame.depth_mm)[some], np.nan)
         known = depth_mm > 0
         points_mm = transform(frame.T_world_camera, frame.camera.rays[some][known] * depth_mm[known, None])
-        counts = np.zeros((3, len(points_mm)), np.int64)
+        colour = _colour(frame)[known]
+        counts = np.zeros((4, len(points_mm)))
         for view in self._asked(frame.index, points_mm):
-            _count(points_mm, view.P, view.nearest_mm, view.farthest_mm, counts)
-        confirm, contradict, clearly = counts
-        seen = confirm + contradict
+            _count(points_mm, colour, view, counts)
+        seen, contradict, clearly, difference = counts
+        difference /= np.maximum(seen, 1)
+        usual = np.median(difference[seen > 0]) if seen.any() else 0.0
+        other_colour = difference >= max(_OTHER_COLOUR, _TIMES_USUAL * usual)
         region, certain = np.zeros(known.shape, np.uint8), np.zeros(known.shape, bool)
-        region[known] = (contradict >= _LEAST_VIEWS) & (contradict >= _SHARE * seen)
-        certain[known] = (clearly >= _LEAST_VIEWS) & (2 * clearly >= seen)
+        region[known] = other_colour | ((contradict >= _LEAST_VIEWS) & (contradict >= _SHARE * seen))
+        certain[known] = other_colour & (clearly >= _LEAST_VIEWS) & (2 * clearly >= seen)
         count, labels = cv2.connectedComponents(region)
         kept = np.bincount(labels[certain], minlength=count) >= _LEAST_POINTS
         kept[0] = False
@@ -134,7 +144,15 @@ def _view(frame: Frame) -> _View:
     place = np.array([[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, step_px]]) / step_px
     seen = known[some]
     P = place @ inverse(frame.T_world_camera)[:3]
-    return _View(frame.index, np.where(seen, nearest, np.float32(0)), np.where(seen, farthest, np.float32(0)), P)
+    nearest, farthest = (np.where(seen, mm, np.float32(0)) for mm in (nearest, farthest))
+    return _View(frame.index, nearest, farthest, _colour(frame), P)
+
+
+def _colour(frame: Frame) -> np.ndarray:
+    """Return the colour of each cell of a frame, whatever its brightness: ln of red and blue over green, (h, w, 2)."""
+    step_px = _step_px(frame.valid.shape)
+    log = np.log(cv2.blur(frame.rgb, (step_px, step_px))[_centres(frame.valid.shape)] + np.float32(_DARK))
+    return np.ascontiguousarray(log[..., [0, 2]] - log[..., [1]])
 
 
 def _step_px(shape: tuple[int, ...]) -> int:
@@ -147,15 +165,15 @@ def _centres(shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count(
-    points_mm: np.ndarray, P: np.ndarray, nearest_mm: np.ndarray, farthest_mm: np.ndarray, counts: np.ndarray
-) -> None:
-    """Add to `counts` (3, N) which points (N, 3) a view confirms, contradicts, and contradicts clearly.
+def _count(points_mm: np.ndarray, colour: np.ndarray, view: _View, counts: np.ndarray) -> None:
+    """Add to `counts` (4, N) whether a view confirms or contradicts points (N, 3), contradicts, clearly contradicts.
 
-    What frame and view differ by in the median is a difference of scale, and does not count.
+    The last is the difference to their colour (N, 2) there. What frame and view differ by in the median is a difference
+    of scale, and does not count.
     """
+    P, nearest_mm, farthest_mm, view_colour = view.P, view.nearest_mm, view.farthest_mm, view.colour
     count = len(points_mm)
-    near, far = np.full(count, np.nan), np.full(count, np.nan)
+    near, far, place = np.full(count, np.nan), np.full(count, np.nan), np.zeros((count, 2), np.int64)
     middle, known = np.empty(count), 0
     for n in range(count):
         x, y, z_mm = points_mm[n]
@@ -168,7 +186,7 @@ def _count(
             continue
         i, j = int(row), int(column)
         if nearest_mm[i, j] > 0:
-            near[n], far[n] = nearest_mm[i, j] / z, farthest_mm[i, j] / z
+            near[n], far[n], place[n, 0], place[n, 1] = nearest_mm[i, j] / z, farthest_mm[i, j] / z, i, j
             middle[known] = 0.5 * (near[n] + far[n])
             known += 1
     if known == 0:
@@ -178,8 +196,9 @@ def _count(
     sigma = 1.4826 * np.median(np.abs(some - median))
     tolerance = max(_TOLERANCE * median, _SIGMAS * sigma)
     for n in range(count):
-        if near[n] > median + tolerance:
-            counts[1, n] += 1
-            counts[2, n] += near[n] > median + _CERTAIN * tolerance
-        elif far[n] >= median - tolerance:
+        if far[n] >= median - tolerance:
+            i, j = place[n]
             counts[0, n] += 1
+            counts[1, n] += near[n] > median + tolerance
+            counts[2, n] += near[n] > median + _CERTAIN * tolerance
+            counts[3, n] += math.hypot(colour[n, 0] - view_colour[i, j, 0], colour[n, 1] - view_colour[i, j, 1])
