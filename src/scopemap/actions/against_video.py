@@ -116,10 +116,10 @@ class RunFrames:
         """Return the surface of all frames but those with the given numbers."""
         fused = set(self.indices) - set(without)
         fusion = SurfaceFusion(self._fusion, self._store, corrected=True)
-        surface = fusion.fuse(self._frames(fused), fused)
+        surface = fusion.fuse(self.frames(fused), fused)
         return finished(surface.mesh, surface.settings)
 
-    def _frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:
+    def frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:
         """Yield all frames or some, without what others look through."""
         return map(self._free_space.without, self._store.frames(among))
 
@@ -136,7 +136,7 @@ class RunFrames:
         perceptual = None if missing else create_perceptual("lpips")
         found = SurfaceAgreement(lpips_missing=missing)
         views: list[tuple[float, Frame, Rendering]] = []
-        for frame in self._frames():
+        for frame in self.frames():
             view, depth_mm = render_mesh(mesh, frame.camera, _pose(frame)), _usable_depth(frame)
             if self._fusion.colours == "albedo":
                 view = lit_like(view, frame.camera, frame.rgb, depth_mm)
@@ -155,7 +155,7 @@ class RunFrames:
         """Return the points of the nearest frame that is fused, seen from a frame."""
         fused = (index for index in self.indices if index not in held_out)
         nearest = min(fused, key=lambda index: abs(index - frame.index), default=frame.index)
-        other = next(self._frames([nearest]))
+        other = next(self.frames([nearest]))
         depth_mm = _usable_depth(other)
         known = depth_mm > 0
         points_mm = transform(_pose(other), (other.camera.rays * depth_mm[..., None])[known])

@@ -43,8 +43,8 @@ _AROUND = np.ones((3, 3), np.uint8)
 class _View(NamedTuple):
     """Smallest and largest depth around each cell of a frame, (h, w) float32, mm, 0: unknown; its number and matrix.
 
-    colour : (h, w, 2) float32, as `_colour`. P : (3, 4), takes a point of the world, mm, to its place in cells times its
-    depth, and that depth.
+    colour : (h, w, 2) float32, as `_colour`. P : (3, 4), takes a point of the world, mm, to its place in cells times
+    its depth, and that depth.
     """
 
     number: int
