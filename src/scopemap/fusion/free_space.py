@@ -20,10 +20,10 @@ from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.notices import Notice
 
-_MOST_VIEWS, _FEW_VIEWS = 256, 16  # about 40 KB each
+_MOST_VIEWS, _FEW_VIEWS = 256, 16  # 50 KB each
 _FRAMES_PER_VIEW = 4
-_CELLS = 80  # along the longer side of the picture: one pixel of each cell is looked at
-_ASKED = 24  # views that a frame is compared with, spread over those that show a third of its points
+_CELLS = 64  # along the longer side of the picture: one pixel of each cell is looked at
+_ASKED = 16  # views that a frame is compared with, spread over those that show a third of its points
 _SHARE = 1 / 3
 _LEAST_VIEWS = 2  # never on the word of one
 # Share of the depth by which a view is farther that looks through a point, at least; and in robust standard deviations
@@ -76,10 +76,7 @@ class FreeSpace:
         return Notice("fusion-free-space", {"frames": self._frames, "share": self._left_out / self._pixels})
 
     def without(self, frame: Frame) -> Frame:
-        """Return a frame with depth and pose, where what other frames look through is neither usable nor a highlight.
-
-        Where tissue touches it, so do the pixels around: their depth is between both.
-        """
+        """Return a frame with depth and pose whose usable pixels and highlights lack what other frames look through."""
         self._pixels += int(np.count_nonzero(frame.valid))
         found = self._looked_through(frame)
         if not found.any():
@@ -93,7 +90,7 @@ class FreeSpace:
         return replace(frame, valid=frame.valid & ~left_out, highlights=highlights)
 
     def _looked_through(self, frame: Frame) -> np.ndarray:
-        """Return the cells (h, w) bool of a frame that other frames look through, and those next to them."""
+        """Return the cells (h, w) bool of a frame that others look through, and those next to them: depth blurs edges."""
         assert frame.depth_mm is not None
         assert frame.T_world_camera is not None
         some = _centres(frame.valid.shape)
@@ -102,10 +99,10 @@ class FreeSpace:
         known = depth_mm > 0
         points_mm = transform(frame.T_world_camera, frame.camera.rays[some][known] * depth_mm[known, None])
         colour = _colour(frame)[known]
-        counts = np.zeros((4, len(points_mm)))
+        counts = np.zeros((len(points_mm), 4))
         for view in self._asked(frame.index, points_mm):
             _count(points_mm, colour, view, counts)
-        seen, contradict, clearly, difference = counts
+        seen, contradict, clearly, difference = counts.T
         difference /= np.maximum(seen, 1)
         usual = np.median(difference[seen > 0]) if seen.any() else 0.0
         other_colour = difference >= max(_OTHER_COLOUR, _TIMES_USUAL * usual)
@@ -164,41 +161,45 @@ def _centres(shape: tuple[int, ...]) -> tuple[slice, slice]:
     return (slice(step_px // 2, None, step_px),) * 2
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _place(points_mm: np.ndarray, n: int, P: np.ndarray, nearest_mm: np.ndarray) -> tuple[int, int, float]:
+    """Return row, column and depth, mm, of a point in the cells of a view; a depth of 0 where that knows nothing."""
+    x, y, z_mm = points_mm[n, 0], points_mm[n, 1], points_mm[n, 2]
+    depth_mm = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z_mm + P[2, 3]
+    if depth_mm <= 0:
+        return 0, 0, 0.0
+    u = P[0, 0] * x + P[0, 1] * y + P[0, 2] * z_mm + P[0, 3]
+    v = P[1, 0] * x + P[1, 1] * y + P[1, 2] * z_mm + P[1, 3]
+    if not (0 <= u < nearest_mm.shape[1] * depth_mm and 0 <= v < nearest_mm.shape[0] * depth_mm):
+        return 0, 0, 0.0
+    row, column = int(v / depth_mm), int(u / depth_mm)
+    return row, column, depth_mm if nearest_mm[row, column] > 0 else 0.0
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _count(points_mm: np.ndarray, colour: np.ndarray, view: _View, counts: np.ndarray) -> None:
-    """Add to `counts` (4, N) whether a view confirms or contradicts points (N, 3), contradicts, clearly contradicts.
+    """Add to `counts` (N, 4) whether a view confirms or contradicts points (N, 3), contradicts, clearly contradicts.
 
     The last is the difference to their colour (N, 2) there. What frame and view differ by in the median is a difference
     of scale, and does not count.
     """
     P, nearest_mm, farthest_mm, view_colour = view.P, view.nearest_mm, view.farthest_mm, view.colour
-    count = len(points_mm)
-    near, far, place = np.full(count, np.nan), np.full(count, np.nan), np.zeros((count, 2), np.int64)
-    middle, known = np.empty(count), 0
-    for n in range(count):
-        x, y, z_mm = points_mm[n]
-        z = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z_mm + P[2, 3]
-        if z <= 0:
-            continue
-        column = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z_mm + P[0, 3]) / z
-        row = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z_mm + P[1, 3]) / z
-        if not (0 <= column < nearest_mm.shape[1] and 0 <= row < nearest_mm.shape[0]):
-            continue
-        i, j = int(row), int(column)
-        if nearest_mm[i, j] > 0:
-            near[n], far[n], place[n, 0], place[n, 1] = nearest_mm[i, j] / z, farthest_mm[i, j] / z, i, j
-            middle[known] = 0.5 * (near[n] + far[n])
+    ratios, known = np.empty(len(points_mm) // _SOME_RATIOS + 1), 0
+    for n in range(0, len(points_mm), _SOME_RATIOS):
+        i, j, depth_mm = _place(points_mm, n, P, nearest_mm)
+        if depth_mm > 0:
+            ratios[known] = 0.5 * (nearest_mm[i, j] + farthest_mm[i, j]) / depth_mm
             known += 1
     if known == 0:
         return
-    some = middle[:known:_SOME_RATIOS]
-    median = np.median(some)
-    sigma = 1.4826 * np.median(np.abs(some - median))
-    tolerance = max(_TOLERANCE * median, _SIGMAS * sigma)
-    for n in range(count):
-        if far[n] >= median - tolerance:
-            i, j = place[n]
-            counts[0, n] += 1
-            counts[1, n] += near[n] > median + tolerance
-            counts[2, n] += near[n] > median + _CERTAIN * tolerance
-            counts[3, n] += math.hypot(colour[n, 0] - view_colour[i, j, 0], colour[n, 1] - view_colour[i, j, 1])
+    median = np.median(ratios[:known])
+    tolerance = max(_TOLERANCE * median, _SIGMAS * 1.4826 * np.median(np.abs(ratios[:known] - median)))
+    for n in range(len(points_mm)):
+        i, j, depth_mm = _place(points_mm, n, P, nearest_mm)
+        if depth_mm > 0 and farthest_mm[i, j] >= (median - tolerance) * depth_mm:
+            behind = nearest_mm[i, j] / depth_mm - median
+            counts[n, 0] += 1
+            counts[n, 1] += behind > tolerance
+            counts[n, 2] += behind > _CERTAIN * tolerance
+            red, blue = colour[n, 0] - view_colour[i, j, 0], colour[n, 1] - view_colour[i, j, 1]
+            counts[n, 3] += math.sqrt(red * red + blue * blue)
