@@ -154,7 +154,8 @@ KINDS: dict[str, _Kind] = {
     ),
     "fusion-free-space": _Kind(
         "note",
-        "fusion: {share:.1%} of the pixels, in {frames} frames, are left out, because other frames look through there",
+        "fusion: {share:.1%} of the pixels, in {frames} frames, are left out: other frames look through there, or "
+        "instruments touch them",
         "",
     ),
     "fusion-too-far": _Kind(

@@ -99,10 +99,13 @@ class RunFrames:
         """Numbers of the frames: the tracked ones that are fused."""
         tracked = folder.frames.rows[folder.frames.tracked][:: fusion.every]
         pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
+        by_network = folder.config.mask.instruments == "auto"
         for frame in map(mask, sequence.frames()):
             if frame.index in pose_of and (depth_mm := depth.read(frame.index)) is not None:
                 sigma_mm, pose = depth.read_sigma(frame.index), pose_of[frame.index]
-                self._store.put(replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma_mm, T_world_camera=pose))
+                instruments = np.isnan(depth_mm) if by_network else None  # depth is unknown there
+                frame = replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma_mm, instruments=instruments)
+                self._store.put(replace(frame, T_world_camera=pose))
                 self.indices.append(frame.index)
         left_out = any(notice.code == "fusion-free-space" for notice in notices_of(folder.provenance))
         views = views_among(self.indices) if left_out else []

@@ -76,7 +76,10 @@ class FreeSpace:
         return Notice("fusion-free-space", {"frames": self._frames, "share": self._left_out / self._pixels})
 
     def without(self, frame: Frame) -> Frame:
-        """Return a frame with depth and pose whose usable pixels and highlights lack what other frames look through."""
+        """Return a frame with depth and pose whose usable pixels and highlights lack what others look through.
+
+        Pixels next to such a region, and to instruments that the depth network found, go with it.
+        """
         self._pixels += int(np.count_nonzero(frame.valid))
         found = self._looked_through(frame)
         if not found.any():
@@ -90,7 +93,7 @@ class FreeSpace:
         return replace(frame, valid=frame.valid & ~left_out, highlights=highlights)
 
     def _looked_through(self, frame: Frame) -> np.ndarray:
-        """Return the cells (h, w) bool of a frame that others look through, and those next to them: depth blurs edges."""
+        """Return the cells (h, w) bool of instruments and of what others look through, and the blurred ones around."""
         assert frame.depth_mm is not None
         assert frame.T_world_camera is not None
         some = _centres(frame.valid.shape)
@@ -109,6 +112,8 @@ class FreeSpace:
         region, certain = np.zeros(known.shape, np.uint8), np.zeros(known.shape, bool)
         region[known] = other_colour | ((contradict >= _LEAST_VIEWS) & (contradict >= _SHARE * seen))
         certain[known] = other_colour & (clearly >= _LEAST_VIEWS) & (2 * clearly >= seen)
+        if frame.instruments is not None:
+            region, certain = region | frame.instruments[some], certain | frame.instruments[some]
         count, labels = cv2.connectedComponents(region)
         kept = np.bincount(labels[certain], minlength=count) >= _LEAST_POINTS
         kept[0] = False
