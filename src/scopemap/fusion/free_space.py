@@ -78,8 +78,10 @@ class FreeSpace:
     def without(self, frame: Frame) -> Frame:
         """Return a frame with depth and pose whose usable pixels and highlights lack what others look through.
 
-        Pixels next to such a region, and to instruments that the depth network found, go with it.
+        Pixels next to such a region, and to instruments that the depth network found, go with it. Without views, none.
         """
+        if not self._views:
+            return frame
         self._pixels += int(np.count_nonzero(frame.valid))
         found = self._looked_through(frame)
         if not found.any():
@@ -122,7 +124,7 @@ class FreeSpace:
 
     def _asked(self, index: int, points_mm: np.ndarray) -> list[_View]:
         """Return the views to compare a frame with, whose points are (N, 3) mm, world."""
-        if not self._views or not len(points_mm):
+        if not len(points_mm):
             return []
         some = points_mm[::_SOME_POINTS]
         column, row, z = np.moveaxis(self._P[:, :, :3] @ some.T + self._P[:, :, 3:], 1, 0)

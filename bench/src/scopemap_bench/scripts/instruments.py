@@ -1,10 +1,12 @@
 """How much of the instruments is in the surface, on phantoms with exact truth, and how much tissue is lost.
 
-    python -m scopemap_bench.scripts.instruments [--out FOLDER] [--seeds 51 52 53]
+    python -m scopemap_bench.scripts.instruments [--out FOLDER] [--seeds 51 52 53] [--data ../shared/data]
 
 Phantoms of 80 frames in which instruments enter, work and leave twice. Runs without and with free-space evidence, by
 `fusion.method`, where the depth network's masks of instruments are off and on (`mask.instruments`). A pixel is in the
-surface where its depth is fused. Lost tissue: pixels that show tissue and are fused without masks and evidence alone.
+surface where its depth is fused. Lost tissue: pixels that show tissue and are fused without masks and evidence
+alone. With --data: what a run with `mask.instruments=auto` leaves out of EndoNeRF's `pulling_soft_tissues`, against its
+masks, among usable pixels.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.actions.against_video import RunFrames
-from scopemap.actions.inputs import open_truth
+from scopemap.actions.inputs import open_input, open_truth
+from scopemap.masking.mask_files import MaskFiles
 from scopemap_bench.scripts import measuring
 
 EVENTS = "instrument:10-40,instrument:50-75"
@@ -64,10 +67,27 @@ def print_phantom(scene: str, seed: int, folder: Path) -> None:
         measuring.print_row(f"{scene}, seed {seed}", masks, in_surface_of, lost_of, " / ".join(errors))
 
 
+def print_pulling(source: Path, folder: Path) -> None:
+    """Run `pulling_soft_tissues` unless that was done, and print IoU with its masks, and how much tissue is lost."""
+    settings = ("--camera-at-rest", "--set", "mask.files=none", "--set", "mask.instruments=auto")
+    run = measuring.run_once(source, folder / "pulling", *settings)
+    fused, (sequence, mask) = fused_pixels(run), open_input(run, source)
+    masks, counts = MaskFiles(source / "gt_masks", sequence.rectifier), np.zeros(4)
+    for frame in map(mask, sequence.frames()):
+        tool = masks.covered(frame.index)
+        if tool is not None and frame.highlights is not None and frame.index in fused:
+            usable = frame.valid | frame.highlights
+            left, tool = usable & ~fused[frame.index], usable & tool
+            counts += [(left & tool).sum(), (left | tool).sum(), (left & ~tool).sum(), (usable & ~tool).sum()]
+    both, either, lost, tissue = counts
+    print(f"\npulling_soft_tissues: IoU {both / either:.3f}, tissue lost {lost / tissue:.1%}")
+
+
 def main() -> None:
     """Print the table."""
     parser = measuring.options_of(__doc__, out=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[51, 52, 53], help="seeds of the phantoms")
+    parser.add_argument("--data", type=Path, help="folder of the real data")
     options = parser.parse_args()
     with measuring.folder_or_scratch(options.out) as folder:
         folder.mkdir(parents=True, exist_ok=True)
@@ -77,6 +97,8 @@ def main() -> None:
         for scene in ("laparoscopy", "colon"):
             for seed in options.seeds:
                 print_phantom(scene, seed, folder)
+        if options.data:
+            print_pulling(options.data / "endoscopy" / "endonerf" / "pulling_soft_tissues", folder)
 
 
 if __name__ == "__main__":
