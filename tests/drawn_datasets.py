@@ -13,6 +13,7 @@ from drawn_climb import write_clip
 from drawn_colmap import write_colmap
 from drawn_dicom import write_dicom_video, write_frames
 from drawn_image_sets import (
+    write_d4d,
     write_endogslam,
     write_endonerf,
     write_experiment,
@@ -28,7 +29,7 @@ from drawn_image_sets import (
 )
 from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_video
 from drawn_scared import write_scared, write_scared_c
-from drawn_video_sets import write_endomapper_with_model, write_stereomis
+from drawn_video_sets import write_endomapper_with_model, write_stereomis, write_stir
 
 from scopemap.cameras.formats.writing import write_calibration
 
@@ -62,6 +63,8 @@ WRITERS: dict[str, Writer] = {
     "endoslam:unity": lambda folder: write_unity(folder / "UnityCam" / "Colon"),
     "endoslam:real": lambda folder: write_real(folder / "HighCam" / "Colon-IV" / "TumorfreeTrajectory_1"),
     "stereomis": write_stereomis,
+    "stir": write_stir,
+    "d4d": write_d4d,
     "endomapper": write_endomapper_with_model,
     "climb": write_clip,
     "endomapper-sim": write_sim,

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import openpyxl
+import trimesh
 from drawn_inputs import SIZE as C3VD_SIZE
 from drawn_inputs import picture, poses, save
 
@@ -324,4 +325,37 @@ def write_sim(folder: Path, first: int = 0) -> Path:
         write_depth_exr(folder / "depth" / f"aov_image_{number:04d}.exr", buffer())
     (folder / "trajectory.csv").write_text(unity_table(header=SIM_HEADER))
     (folder / "info.txt").write_text("Depth image metric unities: dm\n")
+    return folder
+
+
+# ---- D4D
+
+D4D_P = "[75.5, 0.0, 40.25, 0.0, 0.0, 76.0, 30.5, 0.0, 0.0, 0.0, 1.0, 0.0]"
+
+
+def d4d_pose(place: float) -> np.ndarray:
+    """A pose in metres, a quarter turn about the optical axis."""
+    return np.array([[0, -1, 0, 0.001 * place], [1, 0, 0, -0.02], [0, 0, 1, 0.05], [0, 0, 0, 1]])
+
+
+def write_d4d(root: Path) -> Path:
+    """Write a clip of four frames and the points of its session."""
+    session = root / "specimen_1" / "2025_03_06-16_49_40"
+    folder = session / "clips" / "Clip_1"
+    (folder / "stereo_depth").mkdir(parents=True)
+    for number in range(4):
+        write_picture(folder / "left_images_rect" / f"{number:06d}.png", number)
+        np.save(folder / "stereo_depth" / f"{number:06d}.npy", levels(np.float32, 0.06 + 0.001 * number, 0.08))
+    for end, place in (("start", 0), ("end", 3)):
+        T = d4d_pose(place)
+        np.savetxt(folder / f"curated_camera_pose_{end}.txt", T)
+        (session / "pointcloud").mkdir(exist_ok=True)
+        x, y = (0.001 * side.ravel() for side in np.meshgrid(np.arange(-40, 41), np.arange(-40, 41)))
+        plane = np.column_stack([x, y, np.full(x.shape, 0.1 + 0.001 * place)]) @ T[:3, :3].T + T[:3, 3]
+        trimesh.PointCloud(np.vstack([plane, [[np.nan] * 3]])).export(session / "pointcloud" / f"{end}.ply")
+    (folder / "camera_info").mkdir()
+    camera = f"image_width: 80\nimage_height: 64\nprojection_matrix:\n  rows: 3\n  cols: 4\n  data: {D4D_P}\n"
+    (folder / "camera_info" / "left_rect.yaml").write_text(camera)
+    named = {f"{end}_geometry": f"pointcloud/{end}.ply" for end in ("start", "end")}
+    (session / "clips.json").write_text(json.dumps({"clips": [{"name": "Clip_2"}, {"name": "Clip_1"} | named]}))
     return folder

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from scopemap.reconstruction import Reconstruction
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.trajectory.frame_table import ELSEWHERE, NOT_USED, ROTATED, FrameTable
 from scopemap.trajectory.frame_table import LOST as LOST_FRAME
+from scopemap.trajectory.tissue_states import TissueStates
+from scopemap.trajectory.trajectory import write_tum
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 IN_RESULT, IN_FIRST_MAP, FRAMES = 14, 7, 24
@@ -92,7 +95,17 @@ def placed_frames(place: list[int], **columns: list[Any]) -> FrameTable:
     return FrameTable.of(rows)
 
 
-def draw_run(folder: Path, *, pictures: bool = True, name: str = "video.mp4", **facts: Any) -> Path:
+def wavering() -> TissueStates:
+    """Tissue whose near half is pulled aside, by more from frame to frame."""
+    nodes = tube().vertices[:: len(tube().vertices) // 40]
+    modes = np.where(nodes[:, 2:] < np.median(nodes[:, 2]), [[0.2, 0.1, 0.0]], 0.0)[None]
+    index = np.arange(FRAMES)
+    return TissueStates(nodes, modes, index, index / 25, index[:, None].astype(float), np.array([3.0]))
+
+
+def draw_run(
+    folder: Path, *, pictures: bool = True, name: str = "video.mp4", states: TissueStates | None = None, **facts: Any
+) -> Path:
     """Write the run's folder with its frames' pictures; `facts` replace those of its provenance."""
     mesh, kept, write = tube(), FramePictures(), DepthWriter(folder)
     for index in range(FRAMES):
@@ -104,7 +117,7 @@ def draw_run(folder: Path, *, pictures: bool = True, name: str = "video.mp4", **
         kept.observe(Shown(frame))
     if pictures:
         kept.save(folder)
-    drawn_result(name, **facts).save(folder)
+    replace(drawn_result(name, **facts), states=states).save(folder)
     return folder
 
 
@@ -116,6 +129,21 @@ def draw_run_of_frames(root: Path) -> Path:
     for index in range(FRAMES):
         cv2.imwrite(str(frames / f"{index:06d}.png"), render_mesh(mesh, CAMERA, pose_of(index)).rgb[..., ::-1])
     return draw_run(root / "result", name=str(frames))
+
+
+def write_placed(folder: Path, placed: Iterable[tuple[Frame, np.ndarray, np.ndarray]]) -> Path:
+    """Write frames with their depth (H, W), mm, and poses (4, 4): what of a result is needed to place its depth."""
+    folder.mkdir(exist_ok=True)
+    writer, rows = DepthWriter(folder), []
+    for frame, depth_mm, T_world_camera in placed:
+        writer(replace(frame, depth_mm=depth_mm.astype(np.float32)))
+        known = {"index": frame.index, "time_s": frame.time_s, "status": "ok", "T_world_camera": T_world_camera}
+        rows.append(known)
+    writer.finish(scale_known=True)
+    table = FrameTable.of(rows)
+    table.write(folder / "frames.csv")
+    write_tum(folder / "trajectory.tum", table.trajectory)
+    return folder
 
 
 def _row(index: int, number: int) -> dict[str, Any]:

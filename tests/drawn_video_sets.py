@@ -1,4 +1,4 @@
-"""Made-up copies of research data sets that come as video: StereoMIS, EndoMapper."""
+"""Made-up copies of research data sets that come as video: StereoMIS, EndoMapper, STIR."""
 
 from __future__ import annotations
 
@@ -134,4 +134,26 @@ def archive_of(folder: Path) -> Path:
 def write_endomapper_with_model(root: Path) -> Path:
     folder = write_endomapper(root)
     write_models(archive_of(folder), {0: images_bin([1, 2, 3])})
+    return folder
+
+
+# ---- STIR
+
+STIR_K = [[120.5, 0, 80.25], [0, 121.5, 63.5], [0, 0, 1]]
+TATTOOS = {"start": [(20, 30), (90, 40), (60, 100)], "end": [(24, 33), (88, 40)]}
+
+
+def write_stir(root: Path) -> Path:
+    """Write a clip of six frames with three points of dye, of which two are still seen in the last."""
+    folder = root / "exvivo01" / "left02" / "seq03"
+    for part in ("frames", "segmentation"):
+        (folder / part).mkdir(parents=True)
+    write_frames(folder / "frames" / "1200ms-1440ms-visible.mp4", [picture(i, STEREO_SIZE) for i in range(FRAMES)])
+    for end, centres in TATTOOS.items():
+        seen = np.zeros((STEREO_SIZE[1], STEREO_SIZE[0], 3), np.uint8)
+        for x, y in centres:
+            seen[y - 2 : y + 3, x - 3 : x + 4] = 255
+        save(folder / "segmentation" / f"icg{end}seg.png", seen)
+    stated = {"leftcameramat": STIR_K, "rightcameramat": STIR_K, "leftdistortioncoeffs": [0, 0, 0, 0, 0]}
+    (root / "exvivo01" / "calib.json").write_text(json.dumps(stated | {"translation": [-0.004, 0, 0]}))
     return folder

@@ -118,6 +118,14 @@ def _bounds(folder: Path, content: Content) -> None:
     _damaged(folder / "poses_bounds.npy", content)
 
 
+def _arrays(folder: Path, content: Content) -> None:
+    """Depth in metres."""
+    for file in folder.glob("stereo_depth/*.npy"):
+        file.unlink()
+    for number, depth_mm in content.depth_mm.items():
+        np.save(folder / f"stereo_depth/{number:06d}.npy", (depth_mm / 1000).astype(np.float32))
+
+
 def _unity_tables(folder: Path, content: Content) -> None:
     _table("../SavedPosition_S1.txt", lambda n, c: _unity(c.poses[n], 0.1)[:3])(folder, content)
     _table("../SavedRotationQuaternion_S1.txt", lambda n, c: _unity(c.poses[n], 0.1)[3:])(folder, content)
@@ -283,6 +291,8 @@ KINDS: dict[str, Kind] = {
         pictures="video",
         poses="quaternions",
     ),
+    "stir": Kind((movie("frames/1200ms-1440ms-visible.mp4"),), pictures="video"),
+    "d4d": Kind((pictures("left_images_rect/{:06d}.png"), _arrays), depth="fine"),
     "endomapper": Kind((movie("Seq_001.mov"), _model_archive), pictures="video", poses="quaternions"),
     "climb": Kind((movie("../Seq_001_a.mp4"), _climb_reference), pictures="video", poses="quaternions"),
     "endomapper-sim": Kind(

@@ -170,14 +170,14 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 350: stereo; 420: checksums, inputs, Python; 340: measuring by hand; 115: cost of networks; 660: moving tissue.
-    "core": (lambda: _total(MODULES), 32_210),
-    "core, net": (lambda: _net(MODULES), 19_830),
-    "bench": (lambda: _total(BENCH_MODULES), 12_125),  # 235: two runs; 195: verdicts; 145: failures; 235: peers, tissue
+    # 350: stereo; 420: checksums, Python; 340: measuring by hand; 115: networks; 1110: moving tissue, films.
+    "core": (lambda: _total(MODULES), 32_660),
+    "core, net": (lambda: _net(MODULES), 20_090),
+    "bench": (lambda: _total(BENCH_MODULES), 12_870),  # 235: two runs; 195: verdicts; 145: failures; 980: peers, tissue
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 32_620),  # those of all of these; 230: a network at rest; 30: merging by the graph
-    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 97),
-    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 13_945),
+    "tests": (lambda: _total(TESTS), 33_315),  # those of all of these; 230: a network at rest; 30: merging by the graph
+    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 100),
+    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 14_230),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),
     "settings": (lambda: len(setting_names()), 45),
 }
@@ -276,8 +276,8 @@ def _of_closure(start: str) -> list[_Module]:
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.pipeline")
     assert "scopemap.mapping.backend" in closure
-    # With the typed notices, the causes of losses, and moving tissue.
-    assert len(closure) <= 70, "\n".join(sorted(closure))
+    # With the typed notices, the causes of losses, and moving tissue with the skin that its states share.
+    assert len(closure) <= 71, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

@@ -217,7 +217,7 @@ def _fused(frames: list[Frame]) -> np.ndarray:
 def test_the_surface_as_seen_at_a_second_has_no_other_state(at_s: float, expected_mm: float) -> None:
     frames = _states()
     seen_at = SeenAt(frames, at_s, block_edge_mm(60.0))
-    weighted = [seen_at.weighted(frame) for frame in frames]
+    weighted = [seen_at.fused(frame) for frame in frames]
     vertices = _fused(weighted)
     pixels = CAMERA.project(vertices)
     right, left = (vertices[chosen, 2] for chosen in (pixels[:, 0] > 190, pixels[:, 0] < 130))

@@ -10,10 +10,11 @@ from drawn_bundle import FOCAL_PX, tracked
 
 from scopemap.geometry.align import umeyama
 from scopemap.geometry.se3 import inverse, se3_exp, transform
+from scopemap.geometry.skinning import skin_of
 from scopemap.mapping import FrameCorrection
 from scopemap.mapping.bundle_adjustment import adjust, errors_px
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.mapping.deformation_graph import MotionPrior, hat_functions, periodic_rate, skin_of, spread_nodes
+from scopemap.mapping.deformation_graph import MotionPrior, hat_functions, periodic_rate, spread_nodes
 from scopemap.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
 from scopemap.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
 from scopemap.mapping.pose_interpolation import TissueMotion

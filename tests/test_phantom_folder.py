@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_layout(folder: Path) -> None:
     frames = [f"{i:04d}_{kind}" for i in range(3) for kind in ("color.png", "depth.tiff")]
     assert sorted(p.name for p in folder.iterdir()) == sorted(
-        [*frames, "pose.txt", "camera.yaml", "mesh_truth", "mesh_truth.ply", "phantom.json"]
+        [*frames, "pose.txt", "camera.yaml", "mesh_truth", "mesh_truth.ply", "phantom.json", "displacement_truth.npz"]
     )
     assert sorted(p.name for p in (folder / "mesh_truth").iterdir()) == ["0000.ply", "0001.ply", "0002.ply"]
 

@@ -14,12 +14,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of
+from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of, wavering
 
 from scopemap.actions.measure import measure
 from scopemap.errors import InputError
 from scopemap.io.run_folder import RunFolder
 from scopemap.report.page import keep_measurements, serve_view, write_comparison, write_report
+from scopemap.trajectory.tissue_states import TissueStates
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -277,8 +278,9 @@ def click(opened: Opened, selector: str, *shares: tuple[float, float]) -> None:
         opened.page.wait_for_timeout(100)
 
 
-def test_measuring_by_hand_agrees_with_the_command(browser: Any, tmp_path: Path) -> None:
-    folder = draw_run(tmp_path, scale={"known": True, "measured": True, "source": "measured depth"})
+@pytest.mark.parametrize("states", [None, wavering()], ids=["at rest", "moving"])
+def test_measuring_by_hand_agrees_with_the_command(browser: Any, tmp_path: Path, states: TissueStates | None) -> None:
+    folder = draw_run(tmp_path, scale={"known": True, "measured": True, "source": "measured depth"}, states=states)
     opened = Opened(browser, write_report(folder)[0])
     opened.slide(6)
     assert opened.text("#scene-scale") == "10 mm at the middle of the surface"

@@ -27,7 +27,7 @@ from drawn_image_sets import (
     write_unity,
 )
 from drawn_inputs import SIZE, number_in, poses
-from drawn_video_sets import KB4, LENS, SCOPE_SIZE, STEREO_SIZE, kinematic_pose
+from drawn_video_sets import KB4, LENS, SCOPE_SIZE, STEREO_SIZE, STIR_K, kinematic_pose
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
@@ -150,6 +150,13 @@ CASES = {
         [*range(6)], OpenCvCamera(PinholeCamera(130.5, 131.5, 81.25, 62.75, *STEREO_SIZE), LENS), "kinematic",
         kinematic_pose, time_s=lambda n: n / 25, told=("metres", "left, the upper half", "masks/ is not used"),
     ),
+    "stir": Case(
+        [*range(6)], pinhole(STIR_K, STEREO_SIZE), "kinematic", time_s=lambda n: n / 25, told=("points of dye",),
+    ),
+    "d4d": Case(
+        [0, 1, 2, 3], PinholeCamera(75.5, 76.0, 40.25, 30.5, 80, 64), "stereo", depth=lambda n: (NAN, 60 + n, 80),
+        unit_mm=1000, told=("structured light", "stereo matching"),
+    ),
     "endomapper": Case(
         [*range(6)], FISHEYE, "sfm", of_colmap, time_s=lambda n: n / 50, told=("its scale is arbitrary",),
     ),
@@ -257,7 +264,7 @@ def test_without_its_calibration_the_camera_is_assumed(name: str, tmp_path: Path
     assert any("field of view" in note for note in sequence.notes)
 
 
-@pytest.mark.parametrize("name", [name for name in WITH_DEPTH if name not in ("endomapper-sim", "7-scenes")])
+@pytest.mark.parametrize("name", [name for name in WITH_DEPTH if name not in ("endomapper-sim", "7-scenes", "d4d")])
 @pytest.mark.parametrize("content", ["colour", "floats", "damaged"])
 def test_depth_of_another_kind_is_refused(name: str, content: str, tmp_path: Path) -> None:
     source = open_sequence(WRITERS[name](tmp_path / "s")).source

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from front_door import refused
 
 from scopemap.errors import InputError
 from scopemap.report.serving import LocalServer, live_page
-from scopemap.report.turntable import write_turntable
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 STATE = {
@@ -146,14 +144,3 @@ def test_view_serves_a_runs_page(tmp_path: Path, capfd: pytest.CaptureFixture[st
         timer.cancel()
     capfd.readouterr()
     assert "no finished run" in refused(capfd, "view", tmp_path / "none", "--no-browser")
-
-
-def test_a_turntable_is_a_film_of_the_surface(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    run, film = draw_run(tmp_path / "run"), tmp_path / "out.mp4"
-    write_turntable(run, film, frames=12)
-    with av.open(str(film)) as container:
-        pictures = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
-    assert [picture.shape for picture in pictures] == [(480, 480, 3)] * 12
-    assert all((picture.min(axis=2) < 200).mean() > 0.02 for picture in pictures)  # on white
-    assert np.abs(pictures[0] - pictures[3]).mean() > 3
-    assert "cannot write" in refused(capfd, "view", run, "--turntable", tmp_path / "no" / "out.mp4")

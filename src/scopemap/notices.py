@@ -125,7 +125,7 @@ KINDS: dict[str, _Kind] = {
         "doubtful",
         "mapping: {keyframes} keyframes adjusted with tissue that moves, at {nodes} nodes by up to {moved:.0%} of the "
         "median depth{periodic}; errors of tracks left out {px:.2f} px, {rigid_px:.2f} px if it were rigid",
-        "The tissue moved while it was filmed{periodic}: the surface is a mean of its states",
+        "The tissue moved while it was filmed{periodic}: the surface is one state of it",
     ),
     "mapping-depth-disagrees": _Kind(
         "doubtful",
@@ -157,6 +157,11 @@ KINDS: dict[str, _Kind] = {
         "fusion: {share:.1%} of the pixels, in {frames} frames, are left out: other frames look through there, or "
         "instruments touch them",
         "",
+    ),
+    "fusion-in-one-state": _Kind(
+        "info",
+        "fusion: what was seen of moving tissue was moved into its state at second {second:.2f}; mesh_over_time.glb "
+        "has its other states",
     ),
     "fusion-too-far": _Kind(
         "doubtful",

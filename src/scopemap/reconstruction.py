@@ -2,7 +2,7 @@
 
 out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frames.csv  config.toml  provenance.json
       depth/000000.png (16 bit, depth/depth.json has the scale)  depth_sigma/000000.png (8 bit, relative)
-      depth_preview/000000.jpg (colours)
+      depth_preview/000000.jpg (colours)  tissue_motion.npz mesh_over_time.glb (where tissue moves)
       maps/1 (the same for submaps that are not merged), ...
 """
 
@@ -21,10 +21,11 @@ from scopemap.cameras.camera import CameraModel, PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.config import Config
 from scopemap.errors import InputError
-from scopemap.fusion.mesh_files import save_mesh
+from scopemap.fusion.mesh_files import save_mesh, save_mesh_over_time
 from scopemap.io.frame_choice import SkippedFrame
 from scopemap.notices import scale_words
 from scopemap.trajectory.frame_table import FrameTable
+from scopemap.trajectory.tissue_states import TissueStates
 from scopemap.trajectory.trajectory import SKIPPED, Trajectory, write_tum
 
 VIEWS: dict[str, Callable[[Reconstruction], str]] = {}
@@ -54,6 +55,7 @@ class Reconstruction:
     focal_sigma_px : standard deviation of the focal length of `camera` where it is an estimate, or None.
     others : the other submaps, with their own frames, each with its own world and scale, since their relative pose is
         unknown; most frames first, as in maps/1, maps/2, ...
+    states : of tissue that moves, and in which `mesh` is; None: it is taken to be at rest.
     """
 
     camera: PinholeCamera
@@ -65,6 +67,7 @@ class Reconstruction:
     skipped: list[SkippedFrame] = field(default_factory=list)
     focal_sigma_px: float | None = None
     others: list[Reconstruction] = field(default_factory=list)
+    states: TissueStates | None = None
 
     def __repr__(self) -> str:
         if "line" in VIEWS:
@@ -98,6 +101,10 @@ class Reconstruction:
         """Itself, and the other submaps."""
         return [self, *self.others]
 
+    def mesh_at(self, index: int) -> trimesh.Trimesh:
+        """Return the surface in the state of the frame with this number; `mesh` itself where tissue is at rest."""
+        return self.mesh if self.states is None else self.states.moved(self.mesh, index)
+
     def save(self, folder: Path) -> None:
         """Write everything but the depth maps, which a `DepthWriter` writes frame by frame.
 
@@ -111,6 +118,9 @@ class Reconstruction:
             scale = scale_words(self.provenance.get("scale", {}))
             write_tum(folder / "trajectory.tum", self.trajectory, comment=scale)
             save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb", comment=scale)
+            if self.states is not None:
+                self.states.save(folder)
+                save_mesh_over_time(self.mesh, self.states, folder / "mesh_over_time.glb", comment=scale)
             sigma_px = self.focal_sigma_px
             write_calibration(self.camera, folder / "camera.yaml", focal_sigma_px=sigma_px)
             if (source := self.source_camera) is not None:

@@ -1,6 +1,7 @@
 """Measures a run's surface against its own video: frames kept out of fusion are compared with the mesh of the others.
 
 The run's frames are fused again with its settings, poses and depth, but for every n-th one; masks are made again.
+Tissue that moves is in the state of each frame.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare
 from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.free_space import FreeSpace, views_among
+from scopemap.fusion.reference_state import in_surface_state
 from scopemap.fusion.surface_fusion import SurfaceFusion
 from scopemap.geometry.rendering import Rendering, render_mesh, render_points
 from scopemap.geometry.se3 import transform
@@ -95,6 +97,7 @@ class RunFrames:
         if not depth.present:
             raise InputError(f"the run {run} kept no depth maps")
         self._run, self._fusion, self._store = run, fusion.model_copy(update={"every": 1}), FrameStore(run)
+        self.states = folder.states
         self.indices: list[int] = []
         """Numbers of the frames: the tracked ones that are fused."""
         tracked = folder.frames.rows[folder.frames.tracked][:: fusion.every]
@@ -119,7 +122,10 @@ class RunFrames:
         """Return the surface of all frames but those with the given numbers."""
         fused = set(self.indices) - set(without)
         fusion = SurfaceFusion(self._fusion, self._store, corrected=True)
-        surface = fusion.fuse(self.frames(fused), fused)
+        frames = self.frames(fused)
+        if (states := self.states) is not None:
+            frames = (in_surface_state(frame, states) for frame in frames)
+        surface = fusion.fuse(frames, fused)
         return finished(surface.mesh, surface.settings)
 
     def frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:
@@ -140,7 +146,8 @@ class RunFrames:
         found = SurfaceAgreement(lpips_missing=missing)
         views: list[tuple[float, Frame, Rendering]] = []
         for frame in self.frames():
-            view, depth_mm = render_mesh(mesh, frame.camera, _pose(frame)), _usable_depth(frame)
+            then = mesh if self.states is None else self.states.moved(mesh, frame.index)
+            view, depth_mm = render_mesh(then, frame.camera, _pose(frame)), _usable_depth(frame)
             if self._fusion.colours == "albedo":
                 view = lit_like(view, frame.camera, frame.rgb, depth_mm)
             agreement = compare_rendering(view, frame.rgb, depth_mm, perceptual)

@@ -86,7 +86,7 @@ def measure(
             f"{folder}: {run.scale}; give two points as a reference: measures are then multiples of their distance, "
             "and millimetres where that is given, too"
         )
-    pose, mesh = _pose(run, frame), measured_mesh(run)
+    pose, mesh = _pose(run, frame), measured_mesh(run, frame)
     picked, errors = _picked(run, mesh, frame, pose, pixels), _drawn(run)
     unit, divisor, draws = "mm", 1.0, errors.scale
     if reference is not None:

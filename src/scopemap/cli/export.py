@@ -12,7 +12,7 @@ from scopemap.cli.options import AsJson, InputNow, Quiet, Unit
 
 To = Literal[
     "nerfstudio", "colmap", "endogslam", "endonerf", "gaussians", "pointcloud", "ply", "obj", "stl", "glb",
-    "slicer", "dicom", "tum", "kitti", "euroc", "mcap",
+    "surfaces", "slicer", "dicom", "tum", "kitti", "euroc", "mcap",
 ]  # fmt: skip
 
 
@@ -24,7 +24,8 @@ def export(
         Unit | None, typer.Option(help="Unit of lengths; default: what the format prescribes, else mm.")
     ] = None,
     axes: Annotated[
-        Literal["lps", "ras", "opencv", "gltf"] | None, typer.Option(help="Axes of ply, obj and stl; default: lps.")
+        Literal["lps", "ras", "opencv", "gltf"] | None,
+        typer.Option(help="Axes of ply, obj, stl, surfaces; default: lps."),
     ] = None,
     source: InputNow = None,
     as_json: AsJson = False,

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from scopemap.cli.options import RunFolder
+from scopemap.cli.options import InputNow, RunFolder
 
 
 def view(
@@ -19,17 +19,27 @@ def view(
         Path | None,
         typer.Option(metavar="FILE", help="Write a film of the surface turning once, .mp4, .mkv or .webm, and end."),
     ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a film of the video beside the surface along the path, and end."),
+    ] = None,
+    source: InputNow = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
     """Show a run's page with all triangles and pictures at localhost, until Ctrl-C.
 
     Nothing is written but measurements.json, where you measure on the page and save.
     """
-    if turntable is not None:
-        from scopemap.report.turntable import write_turntable
+    if turntable is not None or video is not None:
+        from scopemap.actions.fly_through import write_fly_through
+        from scopemap.report.films import write_turntable
 
-        write_turntable(run, turntable)
-        typer.echo(f"{turntable}: {turntable.stat().st_size / 1e6:.1f} MB")
+        if turntable is not None:
+            write_turntable(run, turntable)
+        if video is not None:
+            write_fly_through(run, video, source)
+        for film in filter(None, (turntable, video)):
+            typer.echo(f"{film}: {film.stat().st_size / 1e6:.1f} MB")
         return
     from scopemap.report.page import serve_view
 

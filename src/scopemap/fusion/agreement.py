@@ -17,6 +17,7 @@ from scopemap.fusion.albedo import lit_by_lamp
 from scopemap.geometry.rendering import Rendering, render_mesh
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.geometry.similarity import structural_similarity
+from scopemap.trajectory.tissue_states import TissueStates
 
 _SAME_SURFACE = 0.02  # between a vertex and what is rendered at its pixel, of its depth: it is not hidden
 
@@ -106,18 +107,24 @@ def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
     return figures
 
 
-def surface_agreement(mesh: trimesh.Trimesh, settings: FusionSettings, frames: list[Frame]) -> dict[str, float]:
-    """Return the figures of a fusion's surface with some of its frames; {} without a surface or frames."""
+def surface_agreement(
+    mesh: trimesh.Trimesh, settings: FusionSettings, frames: list[Frame], states: TissueStates | None = None
+) -> dict[str, float]:
+    """Return the figures of a fusion's surface with some of its frames; {} without a surface or frames.
+
+    states : of tissue that moves, with which the surface is in that of each frame.
+    """
     agreements = []
     for frame in frames if len(mesh.faces) else []:
         if frame.T_world_camera is not None and frame.depth_mm is not None:
             depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
             seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
-            agreements.append(compare_with_frame(mesh, *seen, albedo=settings.colours == "albedo")[0])
+            then = mesh if states is None else states.moved(mesh, frame.index)
+            agreements.append(compare_with_frame(then, *seen, albedo=settings.colours == "albedo")[0])
     return agreement_figures(agreements) if agreements else {}
 
 
-def vertex_sigmas(mesh: trimesh.Trimesh, frames: list[Frame]) -> np.ndarray:
+def vertex_sigmas(mesh: trimesh.Trimesh, frames: list[Frame], states: TissueStates | None = None) -> np.ndarray:
     """Return the standard deviation of each vertex along the lines of sight, (V,) float32, mm; NaN: no frame sees it.
 
     It is the root mean square, over the frames that see the vertex, of what their depth and the surface differ by or of
@@ -127,8 +134,9 @@ def vertex_sigmas(mesh: trimesh.Trimesh, frames: list[Frame]) -> np.ndarray:
     for frame in frames if len(mesh.faces) else []:
         if frame.T_world_camera is None or frame.depth_mm is None:
             continue
-        z = transform(inverse(frame.T_world_camera), np.asarray(mesh.vertices))
-        shown = render_mesh(mesh, frame.camera, frame.T_world_camera).depth_mm
+        then = mesh if states is None else states.moved(mesh, frame.index)
+        z = transform(inverse(frame.T_world_camera), np.asarray(then.vertices))
+        shown = render_mesh(then, frame.camera, frame.T_world_camera).depth_mm
         pixels = frame.camera.project(z)
         limits = [frame.camera.width - 0.5, frame.camera.height - 0.5]
         inside = np.flatnonzero(((pixels >= -0.5) & (pixels < limits)).all(axis=1))

@@ -137,7 +137,7 @@ class SeenAt:
         where = f"{len(self._keys)} blocks of {self._edge_mm:.3g} mm" if len(self._keys) else "nowhere"
         return Notice("fusion-at-one-moment", {"second": self._at_s, "where": where})
 
-    def weighted(self, frame: Frame) -> Frame:
+    def fused(self, frame: Frame) -> Frame:
         """Return a frame with depth and pose with the weights of its pixels, 0..1, (H, W) float32; None: all 1."""
         assert frame.depth_mm is not None
         assert frame.T_world_camera is not None

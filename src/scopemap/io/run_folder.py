@@ -18,6 +18,7 @@ from scopemap.io.depth_maps import DepthReader
 from scopemap.notices import scale_words
 from scopemap.trajectory.formats.folders import read_frames, submap_folders
 from scopemap.trajectory.frame_table import FrameTable
+from scopemap.trajectory.tissue_states import TissueStates
 
 _SCALE_NOT_STATED = "scale unknown (the run does not state it): sizes are a guess, compare shapes"
 _MOST_PX = 1 << 15
@@ -86,6 +87,11 @@ class RunFolder:
     def mesh(self) -> trimesh.Trimesh:
         """The surface with its vertices' attributes; empty where there is no mesh.ply or no face."""
         return read_mesh(self.path / "mesh.ply")
+
+    @cached_property
+    def states(self) -> TissueStates | None:
+        """The states of tissue that moves; None where it is taken to be at rest."""
+        return TissueStates.read(self.path)
 
     @cached_property
     def camera(self) -> PinholeCamera:

@@ -17,9 +17,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree
 
-_SKIN = 4  # nodes of a point
 _NEIGHBOURS = 6  # of a node
-_LEAST_WEIGHT = 1e-3
 _FARTHEST_SHARE = 97  # percent of the points, nearest to their median, among which nodes are
 # A curve repeats itself where a sinusoid of at least so many periods explains so much of its variance.
 _LEAST_PERIODS, _PERIODIC_SHARE = 1.5, 0.8
@@ -51,26 +49,6 @@ class Deformation:
     def rate_per_min(self, time_s: np.ndarray) -> float:
         """Return how often the first curve repeats itself, times (K,) s of the keyframes; NaN where it does not."""
         return periodic_rate(time_s, self.basis[:, 0]) * 60
-
-
-class Skin(NamedTuple):
-    """Nodes of P points, (P, 4) int, and their weights (P, 4), whose sum is 1."""
-
-    node: np.ndarray
-    weight: np.ndarray
-
-    def moved(self, displacement: np.ndarray, points: np.ndarray, since: np.ndarray, until: np.ndarray) -> np.ndarray:
-        """Return the motion (n, 3) of numbered points between keyframes (n,), by the nodes' displacement (K, N, 3)."""
-        node = self.node[points]
-        change = displacement[until[:, None], node] - displacement[since[:, None], node]
-        return np.einsum("nj,njc->nc", self.weight[points], change)
-
-
-def skin_of(nodes: np.ndarray, points: np.ndarray) -> Skin:
-    """Return the four nearest of more than four nodes (N, 3) to each of points (P, 3); the fifth would weigh 0."""
-    far, node = KDTree(nodes).query(points, k=_SKIN + 1)
-    weight = np.maximum(1 - far[:, :-1] / far[:, -1:], _LEAST_WEIGHT) ** 2
-    return Skin(node[:, :-1], weight / weight.sum(1, keepdims=True))
 
 
 def spread_nodes(points: np.ndarray, count: int) -> np.ndarray:

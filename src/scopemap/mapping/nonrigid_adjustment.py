@@ -18,6 +18,7 @@ import numpy as np
 
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse, orthonormalised
+from scopemap.geometry.skinning import skin_of
 from scopemap.mapping.bundle_adjustment import BundleSolution, adjust, errors_px, log_depth_sigma, with_points
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, State, reproject
 from scopemap.mapping.deformation_graph import (
@@ -25,7 +26,6 @@ from scopemap.mapping.deformation_graph import (
     MotionPrior,
     first_mode,
     hat_functions,
-    skin_of,
     spread_nodes,
 )
 from scopemap.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, solve

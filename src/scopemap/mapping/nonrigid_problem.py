@@ -17,6 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from scopemap.geometry import least_squares
 from scopemap.geometry.least_squares import CameraBlock, cauchy, minimise, robust_sigma_2d
+from scopemap.geometry.skinning import Skin
 from scopemap.mapping.bundle_adjustment import (
     CAUCHY,
     PER_KEYFRAME,
@@ -27,7 +28,7 @@ from scopemap.mapping.bundle_adjustment import (
     weights,
 )
 from scopemap.mapping.bundle_problem import BundleProblem, Reprojection, State, jacobians, reproject
-from scopemap.mapping.deformation_graph import Deformation, Skin
+from scopemap.mapping.deformation_graph import Deformation
 
 _RIDGE = 1e-9  # of the diagonal
 _MAX_ITERATIONS, _MIN_DECREASE = 20, 1e-3

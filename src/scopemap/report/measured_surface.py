@@ -27,14 +27,15 @@ _OTHERS = {
 }
 
 
-def measured_mesh(run: RunFolder) -> trimesh.Trimesh:
-    """Return the surface of a run, or of a submap in `maps/N`, as `report.html` holds it: with few triangles.
+def measured_mesh(run: RunFolder, frame: int) -> trimesh.Trimesh:
+    """Return the surface of a run, or of a submap in `maps/N`, as `report.html` shows it at a frame, of few triangles.
 
     A vertex is off by a part of the shown triangles' size, which is far below the errors of depth.
     """
     mesh = simplified(run.mesh, FACES_OF_OTHERS if run.is_submap else MOST_FACES)
     low, spread, levels = levels_of(mesh)
-    return trimesh.Trimesh(low + levels / LARGEST_LEVEL * spread, mesh.faces, process=False)
+    shown = trimesh.Trimesh(low + levels / LARGEST_LEVEL * spread, mesh.faces, process=False)
+    return shown if run.states is None else run.states.moved(shown, frame)
 
 
 def measured_depth(run: RunFolder, frame: int) -> np.ndarray | None:

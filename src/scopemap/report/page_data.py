@@ -219,9 +219,11 @@ def _maps(
         looking = [p for p in pictures if place[p.row] == number and p.depth_mm is not None]
         looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
         seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
-        data = mesh_data(mesh, seen, camera) | {"errors": measure_errors(submap)}
+        data = mesh_data(mesh, seen, camera, submap.states) | {"errors": measure_errors(submap)}
+        if (states := submap.states) is not None and len(mesh.vertices):
+            data["changes"] = [states.change(index).tolist() for index in indices]
         if len(mesh.faces) > (most := MOST_FACES if number == 0 else FACES_OF_OTHERS):
-            data["measured"] = shape_data(simplified(mesh, most))
+            data["measured"] = shape_data(simplified(mesh, most), submap.states)
         facts = {"frames": len(pose_of), "all_faces": len(submap.mesh.faces)}
         found.append(data | facts | {"turn": turn.get(number, number), "inliers": inliers.get(number, "")})
     return found

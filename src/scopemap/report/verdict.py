@@ -207,7 +207,8 @@ def _of_notices(run: Result) -> list[Reason]:
     codes = {notice.code for notice in notices_of(run.provenance)}
     if "camera-at-rest-stated" in codes:
         found = [notice for notice in found if notice.code != "camera-at-rest"]
-    shown = "as seen at one moment" if "fusion-at-one-moment" in codes else "a mean"
+    one = codes & {"fusion-at-one-moment", "fusion-in-one-state"}
+    shown = "as seen at one moment" if one else "a mean"
     whole = "" if "camera-at-rest-stated" in codes else " Tissue that moves as a whole looks like a moving camera."
     more = {"tissue-moves": f" There the surface is {shown}.{whole}"}
     levels = [n.level if "camera-at-rest-stated" in codes else _level_of(n) for n in found]

@@ -19,6 +19,7 @@ from scopemap.fusion.agreement import surface_agreement, vertex_sigmas
 from scopemap.fusion.finish import finished
 from scopemap.fusion.free_space import FreeSpace, views_among
 from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
+from scopemap.fusion.reference_state import SurfaceState
 from scopemap.fusion.surface_fusion import FusedSurface, depth_notices
 from scopemap.io.sequence import Sequence
 from scopemap.mapping.multiview_depth import KeyframeDepths
@@ -33,6 +34,7 @@ from scopemap.runner.provenance import Limits, motion_notices, notices_of_end, p
 from scopemap.runner.submap_frames import check_tracked, frames_of_submap
 from scopemap.tracking.track import Track
 from scopemap.trajectory.frame_table import FrameTable, GrowingFrameTable
+from scopemap.trajectory.tissue_states import TissueStates
 
 Observer = Callable[[Step], bool | None]
 """Called with each step; True: no further frame is read, and the result is of the frames until then."""
@@ -196,6 +198,8 @@ class _Finishing:
         sequence, pipeline, submap = self.run.sequence, self.run.pipeline, submaps[number]
         config, store = pipeline.config, pipeline.fusion.store
         final = FinalFrames(submap, self._stored_poses(submap), store.frame)
+        frames, at_s = frames_of_submap(number, submaps, self.frames), config.fusion.surface_at_s
+        states = _states(submap, frames.only(frames.tracked), at_s)
         depths = self._triangulated_depths(final)
         with closing(depths) if depths is not None else nullcontext():
             views = views_among(list(final.T_world_camera)) if config.fusion.constants.free_space else []
@@ -204,26 +208,27 @@ class _Finishing:
             corrected = in_thread(final.frames(triangulated, free_space.without), "correct")
             # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
             median_mm = store.median_depth_mm(submap.main_frames)
-            moving, at_s = MovingTissue(block_edge_mm(median_mm)), config.fusion.surface_at_s
-            seen_at = None if at_s is None else SeenAt(final.frames(None), at_s, block_edge_mm(median_mm))
+            moving = MovingTissue(block_edge_mm(median_mm))
+            state: SurfaceState | SeenAt | None = None if states is None else SurfaceState(states)
+            if at_s is not None and states is None:
+                state = SeenAt(final.frames(None), at_s, block_edge_mm(median_mm))
             checked = self.run.checked.pop(submap.main, SpreadFrames())
             all_frames = sum(len(submap.frames) for submap in submaps)
             written = self._written(corrected, checked, moving, all_frames)
-            seen = in_thread(written if seen_at is None else map(seen_at.weighted, written), "write")
+            seen = in_thread(written if state is None else map(state.fused, written), "write")
             with closing(seen):
                 fused: FusedSurface = self.run.clock.timed(
                     "fuse", pipeline.fusion.fuse, seen, submap.main_frames, submap.main
                 )
         fused = replace(fused, mesh=self.run.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
         fused.mesh.vertex_attributes["moving"] = moving.shares(fused.mesh.vertices).astype(np.float32)
-        agreement = self.run.clock.timed("check surface", surface_agreement, fused.mesh, fused.settings, checked.frames)
-        sigmas_mm = self.run.clock.timed("check surface", vertex_sigmas, fused.mesh, checked.frames)
-        fused.mesh.vertex_attributes["sigma_mm"] = sigmas_mm
-        frames = frames_of_submap(number, submaps, self.frames)
+        looking, check = (checked.frames, states), partial(self.run.clock.timed, "check surface")
+        agreement = check(surface_agreement, fused.mesh, fused.settings, *looking)
+        fused.mesh.vertex_attributes["sigma_mm"] = check(vertex_sigmas, fused.mesh, *looking)
         provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
         notices = self.notices + motion_notices(frames, config)
         notices += [] if submap.correction is None else submap.correction.notices
-        notices += [part.notice for part in (seen_at, depths) if part is not None] + fused.notices
+        notices += [part.notice for part in (state, depths) if part is not None] + fused.notices
         notices += [] if free_space.notice is None else [free_space.notice]
         masks, known_mm = pipeline.estimators.masks, self.frames["median_depth_mm"]
         notices += [] if masks is None else masks.notices
@@ -234,7 +239,15 @@ class _Finishing:
         config = config.model_copy(update={"fusion": fused.settings})
         source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px
         return Reconstruction(
-            sequence.camera, frames, fused.mesh, config, provenance, source_camera, sequence.skipped, sigma_px
+            sequence.camera,
+            frames,
+            fused.mesh,
+            config,
+            provenance,
+            source_camera,
+            sequence.skipped,
+            sigma_px,
+            states=states,
         )
 
     def _stored_poses(self, submap: Submap) -> dict[int, np.ndarray]:
@@ -269,6 +282,17 @@ class _Finishing:
     def _write(self, frame: Frame) -> None:
         for write in self.run.writers:
             write(frame)
+
+
+def _states(submap: Submap, tracked: FrameTable, at_s: float | None) -> TissueStates | None:
+    """Return the states of a submap's tissue at its frames where it moves, that of the surface next to a second."""
+    correction = submap.correction
+    if correction is None or correction.tissue is None:
+        return None
+    motion, index = correction.tissue.deformation, tracked["index"]
+    curves = np.column_stack([np.interp(index, correction.index, curve) for curve in motion.basis.T])
+    states = TissueStates(motion.nodes, motion.modes, index, tracked["time_s"], curves, curves[0])
+    return states.with_reference(at_s)
 
 
 class SpreadFrames:

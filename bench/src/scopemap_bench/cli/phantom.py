@@ -27,7 +27,8 @@ def phantom(
     events: Annotated[
         str,
         typer.Option(
-            help="KIND:A-B,... (frames, inclusive): black, blur, smoke, fluid, instrument, turn, contact, push, poke"
+            help="KIND:A-B,... (frames, inclusive): black, blur, smoke, veil, fluid, instrument, turn, contact, "
+            "push, rebound, poke, peristalsis, grasp, cut"
         ),
     ] = "",
     settings: Annotated[

@@ -2,6 +2,7 @@
 
 from scopemap_bench.datasets.c3vd import C3vdFolder
 from scopemap_bench.datasets.climb import ClimbClip
+from scopemap_bench.datasets.d4d import D4dClip
 from scopemap_bench.datasets.endomapper import EndoMapperSequence
 from scopemap_bench.datasets.endomapper_sim import EndoMapperSimFolder
 from scopemap_bench.datasets.endonerf import EndoNerfFolder
@@ -13,11 +14,12 @@ from scopemap_bench.datasets.servct import ServCtFolder
 from scopemap_bench.datasets.sevenscenes import SevenScenesFolder
 from scopemap_bench.datasets.simcol import SimColFolder
 from scopemap_bench.datasets.stereomis import StereoMisFolder
+from scopemap_bench.datasets.stir import StirClip
 from scopemap_bench.datasets.tum import TumRgbdFolder
 
 READERS = (
     *(ScaredCKeyframe, ScaredKeyframe, HamlynFolder, HamlynTrackingFolder, EndoSlamFolder, SimColFolder),
     *(EndoMapperSequence, ClimbClip, EndoMapperSimFolder, StereoMisFolder, C3vdFolder, EndoNerfFolder),
-    *(ServCtFolder, SevenScenesFolder, TumRgbdFolder, OneSlamFolder),
+    *(ServCtFolder, SevenScenesFolder, TumRgbdFolder, OneSlamFolder, StirClip, D4dClip),
 )
 """The readers, in the order in which `recognises` is called."""

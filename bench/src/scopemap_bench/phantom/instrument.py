@@ -16,7 +16,7 @@ _GLOSS_SHARPNESS, _GLOSS = 30.0, 1.2
 # and forceps out of the endoscope's channel.
 _RIGID = (np.array([55.0, 34.0, -20.0]), np.array([4.0, 4.0, 46.0]), 2.5, 9.0)
 _FORCEPS = (np.array([5.0, 5.0, -2.0]), np.array([1.0, 2.0, 17.0]), 1.1, 3.0)
-_JAWS_MM, _OPEN_RAD = (11.0, 4.0), 0.35
+_JAWS_MM, _OPEN_RAD, _CLOSED_RAD = (11.0, 4.0), 0.35, 0.08
 
 
 @dataclass(frozen=True)
@@ -28,21 +28,28 @@ class Capsules:
     colours: np.ndarray
 
 
-def instrument(time: float, first: int, last: int, rigid: bool, seed: int) -> Capsules | None:
-    """Return the instrument at a time in frames: it enters early in `first` to `last` and leaves late."""
+def instrument(
+    time: float, first: int, last: int, rigid: bool, seed: int, held: tuple[np.ndarray, bool] | None = None
+) -> Capsules | None:
+    """Return the instrument at a time in frames: it enters early in `first` to `last` and leaves late.
+
+    held : the point (3,), camera axes, mm, that its tip goes to instead of working at will, and whether its jaws are
+    closed.
+    """
     share = (time - first) / max(last - first, 1)
     if not 0 <= share <= 1:
         return None
     port, work, radius, wander = _RIGID if rigid else _FORCEPS
-    out = 1 - np.clip(min(share, 1 - share) * 3, 0, 1)
+    out = 1 - np.clip(min(share, 1 - share) * (3 if held is None else 4), 0, 1)
     phase = np.random.default_rng((seed, 9)).uniform(0, 2 * np.pi, 3)
     sway = wander * np.sin(time * np.array([0.11, 0.083, 0.06]) + phase)
-    reach = work + sway - port
+    reach = (work + sway if held is None else held[0]) - port
     along = reach / np.linalg.norm(reach)
     tip = port + (1 - out) * reach
     side = np.cross(along, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
     jaw, angle = _JAWS_MM[0 if rigid else 1], _OPEN_RAD * (0.6 + 0.4 * np.sin(0.2 * time))
+    angle = _CLOSED_RAD if held is not None and held[1] else angle
     hinge = tip - jaw * along
     jaws = [[hinge, hinge + jaw * (np.cos(angle) * along + sign * np.sin(angle) * side)] for sign in (-1, 1)]
     ends = np.array([[port - 40 * along, hinge - jaw * along], [hinge - jaw * along, hinge], *jaws])

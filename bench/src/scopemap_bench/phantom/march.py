@@ -19,12 +19,13 @@ from scipy import ndimage
 
 from scopemap.cameras.camera import CameraModel
 from scopemap_bench.phantom.motion import Displacement
+from scopemap_bench.phantom.slit import gap_at, shift_at
 
 _MARGIN = 2
 _MAX_STEPS, _NEWTON_STEP_VOXELS, _TOLERANCE_VOXELS, _LEAST_STEP_VOXELS = 1000, 0.5, 1e-5, 1e-3
 
 Grids = tuple[np.ndarray, np.ndarray, np.ndarray, float, float]
-Moved = tuple[np.ndarray, np.ndarray]
+Moved = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -180,7 +181,7 @@ class SurfaceBuffers:
 
 @njit(cache=True, nogil=True)
 def _rest_point(moved: Moved, origin: np.ndarray, d: np.ndarray, t: float, here: np.ndarray) -> None:
-    """Write the rest point p - u(p) of the point p at distance t (voxels) of a ray into here[1:4]."""
+    """Write p - u(p) of the point p at distance t (voxels) of a ray into here[7:10], its rest point into here[1:4]."""
     px, py, pz = origin[0] + t * d[0], origin[1] + t * d[1], origin[2] + t * d[2]
     here[1], here[2], here[3] = px, py, pz
     for w in moved[0]:
@@ -190,6 +191,35 @@ def _rest_point(moved: Moved, origin: np.ndarray, d: np.ndarray, t: float, here:
         x, y, z = px - b[0], py - b[1], pz - b[2]
         s = np.exp(-b[6] * (x * x + y * y + z * z))
         here[1], here[2], here[3] = here[1] - b[3] * s, here[2] - b[4] * s, here[3] - b[5] * s
+    here[7], here[8], here[9] = here[1], here[2], here[3]
+    for c in moved[2]:
+        across, gap, _, _, _, _ = gap_at(c, here[7], here[8], here[9])
+        s = shift_at(c, across, gap)
+        here[1], here[2], here[3] = here[1] - c[3] * s, here[2] - c[4] * s, here[3] - c[5] * s
+
+
+@njit(cache=True, nogil=True)
+def _part(c: np.ndarray, here: np.ndarray) -> None:
+    """Turn value and gradient at the rest point, in here[0] and [4:7], into those at here[7:10] with a slit."""
+    x, gap, deep, gap_y, gap_z, deep_y = gap_at(c, here[7], here[8], here[9])
+    if gap == 0.0:
+        return
+    side = 1.0 if x >= 0.0 else -1.0
+    within, fall = gap - abs(x), np.exp(min(gap - abs(x), 0.0) / c[13])
+    # Slopes of the shift along the slit's axes.
+    over = 0.0 if within >= 0.0 else side * fall * (1.0 + gap / c[13])
+    shift_x = 1.0 if within >= 0.0 else -gap * fall / c[13]
+    down = here[4] * c[3] + here[5] * c[4] + here[6] * c[5]
+    along_x, along_y, along_z = -shift_x * down, -over * gap_y * down, -over * gap_z * down
+    if within * c[19] > here[0] + deep:
+        here[0] += deep
+        along_y += deep_y
+    elif within * c[19] > here[0]:
+        here[0] = within * c[19]
+        here[4] = here[5] = here[6] = 0.0
+        along_x, along_y, along_z = -side * c[19], gap_y * c[19], gap_z * c[19]
+    for axis in range(3):
+        here[4 + axis] += along_x * c[3 + axis] + along_y * c[6 + axis] + along_z * c[9 + axis]
 
 
 @njit(cache=True, nogil=True)
@@ -201,6 +231,9 @@ def _shape(c: np.ndarray, moved: Moved, origin: np.ndarray, d: np.ndarray, t: fl
         return 0.0
     here[0], gx, gy, gz = spline(c, here[1], here[2], here[3])
     here[4], here[5], here[6] = gx, gy, gz
+    for s in moved[2]:
+        _part(s, here)
+        gx, gy, gz = here[4], here[5], here[6]
     for w in moved[0]:
         phase = w[0] * (origin[0] + t * d[0]) + w[1] * (origin[1] + t * d[1]) + w[2] * (origin[2] + t * d[2]) + w[6]
         s = np.cos(phase) * (w[3] * gx + w[4] * gy + w[5] * gz)
@@ -268,7 +301,7 @@ def _march_image(grids: Grids, moved: Moved, T_grid_camera: np.ndarray, rays: np
     """Fill out (H, W, 7): distance in voxels, rest point in grid coordinates, gradient in grid axes."""
     R, origin = np.ascontiguousarray(T_grid_camera[:3, :3]), np.ascontiguousarray(T_grid_camera[:3, 3])
     for row in prange(rays.shape[0]):
-        here, d = np.empty(7), np.empty(3)
+        here, d = np.empty(10), np.empty(3)
         for column in range(rays.shape[1]):
             ray = rays[row, column]
             if np.isnan(ray[0]):

@@ -1,7 +1,7 @@
 """How the camera and the tissue move.
 
 Generated paths are hand-like; poses are camera to world, mm, OpenCV axes. Tissue moves by a smooth displacement: at the
-point p of space is that of the rest point p - u(p), with u a sum of plane waves and of bumps.
+point p of space is that of the rest point p - u(p), with u a sum of plane waves and of bumps, unless a slit parts it.
 """
 
 from __future__ import annotations
@@ -12,6 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from scopemap.geometry.se3 import se3, so3_exp
+from scopemap_bench.phantom.slit import UNCUT, cut_until, opened, slit
+from scopemap_bench.phantom.slit import in_grid as slits_in_grid
+from scopemap_bench.phantom.slit import stretch as stretch_of
 
 _SPEED_MM, _TURN_DEG = 0.45, 30.0
 _CONTACT_TURN_DEG, _CONTACT_MM, _CONTACT_STEP_MM = 55.0, 4.0, 0.25
@@ -19,6 +22,13 @@ _SWAY_FRAMES = (90.0, 170.0)
 _FIXED_POINT_STEPS = 40
 _PUSH_MM, _PUSH_LENGTH_MM = 6.0, 110.0
 _POKE_MM, _POKED_SHARE = 8.0, 0.2
+_RISE_SHARE, _SWINGS, _DAMPING = 1 / 3, 2.0, 6.0
+_RING_MM, _RING_WIDTH_MM, _RING_LENGTH_MM, _RING_FRAMES = 2.5, 90.0, 70.0, 60.0
+_PULL_MM, _PULL_WIDTH_MM = 8.0, 12.0
+# A pull and a cut are in proportion to the distance where it is smaller than this.
+_FULL_FROM_MM = 50.0
+# Shares of a grasp's time at which the instrument takes hold, has pulled, and lets go.
+_HOLDS, _PULLED, _LETS_GO = 0.25, 0.5, 0.75
 
 
 def lumen_path(frames: int, loop: bool, seed: int, straight: bool = False) -> np.ndarray:
@@ -127,22 +137,24 @@ class Displacement:
     """The displacement of one instant.
 
     waves : (M, 7) float64, wave vector (rad/mm), amplitude (mm), phase (rad). bumps : (B, 7) float64, centre (mm),
-    amplitude (mm), and the q (1/mm^2) of a displacement of exp(-q distance^2) of it.
+    amplitude (mm), and the q (1/mm^2) of a displacement of exp(-q distance^2) of it. slits : (S, 20), as `UNCUT` has
+    it, S at most 1, of the tissue before waves and bumps displace it.
     """
 
     waves: np.ndarray
     bumps: np.ndarray = field(default_factory=lambda: np.zeros((0, 7)))
+    slits: np.ndarray = field(default_factory=UNCUT.copy)
 
     @property
     def stretch(self) -> float:
-        """Upper bound of the slope of p -> p - u(p)."""
+        """Upper bound of the slope from points to rest points."""
         waves = np.linalg.norm(self.waves[:, :3], axis=1) * np.linalg.norm(self.waves[:, 3:6], axis=1)
         # A bump is steepest at the distance sqrt(1 / 2q).
         bumps = np.sqrt(2 * self.bumps[:, 6] / np.e) * np.linalg.norm(self.bumps[:, 3:6], axis=1)
-        return 1.0 + float(waves.sum() + bumps.sum())
+        return (1.0 + float(waves.sum() + bumps.sum())) * stretch_of(self.slits)
 
     def at(self, points_mm: np.ndarray) -> np.ndarray:
-        """Return the displacement u (N, 3) in mm at points (N, 3) of space."""
+        """Return the displacement u (N, 3) in mm at points (N, 3) of space, without what slits do."""
         moved: np.ndarray = np.sin(points_mm @ self.waves[:, :3].T + self.waves[:, 6]) @ self.waves[:, 3:6]
         for bump in self.bumps:
             moved = moved + np.exp(-bump[6] * ((points_mm - bump[:3]) ** 2).sum(1))[:, None] * bump[3:6]
@@ -150,6 +162,8 @@ class Displacement:
 
     def move(self, rest_mm: np.ndarray) -> np.ndarray:
         """Return where rest points (N, 3) are now: the fixed point of p = q + u(p), to 1e-6 mm or better."""
+        for cut in self.slits:
+            rest_mm = opened(cut, np.ascontiguousarray(rest_mm, np.float64))
         points = rest_mm
         for _ in range(_FIXED_POINT_STEPS if len(self.waves) or len(self.bumps) else 0):
             points = rest_mm + self.at(points)
@@ -160,12 +174,13 @@ class Displacement:
         factors = [1, 1, 1, strength, strength, strength, 1]
         return Displacement(self.waves * factors, self.bumps * factors)
 
-    def in_grid(self, origin_mm: np.ndarray, voxel_mm: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the waves (M, 7) and the bumps (B, 7) for coordinates in voxels from `origin_mm`."""
+    def in_grid(self, origin_mm: np.ndarray, voxel_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return waves (M, 7), bumps (B, 7) and slits (S, 20) for coordinates in voxels from `origin_mm`."""
         k, amplitude, phase = self.waves[:, :3], self.waves[:, 3:6], self.waves[:, 6:]
         waves = np.concatenate([k * voxel_mm, amplitude / voxel_mm, phase + (k @ origin_mm)[:, None]], axis=1)
         centre, poke, q = self.bumps[:, :3], self.bumps[:, 3:6], self.bumps[:, 6:]
-        return waves, np.concatenate([(centre - origin_mm) / voxel_mm, poke / voxel_mm, q * voxel_mm**2], axis=1)
+        bumps = np.concatenate([(centre - origin_mm) / voxel_mm, poke / voxel_mm, q * voxel_mm**2], axis=1)
+        return waves, bumps, slits_in_grid(self.slits, origin_mm, voxel_mm)
 
 
 REST = Displacement(np.zeros((0, 7)))
@@ -185,37 +200,149 @@ class Breathing:
 
 @dataclass(frozen=True)
 class Push:
-    """A displacement that is 0 until the frame `first`, in full from `last` on."""
+    """A displacement that is 0 until the frame `first`, in full from `last` on.
+
+    springs : it is in full after a third of that time, is let go, and swings back past its place to rest.
+    """
 
     full: Displacement
+    first: int
+    last: int
+    springs: bool = False
+
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames."""
+        share = (time - self.first) / max(self.last - self.first, 1)
+        if not self.springs:
+            return self.full.scaled(_eased(share))
+        let_go = (share - _RISE_SHARE) / (1 - _RISE_SHARE)
+        return self.full.scaled(_eased(share / _RISE_SHARE) if let_go < 0 else _swing(let_go))
+
+
+@dataclass(frozen=True)
+class Contractions:
+    """Rings of narrower and wider lumen that travel along an axis, from frame `first` to `last`: peristalsis.
+
+    waves : (4, 7), those of `Displacement` at full strength. turn : (4,), which way the phase of each goes.
+    """
+
+    waves: np.ndarray
+    turn: np.ndarray
+    first: int
+    last: int
+
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames; it grows for a fifth of the time, and fades for one."""
+        share = (time - self.first) / max(self.last - self.first, 1)
+        moved = self.waves.copy()
+        moved[:, 6] += 2 * np.pi * (time - self.first) / _RING_FRAMES * self.turn
+        return Displacement(moved).scaled(_eased(5 * min(share, 1 - share)))
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """Tissue at a rest point (3,) that an instrument holds, pulls by `pull_mm` (3,), and lets go, as `Push` springs.
+
+    Its bump moves with the point, so that the tissue held stays at the tip of the instrument.
+    """
+
+    point_mm: np.ndarray
+    pull_mm: np.ndarray
+    width_mm: float
+    first: int
+    last: int
+
+    @property
+    def let_go(self) -> float:
+        """Time, in frames, at which the instrument opens."""
+        return self.first + _LETS_GO * max(self.last - self.first, 1)
+
+    def holds(self, time: float) -> bool:
+        """Return whether the instrument is closed at a time, in frames."""
+        return self.first + _HOLDS * max(self.last - self.first, 1) <= time < self.let_go
+
+    def at(self, time: float) -> Displacement:
+        """Return the displacement at a time, in frames."""
+        share = (time - self.first) / max(self.last - self.first, 1)
+        let_go = (share - _LETS_GO) / (1 - _LETS_GO)
+        pulled = (_eased((share - _HOLDS) / (_PULLED - _HOLDS)) if let_go < 0 else _swing(let_go)) * self.pull_mm
+        bump = np.concatenate([self.point_mm + pulled, pulled, [0.5 / self.width_mm**2]])
+        return Displacement(REST.waves, bump[None])
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A slit (1, 20) that is cut from frame `first` to `last`, and gapes from then on."""
+
+    slits: np.ndarray
     first: int
     last: int
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
         share = np.clip((time - self.first) / max(self.last - self.first, 1), 0.0, 1.0)
-        return self.full.scaled(0.5 - 0.5 * np.cos(np.pi * share))
+        return Displacement(REST.waves, slits=cut_until(self.slits, float(share)))
+
+
+def _eased(share: float) -> float:
+    """Return 0 for shares of time below 0, 1 above 1, half a cosine between."""
+    return float(0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0)))
+
+
+def _swing(share: float) -> float:
+    """Return what is left of a displacement of 1, let go at rest, at a share >= 0 of time: a damped oscillation."""
+    angle = 2 * np.pi * _SWINGS * share
+    return float(np.exp(-_DAMPING * share) * (np.cos(angle) + _DAMPING / (2 * np.pi * _SWINGS) * np.sin(angle)))
+
+
+Part = Breathing | Push | Contractions | Grasp | Cut
 
 
 @dataclass(frozen=True)
 class TissueMotion:
     """All that moves the tissue."""
 
-    parts: tuple[Breathing | Push, ...]
+    parts: tuple[Part, ...]
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
         parts = [REST, *(part.at(time) for part in self.parts)]
-        return Displacement(np.concatenate([p.waves for p in parts]), np.concatenate([p.bumps for p in parts]))
+        return Displacement(
+            *(np.concatenate([getattr(p, kind) for p in parts]) for kind in ("waves", "bumps", "slits"))
+        )
 
 
-def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float) -> Push:
+def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float, springs: bool = False) -> Push:
     """Return a push of the tissue `distance_mm` ahead of a camera: up on the left of its view, down on the right."""
     right, down, ahead = T_world_camera[:3, :3].T
     along = 2 * np.pi / _PUSH_LENGTH_MM * right
     middle = T_world_camera[:3, 3] + distance_mm * ahead
     wave = np.concatenate([along, _PUSH_MM * (0.8 * down - 0.6 * ahead), [-along @ middle]])
-    return Push(Displacement(wave[None]), first, last)
+    return Push(Displacement(wave[None]), first, last, springs)
+
+
+def contractions(first: int, last: int, T_world_camera: np.ndarray) -> Contractions:
+    """Return contractions about the line of sight of a camera, which travel away from it."""
+    right, down, ahead = T_world_camera[:3, :3].T
+    along = 2 * np.pi / _RING_LENGTH_MM * ahead
+    # Each pair adds up to -sin(across) cos(along - turn): to the axis where the cosine is positive.
+    waves = []
+    for side in (right, down):
+        across = 2 * np.pi / _RING_WIDTH_MM * side
+        waves += [[across + along, -0.5 * _RING_MM * side], [across - along, -0.5 * _RING_MM * side]]
+    rows = [np.concatenate([*wave, [-wave[0] @ T_world_camera[:3, 3]]]) for wave in waves]
+    return Contractions(np.array(rows), np.array([-1.0, 1.0, -1.0, 1.0]), first, last)
+
+
+def grasp(first: int, last: int, point_mm: np.ndarray, direction: np.ndarray, distance_mm: float) -> Grasp:
+    """Return a grasp of the tissue at a point (3,), seen from so far, pulled along a unit vector (3,)."""
+    size = min(1.0, distance_mm / _FULL_FROM_MM)
+    return Grasp(point_mm, size * _PULL_MM * direction, size * _PULL_WIDTH_MM, first, last)
+
+
+def cut(first: int, last: int, point_mm: np.ndarray, across: np.ndarray, normal: np.ndarray, distance_mm: float) -> Cut:
+    """Return a cut of the tissue at a point (3,), seen from so far, which opens along a unit vector (3,)."""
+    return Cut(slit(point_mm, across, normal, min(1.0, distance_mm / _FULL_FROM_MM)), first, last)
 
 
 def poke(first: int, last: int, point_mm: np.ndarray, direction: np.ndarray, distance_mm: float) -> Push:

@@ -7,15 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scopemap.errors import InputError
+from scopemap.geometry.se3 import inverse, transform
 from scopemap.trajectory.formats.text import read_poses
-from scopemap_bench.phantom.instrument import insert, instrument
+from scopemap_bench.phantom.instrument import Capsules, insert, instrument
 from scopemap_bench.phantom.march import SurfaceBuffers, Volume, march
 from scopemap_bench.phantom.motion import (
     REST,
-    Breathing,
-    Push,
+    Grasp,
+    Part,
     TissueMotion,
     breathing,
+    contractions,
+    cut,
+    grasp,
     lumen_path,
     poke,
     push,
@@ -34,10 +38,13 @@ from scopemap_bench.phantom.shading import (
     lagging_gains,
     pose_at,
     shade,
+    veil,
     vignette,
 )
+from scopemap_bench.phantom.slit import in_wound
 from scopemap_bench.phantom.spec import DEFAULT_FRAMES, Event, EventName, PhantomSpec
 
+_WOUND_RGB = np.array([0.7, 0.22, 0.2], np.float32)
 _COLON_RGB = np.array([0.64, 0.265, 0.165])
 _TUBE_RGB = np.array([0.55, 0.30, 0.22])
 # Exposure is measured in a small picture, as cameras do.
@@ -81,26 +88,39 @@ def _events(spec: PhantomSpec, kind: EventName) -> list[Event]:
 
 
 def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotion:
-    """Breathing and pushes of the tissue."""
-    parts: list[Breathing | Push] = [breathing(spec.breath_mm, spec.breath_frames, spec.seed)] if spec.deform else []
+    """Breathing and what the events do to the tissue."""
+    parts: list[Part] = []
+    if spec.deform:
+        parts.append(breathing(spec.breath_mm, spec.breath_frames, spec.seed))
     away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene in _OPEN else "lumen"]
-    for event in _events(spec, "push"):
-        parts.append(push(event.first, event.last, poses[min(event.first, len(poses) - 1)], away_mm))
-    parts += [_poke(spec, event, poses[min(event.first, len(poses) - 1)], volume) for event in _events(spec, "poke")]
+    for event in spec.events:
+        first, last, pose = event.first, event.last, poses[min(event.first, len(poses) - 1)]
+        if event.kind in ("push", "rebound"):
+            parts.append(push(first, last, pose, away_mm, springs=event.kind == "rebound"))
+        elif event.kind == "peristalsis":
+            parts.append(contractions(first, last, pose))
+        elif event.kind in ("poke", "grasp", "cut"):
+            point, normal, along, distance_mm = _touched(spec, event, pose, volume)
+            if event.kind == "cut":
+                parts.append(cut(first, last, point, along, normal, distance_mm))
+            elif event.kind == "poke":
+                parts.append(poke(first, last, point, (along - normal) / np.sqrt(2), distance_mm))
+            else:
+                parts.append(grasp(first, last, point, (along + normal) / np.sqrt(2), distance_mm))
     return TissueMotion(tuple(parts))
 
 
-def _poke(spec: PhantomSpec, event: Event, T_world_camera: np.ndarray, volume: Volume) -> Push:
-    """Return the push of what a camera sees right of its middle, half into the wall, half along it."""
+def _touched(
+    spec: PhantomSpec, event: Event, T_world_camera: np.ndarray, volume: Volume
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return what a camera sees right of its middle: point, normal, a direction along the surface (3,), depth, mm."""
     surface = march(volume, spec.camera, T_world_camera, REST)
     row, column = (round(share * side) for share, side in zip(_POKED_AT, surface.depth_mm.shape, strict=True))
     if not np.isfinite(surface.depth_mm[row, column]):
-        raise InputError(f"nothing to poke: frame {event.first} shows no tissue on the right of its middle")
+        raise InputError(f"nothing to {event.kind}: frame {event.first} shows no tissue on the right of its middle")
     normal = T_world_camera[:3, :3] @ surface.normal[row, column]
     along = np.cross(normal, T_world_camera[:3, 1])
-    direction = along / np.linalg.norm(along) - normal
-    direction /= np.linalg.norm(direction)
-    return poke(event.first, event.last, surface.rest_mm[row, column], direction, surface.depth_mm[row, column])
+    return surface.rest_mm[row, column], normal, along / np.linalg.norm(along), float(surface.depth_mm[row, column])
 
 
 def _lagging_exposure(phantom: Phantom) -> np.ndarray:
@@ -163,14 +183,28 @@ def light(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
 def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers]:
     """Linear light at a moment, in frames, and the surface that it came from."""
     camera, look = phantom.spec.camera, phantom.appearance
-    surface = march(phantom.volume, camera, pose_at(phantom.poses, time), phantom.motion.at(time))
+    displacement = phantom.motion.at(time)
+    surface = march(phantom.volume, camera, pose_at(phantom.poses, time), displacement)
     rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.central.fx)
     albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
+    albedo[in_wound(displacement.slits, rest)] *= _WOUND_RGB
     radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
-    for event in _events(phantom.spec, "instrument"):
-        tool = instrument(time, event.first, event.last, phantom.spec.scene in _OPEN, phantom.spec.seed)
+    for tool in _tools(phantom, time):
         radiance, surface = insert(tool, radiance, surface, camera)
     return radiance * vignette(camera), surface
+
+
+def _tools(phantom: Phantom, time: float) -> list[Capsules | None]:
+    """Return the instruments at a moment, in frames; one that holds tissue has its tip where that is."""
+    rigid, seed = phantom.spec.scene in _OPEN, phantom.spec.seed
+    tools = [instrument(time, e.first, e.last, rigid, seed) for e in _events(phantom.spec, "instrument")]
+    for part in phantom.motion.parts:
+        if isinstance(part, Grasp):
+            # Tissue that was let go swings back; the tip does not follow it.
+            held = phantom.motion.at(min(time, part.let_go)).move(part.point_mm[None])
+            held = transform(inverse(pose_at(phantom.poses, time)), held)[0]
+            tools.append(instrument(time, part.first, part.last, rigid, seed, (held, part.holds(time))))
+    return tools
 
 
 def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:
@@ -181,4 +215,8 @@ def render_frame(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffe
     gain = gain if isinstance(gain, float) else gain[index]
     rng = np.random.default_rng((spec.seed, 4, index))
     kinds = {event.kind for event in spec.events if event.first <= index <= event.last}
-    return develop(disturb(linear * np.float32(gain), kinds, rng, index), spec.noise, rng), surface
+    linear = linear * np.float32(gain)
+    for event in _events(spec, "veil"):
+        if event.first <= index <= event.last:
+            linear = veil(linear, surface.distance_mm, (index - event.first) / max(event.last - event.first, 1), index)
+    return develop(disturb(linear, kinds, rng, index), spec.noise, rng), surface

@@ -33,6 +33,7 @@ _BLUR_PX = 13
 _WATER_PX, _WATER_LENGTH_PX, _WATER_FRAMES = 5.0, 40.0, 7.0
 _WATER_RGB = np.array([0.55, 0.45, 0.22], np.float32)
 _SMOKE_GREY = np.array([0.42, 0.43, 0.44], np.float32)
+_VEIL = 1.2  # optical depth at the usual distance, where a cloud is of density 1
 MAX_SAMPLES = 8
 """Of light within one exposure."""
 
@@ -187,6 +188,20 @@ def _smoke(linear: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     clouds = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     thickness = np.clip(clouds, 0, 1)[..., None]
     return linear * (1 - thickness) + _SMOKE_GREY * thickness
+
+
+def veil(linear: np.ndarray, distance_mm: np.ndarray, share: float, time: float) -> np.ndarray:
+    """Return exposed light (H, W, 3) behind smoke that gathers and clears, at a share of its time.
+
+    distance_mm : (H, W), what is farther is behind more of it; NaN is far.
+    """
+    height, width = distance_mm.shape
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    points = np.stack([x / width - 0.02 * time, y / height + 0.008 * time, np.full_like(x, 0.02 * time)], -1)
+    clouds = np.clip(0.6 + noise_at(points, 0.7, 75) + 0.5 * noise_at(points, 0.25, 76), 0.05, None)
+    far = np.nan_to_num(distance_mm / np.nanmedian(distance_mm), nan=2.0)
+    clear = np.exp(-_VEIL * np.sin(np.pi * share) ** 2 * clouds * far)[..., None].astype(np.float32)
+    return linear * clear + _SMOKE_GREY * (1 - clear)
 
 
 def _blur(linear: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -17,7 +17,10 @@ from scopemap.errors import SettingsError
 
 SceneName = Literal["colon", "laparoscopy", "abdominal_wall", "tube"]
 RouteName = Literal["wander", "sideways", "withdrawal"]
-EventName = Literal["black", "blur", "smoke", "fluid", "instrument", "turn", "contact", "push", "poke"]
+EventName = Literal[
+    "black", "blur", "smoke", "veil", "fluid", "instrument", "turn", "contact",
+    "push", "rebound", "poke", "peristalsis", "grasp", "cut",
+]  # fmt: skip
 
 DEFAULT_FRAMES = 200
 C3VD_DEPTH_SCALE_MM = 100.0 / 65535
@@ -30,7 +33,10 @@ class Event:
     black, blur, smoke, fluid : of the picture. instrument : one enters, works and leaves. turn : the camera turns by 30
     degrees and stays so, back with the next one; a cut where `first` is `last`. contact : the camera touches the wall
     and goes back. push : the tissue is pushed two ways and stays so. poke : the part on the right of the view alone is,
-    by 8 mm, half into the wall and half along it.
+    by 8 mm, half into the wall and half along it. rebound : a push that is let go after a third of the time, and swings
+    back. peristalsis : contractions travel along the view of the first frame. grasp : an instrument enters, holds the
+    tissue right of the middle, pulls it by 8 mm, lets go and leaves. cut : there a slit is cut, and gapes from then on.
+    veil : smoke that gathers, drifts and clears, before what is far more than before what is near.
     """
 
     kind: EventName
@@ -108,6 +114,7 @@ class PhantomSpec:
             "only the route wander goes with loop or path_file": self.route == "wander"
             or not (self.loop or self.path_file),
             "depth_scale_mm must be positive": self.depth_scale_mm > 0,
+            "a phantom has one cut at most": sum(event.kind == "cut" for event in self.events) <= 1,
             "a turn does not go with loop": not (self.loop and any(event.kind == "turn" for event in self.events)),
             "loop needs a generated path of at least 3 frames, not a path file": not self.loop
             or (self.path_file is None and (self.frames is None or self.frames >= 3)),

@@ -1,6 +1,10 @@
 """Write a phantom as a C3VD folder, with a calibration file and the true surface beside the frames.
 
-0000_color.png  0000_depth.tiff  pose.txt  camera.yaml  mesh_truth.ply  [mesh_truth/0000.ply]  phantom.json
+0000_color.png  0000_depth.tiff  pose.txt  camera.yaml  mesh_truth.ply  [mesh_truth/0000.ply]  displacement_truth.npz
+phantom.json
+
+`displacement_truth.npz` follows material points: `positions_mm` (frames, points, 3) float32, world mm, where points of
+the tissue that was seen, the same ones in all frames, are in each.
 """
 
 from __future__ import annotations
@@ -23,10 +27,21 @@ from scopemap.io.decoding import write_encoded
 from scopemap_bench.phantom.march import Volume
 from scopemap_bench.phantom.render import Phantom, prepare, render_frame
 from scopemap_bench.phantom.shading import VideoCoding
+from scopemap_bench.phantom.slit import crossed
 from scopemap_bench.phantom.spec import PhantomSpec
 
 CLIPPED = 65535
-_OWN_FILES = ("*_color.png", "*_depth.tiff", "pose.txt", "camera.yaml", "mesh_truth.ply", "mesh_truth/*.ply")
+DISPLACEMENT = "displacement_truth.npz"
+_OWN_FILES = (
+    "*_color.png",
+    "*_depth.tiff",
+    "pose.txt",
+    "camera.yaml",
+    "mesh_truth.ply",
+    "mesh_truth/*.ply",
+    DISPLACEMENT,
+)
+_FOLLOWED_POINTS = 1000
 _NEWTON_STEPS = 4
 _SEEN_MARGIN_VOXELS, _RIM_VOXELS = 2, 4
 
@@ -81,7 +96,12 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
             write_encoded(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
             if progress is not None:
                 progress(index + 1, len(phantom.poses))
-        _write_meshes(phantom, seen_surface(phantom.volume, seen), folder)
+        mesh = seen_surface(phantom.volume, seen)
+        # Nothing is stretched across a slit, at no time: meshes of all frames have the same faces.
+        parted = crossed(phantom.motion.at(len(phantom.poses)).slits, np.asarray(mesh.vertices), mesh.faces)
+        mesh.update_faces(~parted)
+        _write_meshes(phantom, mesh, folder)
+        np.savez_compressed(folder / DISPLACEMENT, positions_mm=_followed(phantom, np.asarray(mesh.vertices)))
     except OSError as error:
         raise InputError(f"cannot write the phantom to {folder}: {error}") from None
 
@@ -106,6 +126,13 @@ def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None
         for index in range(len(phantom.poses)):
             moved = phantom.motion.at(index).move(np.asarray(mesh.vertices))
             trimesh.Trimesh(moved, mesh.faces, process=False).export(folder / "mesh_truth" / f"{index:04d}.ply")
+
+
+def _followed(phantom: Phantom, rest_mm: np.ndarray) -> np.ndarray:
+    """Return where some of the rest points (N, 3) are in each frame, (frames, points, 3) float32."""
+    rng = np.random.default_rng((phantom.spec.seed, 6))
+    chosen = rest_mm[np.sort(rng.choice(len(rest_mm), min(_FOLLOWED_POINTS, len(rest_mm)), replace=False))]
+    return np.stack([phantom.motion.at(i).move(chosen) for i in range(len(phantom.poses))]).astype(np.float32)
 
 
 def _write_description(phantom: Phantom, file: Path) -> None:

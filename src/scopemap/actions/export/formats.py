@@ -12,7 +12,7 @@ from scopemap.actions.export.exported_run import ExportedRun, read_exported
 from scopemap.actions.export.image_layouts import write_colmap, write_endogslam, write_endonerf, write_nerfstudio
 from scopemap.actions.export.mcap_bag import write_mcap
 from scopemap.actions.export.points import write_gaussians, write_points
-from scopemap.actions.export.surfaces import Axes, write_glb, write_slicer, write_surface
+from scopemap.actions.export.surfaces import Axes, write_glb, write_slicer, write_surface, write_surfaces
 from scopemap.actions.export.trajectories import write_euroc_file, write_kitti_folder
 from scopemap.errors import InputError, SettingsError
 from scopemap.trajectory.trajectory import Unit, write_tum
@@ -47,6 +47,7 @@ FORMATS: dict[str, ExportFormat] = {
     "kitti": ExportFormat(lambda run, out, unit, axes: write_kitti_folder(run, out, unit), ("m", "mm")),
     "euroc": ExportFormat(lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv"),
     "ply": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".ply"),
+    "surfaces": ExportFormat(write_surfaces, ("mm", "m"), _ANY_AXES),
     "obj": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".obj"),
     "stl": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".stl"),
     "glb": ExportFormat(lambda run, out, unit, axes: write_glb(run, out), ("m",), ("gltf",), ".glb"),

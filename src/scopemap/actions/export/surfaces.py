@@ -60,6 +60,20 @@ def write_surface(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> None:
         file.write_text("".join(f"# {line}\n" for line in about) + text, encoding="utf-8")
 
 
+def write_surfaces(run: ExportedRun, folder: Path, unit: Unit, axes: Axes) -> None:
+    """Write the surface in the state of each tracked frame, as `000000.ply`, ..., named by the frame's number.
+
+    Raises `InputError` where the run has no surface, or its tissue is taken to be at rest.
+    """
+    if run.states is None:
+        raise InputError(f"{run.path}: its tissue is taken to be at rest; export its one surface as ply")
+    folder.mkdir(parents=True, exist_ok=True)
+    shown, about, R = _surface_of(run, unit, axes), _about(run, unit, axes), _R_FILE_WORLD[axes]
+    for index in run.trajectory.indices.tolist():
+        shown.vertices = run.states.moved(run.mesh, index).vertices @ R.T / MM_PER_UNIT[unit]
+        (folder / f"{index:06d}.ply").write_bytes(ply_bytes(shown, about))
+
+
 def stl_bytes(run: ExportedRun, unit: Unit, axes: Axes) -> bytes:
     """Return the mesh as binary STL. Raises `InputError` where the run has no surface."""
     content = trimesh.exchange.stl.export_stl(_surface_of(run, unit, axes))

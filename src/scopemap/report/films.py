@@ -1,0 +1,65 @@
+"""Films, and one of a run's surface that turns once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+
+from scopemap.errors import InputError, reporting
+from scopemap.io.run_folder import RunFolder
+from scopemap.report.measured_surface import MOST_FACES
+from scopemap.report.mesh_figures import ESTIMATE_COLOUR, draw_path, mesh_picture, view_of
+from scopemap.report.scale_bar import draw_scale_bar
+from scopemap.report.shown_mesh import simplified
+
+_FRAMES, _FRAMES_PER_S, _PITCH_RAD = 180, 24, -0.35
+_QUALITY_BITS = 4_000_000
+
+
+def write_film(file: Path, pictures: Iterable[np.ndarray], frames_per_s: int) -> None:
+    """Write pictures (H, W, 3) uint8 of one even size as .mp4 or .mkv, H.264, or as .webm; `InputError` if that fails.
+
+    Where making the pictures fails, no file is left.
+    """
+    try:
+        with reporting(f"cannot write {file}"), av.open(str(file), "w") as film:
+            stream = film.add_stream("libvpx-vp9" if file.suffix.lower() == ".webm" else "libx264", rate=frames_per_s)
+            stream.pix_fmt, stream.bit_rate = "yuv420p", _QUALITY_BITS
+            for number, picture in enumerate(pictures):
+                if number == 0:
+                    stream.height, stream.width = picture.shape[:2]
+                film.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+            film.mux(stream.encode())
+    except BaseException:
+        file.unlink(missing_ok=True)
+        raise
+
+
+def write_turntable(folder: Path | str, file: Path, frames: int = _FRAMES) -> None:
+    """Write a film of so many frames, 24 a second, in which a run's surface with the camera's path turns once.
+
+    The end of the file's name chooses its kind: .mp4, .mkv or .webm. With a scale bar where sizes are known.
+
+    Raises `InputError` where the folder holds no finished run or no surface, or the film cannot be written.
+    """
+    run = RunFolder(folder).checked()
+    if not len(run.mesh.faces):
+        raise InputError(f"{folder}: the run has no surface to turn")
+    write_film(file, _turning(run, frames), _FRAMES_PER_S)
+
+
+def _turning(run: RunFolder, frames: int) -> Iterator[np.ndarray]:
+    """Yield the pictures of a surface that turns once."""
+    mesh, poses = simplified(run.mesh, MOST_FACES), run.frames["T_world_camera"][run.frames.tracked]
+    points = np.concatenate([np.asarray(mesh.bounds), poses[:, :3, 3]])
+    centre, radius = (points.min(axis=0) + points.max(axis=0)) / 2, np.linalg.norm(np.ptp(points, axis=0)) / 2
+    for number in range(frames):
+        view = view_of(poses[0][:3, :3], centre, float(radius), 2 * np.pi * number / frames, _PITCH_RAD)
+        picture = mesh_picture(mesh, view)
+        draw_path(picture, view, poses[:, :3, 3], ESTIMATE_COLOUR)
+        if run.scale_known:
+            draw_scale_bar(picture, view.camera.fx / (4 * float(radius)), " at its middle")
+        yield picture

@@ -1,0 +1,67 @@
+"""Films of a run: the surface that turns, and the surface beside the video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from drawn_run import IN_RESULT, draw_run, wavering
+from front_door import call, refused
+
+from scopemap.actions.fly_through import smoothed_poses
+from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.report.films import write_turntable
+
+
+def pictures_of(film: Path) -> list[np.ndarray]:
+    with av.open(str(film)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+        return [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
+
+
+def test_the_surface_is_seen_beside_the_video(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    scale = {"known": True, "measured": True, "source": "measured depth"}
+    run, film = draw_run(tmp_path / "run", scale=scale), tmp_path / "out.mp4"
+    assert call("view", run, "--video", film) == 0
+    assert "out.mp4" in capfd.readouterr().out
+    pictures, (height, width) = pictures_of(film), (6 * 64, 6 * 80)
+    assert [picture.shape for picture in pictures] == [(height + 30, 2 * width, 3)] * IN_RESULT
+    for picture in pictures:
+        video, surface = picture[:height, :width], picture[:height, width:]
+        assert np.corrcoef(video.ravel(), surface.ravel())[0, 1] > 0.85
+    moving = draw_run(tmp_path / "moving", states=wavering(), scale=scale)
+    assert call("view", moving, "--video", film) == 0
+    changed = [np.abs(one - other).mean() for one, other in zip(pictures, pictures_of(film), strict=True)]
+    assert changed[3] < 1.2 < 3 < changed[-1]  # drawn in the state of frame 3
+    capfd.readouterr()
+    assert "cannot write" in refused(capfd, "view", run, "--video", tmp_path / "no" / "out.mp4")
+    (run / "frames" / "000004.jpg").unlink()
+    assert "frame" in refused(capfd, "view", run, "--video", film)
+    assert not film.exists()
+
+
+def test_a_shaken_path_is_smoothed_and_a_straight_one_stays() -> None:
+    time_s = np.arange(40) / 20
+    turns = [se3(so3_exp(np.array([0.0, 0.03 * k, 0.0])), np.array([0.5 * k, 0.0, k])) for k in range(40)]
+    straight = np.stack(turns)
+    inner = slice(15, 25)
+    assert smoothed_poses(straight, time_s) == pytest.approx(straight, abs=5e-3)
+    assert smoothed_poses(straight[:1], time_s[:1]) == pytest.approx(straight[:1])
+    rng = np.random.default_rng(2)
+    shaken = np.stack([T @ se3(so3_exp(rng.normal(0, 0.02, 3)), rng.normal(0, 1, 3)) for T in straight])
+    found = smoothed_poses(shaken, time_s)
+    assert np.abs(found - straight)[inner].max() < 0.6 * np.abs(shaken - straight)[inner].max()
+    assert found[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1) == pytest.approx(np.tile(np.eye(3), (40, 1, 1)))
+
+
+def test_a_turntable_is_a_film_of_the_surface(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    run, film = draw_run(tmp_path / "run"), tmp_path / "out.mp4"
+    write_turntable(run, film, frames=12)
+    with av.open(str(film)) as container:
+        pictures = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
+    assert [picture.shape for picture in pictures] == [(480, 480, 3)] * 12
+    assert all((picture.min(axis=2) < 200).mean() > 0.02 for picture in pictures)  # on white
+    assert np.abs(pictures[0] - pictures[3]).mean() > 3
+    assert "cannot write" in refused(capfd, "view", run, "--turntable", tmp_path / "no" / "out.mp4")
