@@ -11,13 +11,15 @@ masks, among usable pixels.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from scopemap.actions.against_video import RunFrames
-from scopemap.actions.inputs import open_input, open_truth
+from scopemap.actions.inputs import open_input
 from scopemap.masking.mask_files import MaskFiles
 from scopemap_bench.scripts import measuring
 
@@ -36,10 +38,9 @@ def fused_pixels(run: Path) -> dict[int, np.ndarray]:
         return found
 
 
-def tools(run: Path, source: Path) -> dict[int, np.ndarray]:
-    """Return which pixels (H, W) bool of a phantom's frames show an instrument, by number."""
-    seen = ((frame.index, truth) for frame, truth in open_truth(run, source))
-    return {index: ~(truth.depth_mm > 0) for index, truth in seen if truth is not None and truth.depth_mm is not None}
+def tools(source: Path, indices: Iterable[int]) -> dict[int, np.ndarray]:
+    """Return which pixels (H, W) bool of a phantom's frames show an instrument: 0 in its depth files, by number."""
+    return {n: np.asarray(cv2.imread(str(source / f"{n:04d}_depth.tiff"), cv2.IMREAD_UNCHANGED)) == 0 for n in indices}
 
 
 def print_phantom(scene: str, seed: int, folder: Path) -> None:
@@ -55,11 +56,11 @@ def print_phantom(scene: str, seed: int, folder: Path) -> None:
             fused[masks, name] = fused_pixels(run)
             figures = measuring.evaluated(run, "--truth", source, "--align", "sim3", "--depth", "none")
             errors.append(measuring.cell(figures, ".2f", "mesh_accuracy_mm"))
-        tool, every = tools(run, source), fused["files", "without"]
+        tool, every = tools(source, fused[masks, "with"]), fused["files", "without"]
         shares = []
         for name in METHODS:
             kept = fused[masks, name]
-            in_surface = sum((kept[index] & tool[index]).sum() for index in kept) / sum(tool[n].sum() for n in kept)
+            in_surface = sum((kept[n] & tool[n]).sum() for n in kept if n in tool) / sum(tool[n].sum() for n in tool)
             lost = [(every[n] & ~tool[n] & ~kept[n]).sum() for n in kept if n in every]
             tissue = [(every[n] & ~tool[n]).sum() for n in kept if n in every]
             shares.append((f"{in_surface:.1%}", f"{sum(lost) / sum(tissue):.1%}"))
