@@ -152,6 +152,12 @@ KINDS: dict[str, _Kind] = {
         "fusion: as seen at second {second:g} where tissue moves on its own, {where}",
         "",
     ),
+    "fusion-free-space": _Kind(
+        "note",
+        "fusion: {share:.1%} of the pixels, in {frames} frames, are left out: other frames look through there, or "
+        "instruments touch them",
+        "",
+    ),
     "fusion-in-one-state": _Kind(
         "info",
         "fusion: what was seen of moving tissue was moved into its state at second {second:.2f}; mesh_over_time.glb "

@@ -7,7 +7,7 @@ Tissue that moves is in the state of each frame.
 from __future__ import annotations
 
 import csv
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from scopemap.frame import Frame
 from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, lit_like
 from scopemap.fusion.finish import finished
 from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.free_space import FreeSpace, views_among
 from scopemap.fusion.reference_state import in_surface_state
 from scopemap.fusion.surface_fusion import SurfaceFusion
 from scopemap.geometry.rendering import Rendering, render_mesh, render_points
@@ -30,6 +31,7 @@ from scopemap.geometry.se3 import transform
 from scopemap.io import weights
 from scopemap.io.device import missing_packages
 from scopemap.io.run_folder import RunFolder
+from scopemap.notices import notices_of
 from scopemap.report.depth_figures import draw_renderings
 
 _HELD_OUT_EVERY = 10
@@ -100,11 +102,17 @@ class RunFrames:
         """Numbers of the frames: the tracked ones that are fused."""
         tracked = folder.frames.rows[folder.frames.tracked][:: fusion.every]
         pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
+        by_network = folder.config.mask.instruments == "auto"
         for frame in map(mask, sequence.frames()):
             if frame.index in pose_of and (depth_mm := depth.read(frame.index)) is not None:
                 sigma_mm, pose = depth.read_sigma(frame.index), pose_of[frame.index]
-                self._store.put(replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma_mm, T_world_camera=pose))
+                instruments = np.isnan(depth_mm) if by_network else None  # depth is unknown there
+                frame = replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma_mm, instruments=instruments)
+                self._store.put(replace(frame, T_world_camera=pose))
                 self.indices.append(frame.index)
+        left_out = any(notice.code == "fusion-free-space" for notice in notices_of(folder.provenance))
+        views = views_among(self.indices) if left_out else []
+        self._free_space = FreeSpace(self._store.frames(views))
 
     def close(self) -> None:
         """Delete the unnamed file."""
@@ -114,11 +122,15 @@ class RunFrames:
         """Return the surface of all frames but those with the given numbers."""
         fused = set(self.indices) - set(without)
         fusion = SurfaceFusion(self._fusion, self._store, corrected=True)
-        frames = self._store.frames(fused)
+        frames = self.frames(fused)
         if (states := self.states) is not None:
             frames = (in_surface_state(frame, states) for frame in frames)
         surface = fusion.fuse(frames, fused)
         return finished(surface.mesh, surface.settings)
+
+    def frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:
+        """Yield all frames or some, without what others look through."""
+        return map(self._free_space.without, self._store.frames(among))
 
     def agreement(self) -> SurfaceAgreement:
         """Return the agreement of the surface with the video; every tenth frame is kept out of fusion.
@@ -133,7 +145,7 @@ class RunFrames:
         perceptual = None if missing else create_perceptual("lpips")
         found = SurfaceAgreement(lpips_missing=missing)
         views: list[tuple[float, Frame, Rendering]] = []
-        for frame in self._store.frames():
+        for frame in self.frames():
             then = mesh if self.states is None else self.states.moved(mesh, frame.index)
             view, depth_mm = render_mesh(then, frame.camera, _pose(frame)), _usable_depth(frame)
             if self._fusion.colours == "albedo":
@@ -153,7 +165,7 @@ class RunFrames:
         """Return the points of the nearest frame that is fused, seen from a frame."""
         fused = (index for index in self.indices if index not in held_out)
         nearest = min(fused, key=lambda index: abs(index - frame.index), default=frame.index)
-        other = next(self._store.frames([nearest]))
+        other = next(self.frames([nearest]))
         depth_mm = _usable_depth(other)
         known = depth_mm > 0
         points_mm = transform(_pose(other), (other.camera.rays * depth_mm[..., None])[known])

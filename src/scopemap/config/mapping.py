@@ -69,10 +69,12 @@ class FusionConstants:
     truncation_share: float = 0.08  # of the pixel's depth, where that is larger than truncation_mm
     min_weight: float = 0.1  # voxels with less weight give no surface
     min_component_share: float = 0.02  # components with less than this share of the faces are removed
+    free_space: bool = True  # leave out what other frames look through, where frames are fused after the last one
 
 
 FUSION: dict[str, dict[str, Any]] = {
     "scopemap": {},
+    "no-free-space": {"free_space": False},
     "unweighted": {"weighted": False, "min_incidence": 0.0, "truncation_share": 0.0, "min_weight": 0.0},
     "all-components": {"min_component_share": 0.0},
     "well-seen": {"min_weight": 0.5},

@@ -35,7 +35,7 @@ _ENTRY = np.dtype(
         ("has_pose", np.int64),
         ("T_world_camera", np.float64, (4, 4)),
         ("offset", np.int64),
-        ("sizes", np.int64, (5,)),
+        ("sizes", np.int64, (6,)),
         ("crc", np.uint32),
         ("median_depth_mm", np.float64),
         ("nonrigidity", np.float32, REGIONS),
@@ -177,10 +177,11 @@ class FrameStore:
     def put(self, frame: Frame) -> None:
         """Store a frame. Raises `InputError` where the folder is full or read-only."""
         assert frame.depth_mm is not None
+        masks = frame.highlights, frame.instruments
         parts = [
             cv2.imencode(".jpg", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), _COLOUR_QUALITY)[1].tobytes(),
             np.packbits(frame.valid).tobytes(),
-            np.packbits(np.zeros_like(frame.valid) if frame.highlights is None else frame.highlights).tobytes(),
+            *(np.packbits(frame.valid & False if some is None else some).tobytes() for some in masks),
             *(_encoded(mm).tobytes() for mm in (frame.depth_mm, frame.depth_sigma_mm) if mm is not None),
         ]
         content, offset = b"".join(parts), self._images.size
@@ -265,7 +266,7 @@ class FrameStore:
         parts = [
             np.frombuffer(content, np.uint8, size, end - size) for size, end in zip(sizes, ends, strict=True) if size
         ]
-        colours, valid, highlights, depth, *sigma = parts
+        colours, valid, highlights, instruments, depth, *sigma = parts
         return Frame(
             int(entry["index"]),
             float(entry["time_s"]),
@@ -276,6 +277,7 @@ class FrameStore:
             entry["T_world_camera"] if entry["has_pose"] else None,
             depth_sigma_mm=_decoded(sigma[0], shape) if sigma else None,
             highlights=_bits(highlights, shape),
+            instruments=_bits(instruments, shape),
             nonrigidity=entry["nonrigidity"].copy(),
             quality=float(entry["quality"]),
         )

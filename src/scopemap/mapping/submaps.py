@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -237,11 +237,20 @@ class FinalFrames:
         adjusted = submap.correction.index.tolist() if rigid and submap.correction is not None else []
         self.keyframes = [index for index in adjusted if index in self.T_world_camera]
 
-    def frames(self, triangulated: TriangulatedDepths | None) -> Iterator[Frame]:
-        """Yield the frames, with triangulated depth where there is one."""
-        for index in self.T_world_camera:
+    def frames(
+        self,
+        triangulated: TriangulatedDepths | None,
+        without: Callable[[Frame], Frame] = lambda frame: frame,
+        among: Iterable[int] | None = None,
+    ) -> Iterator[Frame]:
+        """Yield the frames, with triangulated depth where there is one.
+
+        without : returns a frame without the pixels that show no tissue. among : numbers of the frames; None: all.
+        """
+        for index in self.T_world_camera if among is None else among:
             frame = corrected_frame(self._read(index), self._correction)
             found = None if triangulated is None else triangulated(index, _usable_depth_mm(frame))
+            frame = without(frame)
             if found is not None:
                 # The factor, not the depth: pixels that are masked keep a depth, too.
                 _, sigma, log_factor = found

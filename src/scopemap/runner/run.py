@@ -17,6 +17,7 @@ from numba.core.event import TimingListener, register
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import surface_agreement, vertex_sigmas
 from scopemap.fusion.finish import finished
+from scopemap.fusion.free_space import FreeSpace, views_among
 from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
 from scopemap.fusion.reference_state import SurfaceState
 from scopemap.fusion.surface_fusion import FusedSurface, depth_notices
@@ -201,7 +202,10 @@ class _Finishing:
         states = _states(submap, frames.only(frames.tracked), at_s)
         depths = self._triangulated_depths(final)
         with closing(depths) if depths is not None else nullcontext():
-            corrected = in_thread(final.frames(None if depths is None else depths.depth), "correct")
+            views = views_among(list(final.T_world_camera)) if config.fusion.constants.free_space else []
+            free_space: FreeSpace = self.run.clock.timed("free space", FreeSpace, final.frames(None, among=views))
+            triangulated = None if depths is None else depths.depth
+            corrected = in_thread(final.frames(triangulated, free_space.without), "correct")
             # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
             median_mm = store.median_depth_mm(submap.main_frames)
             moving = MovingTissue(block_edge_mm(median_mm))
@@ -225,6 +229,7 @@ class _Finishing:
         notices = self.notices + motion_notices(frames, config)
         notices += [] if submap.correction is None else submap.correction.notices
         notices += [part.notice for part in (state, depths) if part is not None] + fused.notices
+        notices += [] if free_space.notice is None else [free_space.notice]
         masks, known_mm = pipeline.estimators.masks, self.frames["median_depth_mm"]
         notices += [] if masks is None else masks.notices
         medians_mm = known_mm[np.isfinite(known_mm)].tolist() if median_mm is None else [median_mm]
