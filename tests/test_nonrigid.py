@@ -11,6 +11,7 @@ from drawn_bundle import FOCAL_PX, tracked
 from scopemap.geometry.align import umeyama
 from scopemap.geometry.se3 import inverse, se3_exp, transform
 from scopemap.mapping import FrameCorrection
+from scopemap.mapping.bundle_adjustment import PER_KEYFRAME as PER_KEYFRAME_UNKNOWNS
 from scopemap.mapping.bundle_adjustment import adjust, errors_px
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
 from scopemap.mapping.deformation_graph import MotionPrior, hat_functions, periodic_rate, skin_of, spread_nodes
@@ -127,30 +128,36 @@ def test_few_and_many_keyframes_are_not_tried(keyframes: int) -> None:
     assert adjust_moving_tissue(replace(problem, T_camera_world=T, observations=some)) is None
 
 
-def _small() -> tuple[NonRigidProblem, NonRigidState]:
-    """A problem with 8 nodes and 4 curves, away from its solution."""
+def _small(curves: int) -> tuple[NonRigidProblem, NonRigidState]:
+    """A problem with 8 nodes and as many curves, away from its solution."""
     rigid, true = _scene(BREATH)
     nodes, rng = spread_nodes(true[:, 0], 8), np.random.default_rng(2)
-    basis, at_host = hat_functions(KEYFRAMES, 4), true[np.arange(len(true)), rigid.points.host]
+    basis = hat_functions(KEYFRAMES, curves) if curves > 1 else BREATH[:, None]
+    at_host = true[np.arange(len(true)), rigid.points.host]
     prior = MotionPrior(0.1, 0.03, 0.01).normal_matrix(nodes, basis, rigid.unit_mm)
     problem = NonRigidProblem(rigid, nodes, basis, skin_of(nodes, at_host), prior)
     state = rigid.tracked._replace(sigma_px=0.7, log_scale=rng.normal(0, 0.02, KEYFRAMES))
-    return problem, NonRigidState(state, rng.normal(0, 0.5, (4, 8, 3)))
+    start = basis if curves > 1 else basis + rng.normal(0, 0.05, basis.shape)
+    return problem, NonRigidState(state, rng.normal(0, 0.5, (curves, 8, 3)), start)
 
 
-def test_the_gradient_is_that_of_the_cost() -> None:
-    problem, state = _small()
+@pytest.mark.parametrize("curves", [1, 4])
+def test_the_gradient_is_that_of_the_cost(curves: int) -> None:
+    problem, state = _small(curves)
     model, rng = NonRigidModel(problem, state), np.random.default_rng(3)
-    parts = [slice(6, 112), slice(112, 112 + 96), slice(208, None)]  # keyframes, modes, points
-    for part in parts:
+    keyframes, modes = PER_KEYFRAME_UNKNOWNS * KEYFRAMES, 24 * curves
+    curve = KEYFRAMES if curves == 1 else 0  # several are given
+    bounds = np.cumsum([6, keyframes - 6, modes, curve])
+    for first, end in zip(bounds, [*bounds[1:], None], strict=True):
         step = np.zeros(len(model.gradient))
-        step[part] = rng.normal(size=len(step[part]))
+        step[first:end] = rng.normal(size=len(step[first:end]))
         ahead, behind = (NonRigidModel(problem, _retract(problem, state, s * step)).cost for s in (1e-6, -1e-6))
         assert (ahead - behind) / 2e-6 == pytest.approx(model.gradient @ step, rel=1e-4)
 
 
-def test_the_step_without_points_solves_the_normal_equations_of_all_unknowns() -> None:
-    model = NonRigidModel(*_small())
+@pytest.mark.parametrize("curves", [1, 4])
+def test_the_step_without_points_solves_the_normal_equations_of_all_unknowns(curves: int) -> None:
+    model = NonRigidModel(*_small(curves))
     step, rng = model.gauss_newton_step(), np.random.default_rng(4)
     assert model.curvature(step) == pytest.approx(-model.gradient @ step, rel=1e-5)
     other = rng.normal(size=len(step)) * np.abs(step).max()

@@ -89,15 +89,15 @@ def adjust_moving_tissue(problem: BundleProblem) -> NonRigidSolution | None:
     nodes = spread_nodes(_in_world(inside, inside.tracked), _NODES)
     curve = _curve(inside, nodes[:_CURVE_NODES])  # far from each other, too
     state = _with_curve(inside, nodes, curve)
-    left_out = _compared(_part(problem, outside & seen), rigid, state, Deformation(nodes, curve, state.modes))
+    left_out = _compared(_part(problem, outside & seen), rigid, state, nodes)
     if not left_out.accepts:
         return None
     state = _with_curve(problem, nodes, curve)
-    motion = _problem(problem, nodes, curve, _ONE_CURVE).moved(state.modes)
+    motion = _problem(problem, nodes, curve, _ONE_CURVE).moved(state.modes, state.basis)
     T = np.stack([orthonormalised(pose) for pose in state.rigid.T_camera_world])
     final = with_points(problem, state.rigid._replace(T_camera_world=T), motion)
     found = BundleSolution(final, log_depth_sigma(problem, final, motion), 0)
-    return NonRigidSolution(found, Deformation(nodes, curve, state.modes), left_out)
+    return NonRigidSolution(found, Deformation(nodes, state.basis, state.modes), left_out)
 
 
 def _curve(problem: BundleProblem, nodes: np.ndarray) -> np.ndarray:
@@ -125,12 +125,12 @@ def _problem(rigid: BundleProblem, nodes: np.ndarray, basis: np.ndarray, prior: 
 def _solved(problem: NonRigidProblem) -> NonRigidState:
     """Return the solution from the poses as tracked, and from tissue at rest."""
     at_rest = np.zeros((problem.basis.shape[1], len(problem.nodes), 3))
-    return solve(problem, NonRigidState(problem.rigid.tracked, at_rest))
+    return solve(problem, NonRigidState(problem.rigid.tracked, at_rest, problem.basis))
 
 
-def _compared(part: BundleProblem, rigid: State, state: NonRigidState, deformation: Deformation) -> LeftOutTracks:
+def _compared(part: BundleProblem, rigid: State, state: NonRigidState, nodes: np.ndarray) -> LeftOutTracks:
     """Return the errors of points that were left out, in the keyframes of two solutions."""
-    moving = _problem(part, deformation.nodes, deformation.basis, _ONE_CURVE).moved(state.modes)
+    moving = _problem(part, nodes, state.basis, _ONE_CURVE).moved(state.modes, state.basis)
     (rigid_px, rigid_wrong), (px, wrong) = (
         _errors(part, keyframes, moved) for keyframes, moved in ((rigid, np.zeros_like(moving)), (state.rigid, moving))
     )
