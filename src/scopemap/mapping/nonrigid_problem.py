@@ -265,6 +265,8 @@ def _add_points(
                 if change == 0:
                     continue
                 for j in range(skin.node.shape[1]):
+                    if skin.weight[p, j] == 0:
+                        continue
                     for axis in range(3):
                         columns[used] = first + (axis * curves + curve) * nodes + skin.node[p, j]
                         row[:, used] = change * skin.weight[p, j] * linear.by_world[k, :, axis]
