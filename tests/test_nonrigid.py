@@ -82,9 +82,13 @@ def _shape_error_mm(points: np.ndarray, true: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(umeyama(points, true, True).transform_points(points) - true, axis=-1)))
 
 
+def _adjusted(problem: BundleProblem) -> NonRigidSolution | None:
+    return adjust_moving_tissue(problem, adjust(problem).state, np.arange(len(problem.T_camera_world)) / 2)
+
+
 @pytest.fixture(scope="module")
 def breathing() -> NonRigidSolution:
-    found = adjust_moving_tissue(_scene(BREATH)[0])
+    found = _adjusted(_scene(BREATH)[0])
     assert found is not None
     return found
 
@@ -109,13 +113,13 @@ def test_tissue_that_breathes_is_recovered_with_its_curve_and_shape(breathing: N
 
 def test_tissue_at_rest_is_left_to_the_rigid_adjustment_whatever_the_matches_are() -> None:
     still, _ = _scene(0 * BREATH)
-    assert adjust_moving_tissue(still) is None
+    assert _adjusted(still) is None
     # False matches and noise take the shortcuts away: tracks left out refuse it.
     wrong, _ = _scene(0 * BREATH, false_share=0.15, noise_px=0.6)
     rigid = adjust(wrong).state
     assert rigid.sigma_px > 0.4
     assert (errors_px(wrong, rigid) > 2).mean() > 0.05
-    assert adjust_moving_tissue(wrong) is None
+    assert _adjusted(wrong) is None
 
 
 @pytest.mark.parametrize("keyframes", [5, 61])
@@ -125,7 +129,8 @@ def test_few_and_many_keyframes_are_not_tried(keyframes: int) -> None:
     kept = (problem.points.host[problem.observations.point] < 5) & (problem.observations.keyframe < 5)
     seen = problem.observations
     some = seen if keyframes > 60 else Observations(seen.point[kept], seen.keyframe[kept], seen.pixel[kept])
-    assert adjust_moving_tissue(replace(problem, T_camera_world=T, observations=some)) is None
+    many = replace(problem, T_camera_world=T, observations=some)
+    assert adjust_moving_tissue(many, problem.tracked._replace(sigma_px=1.0), np.arange(keyframes) / 2) is None
 
 
 def _small(curves: int) -> tuple[NonRigidProblem, NonRigidState]:
