@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from scopemap.mapping.bundle_adjustment import PER_KEYFRAME as PER_KEYFRAME_UNKN
 from scopemap.mapping.bundle_adjustment import adjust, errors_px
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
 from scopemap.mapping.deformation_graph import MotionPrior, hat_functions, periodic_rate, skin_of, spread_nodes
+from scopemap.mapping.motion_ambiguity import camera_without_curve
 from scopemap.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
 from scopemap.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
 from scopemap.mapping.pose_interpolation import TissueMotion
@@ -31,7 +33,18 @@ def _moved(rest: np.ndarray, breath: float) -> np.ndarray:
     return rest + breath * np.column_stack([0.5 * np.cos(y), 4 * np.sin(1.3 * x), 1.5 * np.cos(x + y)])
 
 
-def _scene(curve: np.ndarray, false_share: float = 0.0, noise_px: float = NOISE_PX) -> tuple[BundleProblem, np.ndarray]:
+def _poked(rest: np.ndarray, share: float) -> np.ndarray:
+    """Tissue (n, 3) mm that is pushed by 5 mm at one place, and at rest 12 mm from it."""
+    near = np.exp(-((rest[:, :2] - [7, -5]) ** 2).sum(1) / 50)
+    return rest + share * near[:, None] * [3.0, 2.0, 3.5]
+
+
+def _scene(
+    curve: np.ndarray,
+    false_share: float = 0.0,
+    noise_px: float = NOISE_PX,
+    moved: Callable[[np.ndarray, float], np.ndarray] = _moved,
+) -> tuple[BundleProblem, np.ndarray]:
     """A bundle problem with wrong depth and nearly right poses, and the true points (P, K, 3) over time."""
     rng = np.random.default_rng(5)
     twists = [
@@ -42,7 +55,7 @@ def _scene(curve: np.ndarray, false_share: float = 0.0, noise_px: float = NOISE_
     # Of all tissue at rest each keyframe sees other points.
     flat = rng.uniform(-22, 22, (KEYFRAMES * PER_KEYFRAME, 2))
     rest = np.column_stack([flat, 42 + 5 * np.sin(flat[:, 0] / 9) * np.cos(flat[:, 1] / 7)])
-    over_time = np.stack([_moved(rest, breath) for breath in curve], 1)
+    over_time = np.stack([moved(rest, breath) for breath in curve], 1)
     host, seen = np.repeat(np.arange(KEYFRAMES), PER_KEYFRAME), []
     pixel, depth = np.empty((len(host), 2)), np.empty(len(host))
     for p, h in enumerate(host):
@@ -71,7 +84,8 @@ def _over_time(problem: BundleProblem, found: NonRigidSolution) -> np.ndarray:
         return np.stack([transform(inverse(T_camera_world[h]), each) for h, each in zip(points.host, x, strict=True)])
 
     state, motion, host = found.found.state, found.deformation, problem.points.host
-    skin = skin_of(motion.nodes, in_world(problem.T_camera_world, problem.points.log_depth))
+    begin = problem.begin
+    skin = skin_of(motion.nodes, in_world(begin.T_camera_world, begin.log_depth))
     number, at_host = np.arange(len(host)), in_world(state.T_camera_world, state.log_depth)
     moved = [skin.moved(motion.displacement, number, host, np.full(len(host), k)) for k in range(KEYFRAMES)]
     return at_host[:, None] + np.stack(moved, 1)
@@ -109,6 +123,51 @@ def test_tissue_that_breathes_is_recovered_with_its_curve_and_shape(breathing: N
     assert errors[0] < 2.0
     assert errors[0] < errors[1] / 2
     assert np.isfinite(found.found.log_depth_sigma).all()
+
+
+def test_beside_a_core_at_rest_the_part_that_moves_is_found() -> None:
+    problem, true = _scene(np.clip((np.arange(KEYFRAMES) - 5) / 5, 0, 1), moved=_poked)
+    rigid = adjust(problem).state
+    assert rigid.sigma_px < 0.4
+    found = _adjusted(problem)
+    assert found is not None
+    moving = np.linalg.norm(found.deformation.modes[0], axis=1) > 0
+    assert 0 < moving.sum() < 30
+    at = np.linalg.norm(found.deformation.nodes[:, :2] - [7, -5], axis=1)
+    assert at[moving].mean() < 10 < at[~moving].mean()
+    started = replace(problem, start=rigid)
+    held = found._replace(
+        found=found.found._replace(state=rigid), deformation=replace(found.deformation, modes=np.zeros((1, 60, 3)))
+    )
+    near = np.linalg.norm(true[:, 0, :2] - [7, -5], axis=1) < 6
+    errors = [
+        np.linalg.norm(points - true, axis=-1)[near].mean()
+        for points in (_over_time(started, found), _over_time(started, held))
+    ]
+    assert errors[0] < 0.6 * errors[1]
+
+
+def test_a_camera_does_not_breathe_with_the_tissue() -> None:
+    rng, time_s = np.random.default_rng(6), np.arange(20) / 2
+    breath, nodes = np.sin(2 * np.pi * time_s / 4), rng.uniform([-20, -20, 25], [20, 20, 65], (60, 3))
+    mode = rng.normal(0, 1.5, nodes.shape)
+    smooth = np.column_stack(
+        [0.1 * np.sin(time_s / 7), 0 * time_s, 0 * time_s, 5 * np.cos(time_s / 9), time_s, 0 * time_s]
+    )
+    path = np.stack([se3_exp(twist) for twist in smooth])
+    common = np.array([0.01, -0.02, 0.015, 1.0, -0.5, 0.8])
+    about = np.eye(4)
+    about[:3, 3] = nodes.mean(0)
+    with_breath = np.stack([about @ se3_exp(share * common) @ inverse(about) for share in breath]) @ path
+    moved = mode + np.cross(common[:3], nodes - nodes.mean(0)) + common[3:]
+    T_world_world, without = camera_without_curve(with_breath, time_s, breath, nodes, moved, 2.5)
+    before, after = (
+        np.linalg.norm((T - path)[:, :3, 3], axis=1).max() for T in (with_breath, T_world_world @ with_breath)
+    )
+    assert after < 0.1 < 1.0 < before
+    assert np.abs(without - mode).max() < 0.2
+    unchanged, _ = camera_without_curve(path, time_s, breath, nodes, mode, 2.5)
+    assert np.abs((unchanged @ path - path)[:, :3, 3]).max() < 0.1
 
 
 def test_tissue_at_rest_is_left_to_the_rigid_adjustment_whatever_the_matches_are() -> None:

@@ -16,7 +16,12 @@ _LEAST_GAP_S = 1e-3
 
 
 def camera_without_curve(
-    T_world_camera: np.ndarray, time_s: np.ndarray, curve: np.ndarray, nodes: np.ndarray, mode: np.ndarray, size_mm: float
+    T_world_camera: np.ndarray,
+    time_s: np.ndarray,
+    curve: np.ndarray,
+    nodes: np.ndarray,
+    mode: np.ndarray,
+    size_mm: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the motion (K, 4, 4) of the world without which poses do not follow the curve (K,), and the mode with it.
 

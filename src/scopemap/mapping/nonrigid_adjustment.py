@@ -19,7 +19,7 @@ import numpy as np
 
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse, orthonormalised
-from scopemap.mapping.bundle_adjustment import BundleSolution, adjust, errors_px, log_depth_sigma, with_points
+from scopemap.mapping.bundle_adjustment import BundleSolution, errors_px, log_depth_sigma, with_points
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, State, reproject
 from scopemap.mapping.deformation_graph import (
     Deformation,
