@@ -192,26 +192,22 @@ def test_few_and_many_keyframes_are_not_tried(keyframes: int) -> None:
     assert adjust_moving_tissue(many, problem.tracked._replace(sigma_px=1.0), np.arange(keyframes) / 2) is None
 
 
-def _small(curves: int) -> tuple[NonRigidProblem, NonRigidState]:
-    """A problem with 8 nodes and as many curves, away from its solution."""
+def _small(free: bool) -> tuple[NonRigidProblem, NonRigidState]:
+    """A problem with 8 nodes and 3 curves, free or given, away from its solution."""
     rigid, true = _scene(BREATH)
     nodes, rng = spread_nodes(true[:, 0], 8), np.random.default_rng(2)
-    basis = hat_functions(KEYFRAMES, curves) if curves > 1 else BREATH[:, None]
-    at_host = true[np.arange(len(true)), rigid.points.host]
+    basis, at_host = hat_functions(KEYFRAMES, 3), true[np.arange(len(true)), rigid.points.host]
     prior = MotionPrior(0.1, 0.03, 0.01).normal_matrix(nodes, basis, rigid.unit_mm)
-    problem = NonRigidProblem(rigid, nodes, basis, skin_of(nodes, at_host), prior)
+    problem = NonRigidProblem(rigid, nodes, basis, skin_of(nodes, at_host), prior, free)
     state = rigid.tracked._replace(sigma_px=0.7, log_scale=rng.normal(0, 0.02, KEYFRAMES))
-    start = basis if curves > 1 else basis + rng.normal(0, 0.05, basis.shape)
-    return problem, NonRigidState(state, rng.normal(0, 0.5, (curves, 8, 3)), start)
+    return problem, NonRigidState(state, rng.normal(0, 0.5, (3, 8, 3)), basis + free * rng.normal(0, 0.05, basis.shape))
 
 
-@pytest.mark.parametrize("curves", [1, 4])
-def test_the_gradient_is_that_of_the_cost(curves: int) -> None:
-    problem, state = _small(curves)
+@pytest.mark.parametrize("free", [False, True])
+def test_the_gradient_is_that_of_the_cost(free: bool) -> None:
+    problem, state = _small(free)
     model, rng = NonRigidModel(problem, state), np.random.default_rng(3)
-    keyframes, modes = PER_KEYFRAME_UNKNOWNS * KEYFRAMES, 24 * curves
-    curve = KEYFRAMES if curves == 1 else 0  # several are given
-    bounds = np.cumsum([6, keyframes - 6, modes, curve])
+    bounds = np.cumsum([6, PER_KEYFRAME_UNKNOWNS * KEYFRAMES - 6, 72, problem.curve_unknowns])  # then points
     for first, end in zip(bounds, [*bounds[1:], None], strict=True):
         step = np.zeros(len(model.gradient))
         step[first:end] = rng.normal(size=len(step[first:end]))
@@ -219,9 +215,9 @@ def test_the_gradient_is_that_of_the_cost(curves: int) -> None:
         assert (ahead - behind) / 2e-6 == pytest.approx(model.gradient @ step, rel=1e-4)
 
 
-@pytest.mark.parametrize("curves", [1, 4])
-def test_the_step_without_points_solves_the_normal_equations_of_all_unknowns(curves: int) -> None:
-    model = NonRigidModel(*_small(curves))
+@pytest.mark.parametrize("free", [False, True])
+def test_the_step_without_points_solves_the_normal_equations_of_all_unknowns(free: bool) -> None:
+    model = NonRigidModel(*_small(free))
     step, rng = model.gauss_newton_step(), np.random.default_rng(4)
     assert model.curvature(step) == pytest.approx(-model.gradient @ step, rel=1e-5)
     other = rng.normal(size=len(step)) * np.abs(step).max()

@@ -125,12 +125,15 @@ def hat_functions(count: int, most: int) -> np.ndarray:
     return np.maximum(1 - np.abs(np.arange(count)[:, None] - knots) / spacing, 0.0)
 
 
-def first_mode(displacement: np.ndarray) -> np.ndarray:
-    """Return the curve (K, 1), at most 1, of the first singular vector of displacements (K, N, 3) less their mean."""
+def first_modes(displacement: np.ndarray, most: int) -> np.ndarray:
+    """Return the curves (K, L) of the first singular vectors of displacements (K, N, 3) less their mean.
+
+    The largest value is 1; each curve is as large, against the first, as its share of the displacement.
+    """
     flat = displacement.reshape(len(displacement), -1)
-    curve = np.linalg.svd(flat - flat.mean(0), full_matrices=False)[0][:, :1]
-    largest: np.ndarray = curve / np.abs(curve).max()
-    return largest
+    left, size, _ = np.linalg.svd(flat - flat.mean(0), full_matrices=False)
+    curves: np.ndarray = left[:, :most] * size[:most]
+    return curves / np.abs(curves).max()
 
 
 def periodic_rate(time_s: np.ndarray, curve: np.ndarray) -> float:

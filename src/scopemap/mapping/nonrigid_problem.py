@@ -1,8 +1,8 @@
-"""Bundle adjustment with tissue that moves: the rigid problem, modes of a deformation graph, and a single curve.
+"""Bundle adjustment with tissue that moves: the rigid problem, and modes and curves of a deformation graph.
 
-To the cost of `bundle_adjustment` come the priors of the modes and of the curve. Unknowns of the reduced system are
-those of the keyframes, the modes, axis by axis, and the curve where there is one; several curves are given. Points are
-eliminated one by one, since each touches few nodes.
+To the cost of `bundle_adjustment` come the priors of the modes and of the curves. Unknowns of the reduced system are
+those of the keyframes, the modes, axis by axis, and the curves unless they are given. Points are eliminated one by one,
+since each touches few nodes.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from scopemap.mapping.deformation_graph import Deformation, Skin
 
 _RIDGE = 1e-9  # of the diagonal
 _MAX_ITERATIONS, _MIN_DECREASE = 20, 1e-3
-_CURVE_SIGMA = 0.3  # prior standard deviation of a single curve, whose largest value is 1
+_CURVE_SIGMA = 0.3  # prior standard deviation of a curve, whose largest value is 1
 
 
 @dataclass(frozen=True)
 class NonRigidProblem:
     """What is adjusted: `rigid`, and the modes of a deformation with these nodes (N, 3) and curves `basis` (K, L).
 
-    A single curve is adjusted, near `basis`. skin : of the points of `rigid`. prior : (L N, L N), normal matrix of one
-    axis of the modes.
+    skin : of the points of `rigid`. prior : (L N, L N), normal matrix of one axis of the modes. free : whether the
+    curves are adjusted, near `basis`.
     """
 
     rigid: BundleProblem
@@ -48,6 +48,12 @@ class NonRigidProblem:
     basis: np.ndarray
     skin: Skin
     prior: sparse.csr_matrix
+    free: bool = False
+
+    @property
+    def curve_unknowns(self) -> int:
+        """Number of unknowns of the curves, curve by curve."""
+        return self.basis.size if self.free else 0
 
     def moved(self, modes: np.ndarray, basis: np.ndarray) -> np.ndarray:
         """Return by how much (N, 3) mm the point of each observation has moved since its host saw it."""
@@ -81,14 +87,10 @@ def solve(problem: NonRigidProblem, start: NonRigidState) -> NonRigidState:
 def _retract(problem: NonRigidProblem, state: NonRigidState, step: np.ndarray) -> NonRigidState:
     first = PER_KEYFRAME * len(state.rigid.T_camera_world)
     end = first + state.modes.size
-    last = end + _curve_unknowns(state)
+    last = end + problem.curve_unknowns
     rigid = retract(problem.rigid, state.rigid, np.append(step[:first], step[last:]))
-    basis = state.basis + step[end:last, None] if last > end else state.basis
+    basis = state.basis + step[end:last].reshape(state.basis.T.shape).T if problem.free else state.basis
     return NonRigidState(rigid, state.modes + _modes_of(step[first:end], state.modes.shape), basis)
-
-
-def _curve_unknowns(state: NonRigidState) -> int:
-    return len(state.basis) if state.basis.shape[1] == 1 else 0
 
 
 def _modes_of(unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -104,7 +106,7 @@ class _Linear(NamedTuple):
     by_host: np.ndarray  # (N, 2, 6)
     by_depth: np.ndarray  # (N, 2)
     by_world: np.ndarray  # (N, 2, 3), px / mm of the point's motion in the world
-    by_curve: np.ndarray  # (N, 2), px, by the observing keyframe's value of the first curve
+    by_curve: np.ndarray  # (N, 2, L), px, by the observing keyframe's values of the curves
     weight: np.ndarray  # (N,)
     off: np.ndarray  # (P,)
     held: np.ndarray  # (P,)
@@ -117,13 +119,13 @@ class NonRigidModel:
         self._problem, self._state, rigid = problem, state, problem.rigid
         self._first = PER_KEYFRAME * len(state.rigid.T_camera_world)
         self._end = self._first + state.modes.size
-        self._unknowns = self._end + _curve_unknowns(state)
+        self._unknowns = self._end + problem.curve_unknowns
         self._modes = state.modes.transpose(2, 0, 1).reshape(3, -1)
         self._seen: Reprojection = reproject(rigid, state.rigid, problem.moved(state.modes, state.basis))
         self._edges = odometry_edges(rigid, state.rigid)
         self._off = state.rigid.log_depth - rigid.points.log_depth - state.rigid.log_scale[rigid.points.host]
         self.cost = cost(rigid, state.rigid, self._seen, self._edges) + 0.5 * self._stiffness(self._modes)
-        if self._unknowns > self._end:
+        if problem.free:
             self.cost += 0.5 * float((((state.basis - problem.basis) / _CURVE_SIGMA) ** 2).sum())
 
     def _stiffness(self, modes: np.ndarray) -> float:
@@ -138,17 +140,19 @@ class NonRigidModel:
         held = cauchy((self._off / rigid.points.sigma) ** 2, CAUCHY)[1] / rigid.points.sigma**2
         weight = weights(state, self._seen) / rigid.correlated
         node, share = self._problem.skin.node, self._problem.skin.weight
-        first_mode = np.einsum("pj,pjc->pc", share, self._state.modes[0, node])
-        by_curve = np.einsum("nij,nj->ni", by_world, first_mode[rigid.observations.point])
+        # Of a basis that is given there are many curves, whose derivatives nobody needs.
+        modes = self._state.modes if self._problem.free else self._state.modes[:1]
+        at_points = np.einsum("pj,lpjc->pcl", share, modes[:, node])
+        by_curve = np.einsum("nij,njl->nil", by_world, at_points[rigid.observations.point])
         return _Linear(self._seen.error, by_camera, by_host, by_depth, by_world, by_curve, weight, self._off, held)
 
     @cached_property
     def _priors(self) -> list[CameraBlock]:
         blocks = camera_blocks(self._problem.rigid, self._state.rigid, self._edges)
-        if count := self._unknowns - self._end:
-            off = (self._state.basis - self._problem.basis)[:, 0] / _CURVE_SIGMA**2
+        if self._problem.free:
+            off = (self._state.basis - self._problem.basis).T.ravel() / _CURVE_SIGMA**2
             own = np.arange(self._end, self._unknowns)
-            blocks.append(CameraBlock(own, np.identity(count) / _CURVE_SIGMA**2, off))
+            blocks.append(CameraBlock(own, np.identity(len(own)) / _CURVE_SIGMA**2, off))
         return blocks
 
     def _change(self, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,8 +162,9 @@ class NonRigidModel:
         host = rigid.points.host[rigid.observations.point]
         modes = _modes_of(step[self._first : self._end], self._state.modes.shape)
         moved = self._problem.moved(modes, self._state.basis)
-        if self._unknowns > self._end:
-            moved += self._problem.moved(self._state.modes, step[self._end : self._unknowns, None])
+        if self._problem.free:
+            basis = step[self._end : self._unknowns].reshape(self._state.basis.T.shape).T
+            moved += self._problem.moved(self._state.modes, basis)
         change = np.einsum("nij,nj->ni", linear.by_camera, own[rigid.observations.keyframe, :6])
         change += np.einsum("nij,nj->ni", linear.by_host, own[host, :6])
         return change + np.einsum("nij,nj->ni", linear.by_world, moved), own[rigid.points.host, 6]
@@ -183,8 +188,8 @@ class NonRigidModel:
         modes = np.einsum("kl,knc->cln", self._state.basis, nodes).reshape(3, -1)
         modes += (self._problem.prior @ self._modes.T).T
         depth = np.bincount(seen.point, (linear.by_depth * error).sum(1), len(held)) + held
-        curve = np.einsum("knc,nc->k", nodes, self._state.modes[0])[: self._unknowns - self._end]
-        gradient = np.concatenate([own.ravel(), modes.ravel(), curve, depth])
+        basis = np.einsum("knc,lnc->lk", nodes, self._state.modes) if self._problem.free else np.zeros(0)
+        gradient = np.concatenate([own.ravel(), modes.ravel(), basis.ravel(), depth])
         for prior in self._priors:
             gradient[prior.columns] += prior.b
         gradient[:6] = 0
@@ -241,11 +246,12 @@ class _Ends(NamedTuple):
 def _add_points(
     matrix: np.ndarray, rhs: np.ndarray, ends: _Ends, linear: _Linear, skin: Skin, basis: np.ndarray, nodes: int
 ) -> None:
-    """Add the normal equations of keyframes, modes and curve, without the points, to matrix and right-hand side."""
+    """Add the normal equations of keyframes, modes and curves, without the points, to matrix and right-hand side."""
     curves, size = basis.shape[1], len(rhs)
     first = PER_KEYFRAME * len(basis)
     end = first + 3 * curves * nodes
-    most = 14 + 3 * curves * skin.node.shape[1]
+    free = curves if size > end else 0
+    most = 12 + 3 * curves * skin.node.shape[1] + 2 * free
     columns, row = np.empty(most, np.int64), np.empty((2, most))
     E, touched, known = np.zeros(size), np.empty(size, np.int64), np.zeros(size, np.bool_)
     for p in range(len(ends.host)):
@@ -271,9 +277,10 @@ def _add_points(
                         columns[used] = first + (axis * curves + curve) * nodes + skin.node[p, j]
                         row[:, used] = change * skin.weight[p, j] * linear.by_world[k, :, axis]
                         used += 1
-            if size > end:
-                columns[used], columns[used + 1] = end + ends.keyframe[k], end + host
-                row[:, used], row[:, used + 1] = linear.by_curve[k], -linear.by_curve[k]
+            for curve in range(free):
+                column = end + curve * len(basis)
+                columns[used], columns[used + 1] = column + ends.keyframe[k], column + host
+                row[:, used], row[:, used + 1] = linear.by_curve[k, :, curve], -linear.by_curve[k, :, curve]
                 used += 2
             for side in range(2):
                 depth = linear.weight[k] * linear.by_depth[k, side]
