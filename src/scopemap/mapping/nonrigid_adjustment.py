@@ -33,11 +33,13 @@ from scopemap.mapping.deformation_graph import (
 from scopemap.mapping.motion_ambiguity import camera_without_curve
 from scopemap.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, solve
 
-LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 60
+LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 300
 """With fewer keyframes no curve is known; with more, time and memory of the adjustment would grow too much."""
 RIGID_CORE_PX = 0.4
 """Robust standard deviation of a rigid solution below which most of the tissue is at rest."""
-_NODES, _CURVE_NODES, _MOST_CURVES = 60, 30, 30
+_NODES = 60
+# Nodes that find the curves, of up to so many keyframes and of many, and the least hat functions of each.
+_CURVE_NODES, _FEW_KEYFRAMES, _LEAST_CURVE_NODES, _LEAST_HATS = 30, 60, 10, 30
 _THINNED = 3  # one of so many points finds the curve
 # Nodes that move step by step, and those that follow curves; priors of tracked motion are tighter by the last factor.
 _FREE, _CURVES, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05
@@ -86,7 +88,7 @@ class _Nodes(NamedTuple):
 def adjust_moving_tissue(problem: BundleProblem, rigid: State, time_s: np.ndarray) -> NonRigidSolution | None:
     """Return the solution with moving tissue; None where tracks left out do not confirm it, or it is not tried.
 
-    rigid : the rigid solution. time_s : (K,) of the keyframes. It is tried with 6 to 60 keyframes, where the rigid
+    rigid : the rigid solution. time_s : (K,) of the keyframes. It is tried with 6 to 300 keyframes, where the rigid
     solution leaves errors above 2 px.
     """
     observed = np.unique(problem.observations.point)
@@ -106,7 +108,7 @@ def adjust_moving_tissue(problem: BundleProblem, rigid: State, time_s: np.ndarra
     nodes = _Nodes(place, _moving(problem, place, wrong) if core else np.ones(_NODES, bool))
     if not nodes.moving.any():
         return None
-    curves = _curves(inside, nodes if core else _Nodes(*(each[:_CURVE_NODES] for each in nodes)))
+    curves = _curves(inside, nodes)
     start, left_out = _chosen(inside, _part(problem, outside & seen), rigid, nodes, curves)
     if left_out is None or not left_out.accepts:
         return None
@@ -159,9 +161,15 @@ def _chosen(
 
 
 def _curves(problem: BundleProblem, nodes: _Nodes) -> np.ndarray:
-    """Return the curves (K, L) of nodes that move step by step."""
-    thinned = _part(problem, np.arange(len(problem.points.host)) % _THINNED == 0)
-    basis = hat_functions(len(problem.T_camera_world), _MOST_CURVES)
+    """Return the curves (K, L) of nodes that move step by step: with more keyframes fewer nodes, not more unknowns."""
+    thinned, keyframes = (
+        _part(problem, np.arange(len(problem.points.host)) % _THINNED == 0),
+        len(problem.T_camera_world),
+    )
+    if nodes.moving.all():
+        most = _CURVE_NODES * _FEW_KEYFRAMES // max(keyframes, _FEW_KEYFRAMES)
+        nodes = _Nodes(*(each[: max(most, _LEAST_CURVE_NODES)] for each in nodes))
+    basis = hat_functions(keyframes, max(_LEAST_HATS, _CURVE_NODES * _LEAST_HATS // len(nodes.place[nodes.moving])))
     state = _solved(_problem(thinned, nodes, basis, _FREE))
     # Nodes that are held do not move.
     return first_modes(Deformation(nodes.place[nodes.moving], basis, state.modes).displacement, _MOST_MODES)
