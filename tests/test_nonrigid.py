@@ -15,8 +15,14 @@ from scopemap.mapping import FrameCorrection
 from scopemap.mapping.bundle_adjustment import PER_KEYFRAME as PER_KEYFRAME_UNKNOWNS
 from scopemap.mapping.bundle_adjustment import adjust, errors_px
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.mapping.deformation_graph import MotionPrior, hat_functions, periodic_rate, skin_of, spread_nodes
-from scopemap.mapping.motion_ambiguity import camera_without_curve
+from scopemap.mapping.deformation_graph import (
+    MotionPrior,
+    camera_without_curve,
+    hat_functions,
+    periodic_rate,
+    skin_of,
+    spread_nodes,
+)
 from scopemap.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
 from scopemap.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
 from scopemap.mapping.pose_interpolation import TissueMotion

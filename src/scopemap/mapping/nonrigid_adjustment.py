@@ -7,7 +7,7 @@ search begins at the rigid solution; else at the poses as tracked.
 
 The solution is accepted by tracks left out of it, a fifth of the picture's cells, where nodes move: tissue at rest
 gains nothing there. Motion of all tissue against the camera is only determined where it repeats itself, and the camera
-does not: see `motion_ambiguity`; else the tracked motion decides.
+does not: see `camera_without_curve`; else the tracked motion decides.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points,
 from scopemap.mapping.deformation_graph import (
     Deformation,
     MotionPrior,
+    camera_without_curve,
     first_modes,
     hat_functions,
     periodic_rate,
     skin_of,
     spread_nodes,
 )
-from scopemap.mapping.motion_ambiguity import camera_without_curve
 from scopemap.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, solve
 
 LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 300
