@@ -46,6 +46,11 @@ class Deformation:
         """Displacement (K, N, 3) mm of the nodes at the keyframes."""
         return np.einsum("kl,lnc->knc", self.basis, self.modes)
 
+    @property
+    def has_core(self) -> bool:
+        """Whether some nodes are held: most of the tissue is at rest."""
+        return bool((self.modes == 0).all(axis=(0, 2)).any())
+
     def in_world(self, T_new_world: np.ndarray) -> Deformation:
         """Return the motion in another world; `T_new_world` (4, 4) takes points of this one to it."""
         nodes = self.nodes @ T_new_world[:3, :3].T + T_new_world[:3, 3]
@@ -128,15 +133,12 @@ def hat_functions(count: int, most: int) -> np.ndarray:
     return np.maximum(1 - np.abs(np.arange(count)[:, None] - knots) / spacing, 0.0)
 
 
-def first_modes(displacement: np.ndarray, most: int) -> np.ndarray:
-    """Return the curves (K, L) of the first singular vectors of displacements (K, N, 3) less their mean.
-
-    The largest value is 1; each curve is as large, against the first, as its share of the displacement.
-    """
+def first_mode(displacement: np.ndarray) -> np.ndarray:
+    """Return the curve (K, 1), at most 1, of the first singular vector of displacements (K, N, 3) less their mean."""
     flat = displacement.reshape(len(displacement), -1)
-    left, size, _ = np.linalg.svd(flat - flat.mean(0), full_matrices=False)
-    curves: np.ndarray = left[:, :most] * size[:most]
-    return curves / np.abs(curves).max()
+    curve = np.linalg.svd(flat - flat.mean(0), full_matrices=False)[0][:, :1]
+    largest: np.ndarray = curve / np.abs(curve).max()
+    return largest
 
 
 def periodic_rate(time_s: np.ndarray, curve: np.ndarray) -> float:

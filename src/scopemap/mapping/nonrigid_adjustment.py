@@ -25,7 +25,7 @@ from scopemap.mapping.deformation_graph import (
     Deformation,
     MotionPrior,
     camera_without_curve,
-    first_modes,
+    first_mode,
     hat_functions,
     periodic_rate,
     skin_of,
@@ -41,15 +41,13 @@ _NODES = 60
 # Nodes that find the curves, of up to so many keyframes and of many, and the least hat functions of each.
 _CURVE_NODES, _FEW_KEYFRAMES, _LEAST_CURVE_NODES, _LEAST_HATS = 30, 60, 10, 30
 _THINNED = 3  # one of so many points finds the curve
-# Nodes that move step by step, and those that follow curves; priors of tracked motion are tighter by the last factor.
-_FREE, _CURVES, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05
+# Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
+_FREE, _ONE_CURVE, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05
 _CELL_PX, _EVERY = 16, 5  # cells of the picture, and which share of them is left out
 # Left-out errors: that count as wrong, and beyond which an error counts no more, px.
 _WRONG_PX, _FALSE_PX = 2.0, 10.0
 _LEAST_FACTOR, _LEAST_FALL = 1.5, 0.05
 _LEAST_LEFT_OUT = 100  # observations
-# Where many errors stay, more curves are tried, and kept where each divides the errors by the factor.
-_MOST_MODES, _LEAST_MODE_FACTOR = 2, 1.1
 # Beside a core at rest a node moves where the share of wrong observations exceeds that of most nodes by so much.
 _MOVING_SHARE = 0.02
 _RESCALINGS = 3
@@ -108,17 +106,17 @@ def adjust_moving_tissue(problem: BundleProblem, rigid: State, time_s: np.ndarra
     nodes = _Nodes(place, _moving(problem, place, wrong) if core else np.ones(_NODES, bool))
     if not nodes.moving.any():
         return None
-    curves = _curves(inside, nodes)
-    start, left_out = _chosen(inside, _part(problem, outside & seen), rigid, nodes, curves)
+    start = _with_curve(inside, nodes, _curve(inside, nodes))
+    left_out = _compared(_part(problem, outside & seen), rigid, start, nodes)
     if left_out is None or not left_out.accepts:
         return None
     if not core and np.isfinite(periodic_rate(time_s, start.basis[:, 0])):
         problem, start = _camera_at_rest(problem, time_s, nodes, start)
-    state = _with_curves(problem, nodes, start.basis, start.modes)
-    modes = np.zeros((len(state.modes), _NODES, 3))
+    state = _with_curve(problem, nodes, start.basis, start.modes)
+    modes = np.zeros((1, _NODES, 3))
     modes[:, nodes.moving] = state.modes
     motion = Deformation(place, state.basis, modes)
-    moved = _problem(problem, nodes, state.basis, _CURVES).moved(state.modes, state.basis)
+    moved = _problem(problem, nodes, state.basis, _ONE_CURVE).moved(state.modes, state.basis)
     T = np.stack([orthonormalised(pose) for pose in state.rigid.T_camera_world])
     final = with_points(problem, state.rigid._replace(T_camera_world=T), moved)
     return NonRigidSolution(BundleSolution(final, log_depth_sigma(problem, final, moved), 0), motion, left_out)
@@ -128,11 +126,11 @@ def _camera_at_rest(
     problem: BundleProblem, time_s: np.ndarray, nodes: _Nodes, state: NonRigidState
 ) -> tuple[BundleProblem, NonRigidState]:
     """Return problem and solution with a tracked motion that does not follow the curve."""
-    size_mm, T_world_camera = _CURVES.size * problem.unit_mm, inverse(state.rigid.T_camera_world)
-    first, curve = state.modes[0], state.basis[:, 0]
-    T_world_world, first = camera_without_curve(T_world_camera, time_s, curve, nodes.place, first, size_mm)
+    size_mm, T_world_camera = _ONE_CURVE.size * problem.unit_mm, inverse(state.rigid.T_camera_world)
+    curve, mode = state.basis[:, 0], state.modes[0]
+    T_world_world, mode = camera_without_curve(T_world_camera, time_s, curve, nodes.place, mode, size_mm)
     T = problem.T_camera_world @ inverse(T_world_world)
-    return replace(problem, T_camera_world=T), state._replace(modes=np.concatenate([first[None], state.modes[1:]]))
+    return replace(problem, T_camera_world=T), state._replace(modes=mode[None])
 
 
 def _moving(problem: BundleProblem, nodes: np.ndarray, wrong: np.ndarray) -> np.ndarray:
@@ -143,25 +141,8 @@ def _moving(problem: BundleProblem, nodes: np.ndarray, wrong: np.ndarray) -> np.
     return moving
 
 
-def _chosen(
-    inside: BundleProblem, outside: BundleProblem, rigid: State, nodes: _Nodes, curves: np.ndarray
-) -> tuple[NonRigidState, LeftOutTracks | None]:
-    """Return the solution with as many of the curves as tracks left out confirm, and their errors; None: too few."""
-    best = _with_curves(inside, nodes, curves[:, :1])
-    errors = _compared(outside, rigid, best, nodes)
-    for count in range(2, curves.shape[1] + 1):
-        if errors is None or errors.wrong < _LEAST_FALL:
-            break
-        state = _with_curves(inside, nodes, curves[:, :count])
-        more = _compared(outside, rigid, state, nodes)
-        if more is None or errors.px < _LEAST_MODE_FACTOR * more.px:
-            break
-        best, errors = state, more
-    return best, errors
-
-
-def _curves(problem: BundleProblem, nodes: _Nodes) -> np.ndarray:
-    """Return the curves (K, L) of nodes that move step by step: with more keyframes fewer nodes, not more unknowns."""
+def _curve(problem: BundleProblem, nodes: _Nodes) -> np.ndarray:
+    """Return the curve (K, 1) of nodes that move step by step: with more keyframes fewer nodes, not more unknowns."""
     thinned, keyframes = (
         _part(problem, np.arange(len(problem.points.host)) % _THINNED == 0),
         len(problem.T_camera_world),
@@ -172,13 +153,13 @@ def _curves(problem: BundleProblem, nodes: _Nodes) -> np.ndarray:
     basis = hat_functions(keyframes, max(_LEAST_HATS, _CURVE_NODES * _LEAST_HATS // len(nodes.place[nodes.moving])))
     state = _solved(_problem(thinned, nodes, basis, _FREE))
     # Nodes that are held do not move.
-    return first_modes(Deformation(nodes.place[nodes.moving], basis, state.modes).displacement, _MOST_MODES)
+    return first_mode(Deformation(nodes.place[nodes.moving], basis, state.modes).displacement)
 
 
-def _with_curves(
-    problem: BundleProblem, nodes: _Nodes, curves: np.ndarray, modes: np.ndarray | None = None
+def _with_curve(
+    problem: BundleProblem, nodes: _Nodes, curve: np.ndarray, modes: np.ndarray | None = None
 ) -> NonRigidState:
-    """Return the solution with these curves; without a core at rest it is held more closely to the tracked motion.
+    """Return the solution with one curve; without a core at rest it is held more closely to the tracked motion.
 
     modes : where to begin, None: at rest.
     """
@@ -187,7 +168,7 @@ def _with_curves(
         rotation_rad, translation = priors.rotation_rad * _TRACKED_SHARE, priors.translation_share * _TRACKED_SHARE
         tight = priors._replace(rotation_rad=rotation_rad, translation_share=translation)
         problem = replace(problem, priors=tight)
-    return _solved(_problem(problem, nodes, curves, _CURVES), modes)
+    return _solved(_problem(problem, nodes, curve, _ONE_CURVE), modes)
 
 
 def _problem(rigid: BundleProblem, nodes: _Nodes, basis: np.ndarray, prior: MotionPrior) -> NonRigidProblem:
@@ -195,7 +176,7 @@ def _problem(rigid: BundleProblem, nodes: _Nodes, basis: np.ndarray, prior: Moti
     skin = skin_of(nodes.place, _in_world(rigid)).among(nodes.moving)
     free = np.tile(nodes.moving, basis.shape[1])
     matrix = prior.normal_matrix(nodes.place, basis, rigid.unit_mm)[free][:, free]
-    return NonRigidProblem(rigid, nodes.place[nodes.moving], basis, skin, matrix, prior is _CURVES)
+    return NonRigidProblem(rigid, nodes.place[nodes.moving], basis, skin, matrix, prior is _ONE_CURVE)
 
 
 def _solved(problem: NonRigidProblem, modes: np.ndarray | None = None) -> NonRigidState:
@@ -209,7 +190,7 @@ def _compared(part: BundleProblem, rigid: State, state: NonRigidState, nodes: _N
     part = _part(part, nodes.moving[skin_of(nodes.place, _in_world(part)).node[:, 0]])
     if len(part.observations.point) < _LEAST_LEFT_OUT:
         return None
-    moving = _problem(part, nodes, state.basis, _CURVES).moved(state.modes, state.basis)
+    moving = _problem(part, nodes, state.basis, _ONE_CURVE).moved(state.modes, state.basis)
     (rigid_px, rigid_wrong), (px, wrong) = (
         _errors(part, keyframes, moved) for keyframes, moved in ((rigid, np.zeros_like(moving)), (state.rigid, moving))
     )
