@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,15 +13,21 @@ from scopemap.geometry.align import umeyama
 from scopemap.geometry.se3 import inverse, se3_exp, transform
 from scopemap.geometry.skinning import skin_of
 from scopemap.mapping import FrameCorrection
+from scopemap.mapping.bundle_adjustment import PER_KEYFRAME as PER_KEYFRAME_UNKNOWNS
 from scopemap.mapping.bundle_adjustment import adjust, errors_px
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.mapping.deformation_graph import MotionPrior, hat_functions, periodic_rate, spread_nodes
+from scopemap.mapping.deformation_graph import (
+    MotionPrior,
+    camera_without_curve,
+    hat_functions,
+    periodic_rate,
+    spread_nodes,
+)
 from scopemap.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
 from scopemap.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
 from scopemap.mapping.pose_interpolation import TissueMotion
 
 KEYFRAMES, PER_KEYFRAME, GAPS = 16, 120, (1, 2, 3, 5)
-LINE = np.column_stack([np.arange(KEYFRAMES - 1), np.arange(1, KEYFRAMES)])
 BREATH = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(KEYFRAMES) / 9)
 NOISE_PX = 0.15
 
@@ -31,25 +38,39 @@ def _moved(rest: np.ndarray, breath: float) -> np.ndarray:
     return rest + breath * np.column_stack([0.5 * np.cos(y), 4 * np.sin(1.3 * x), 1.5 * np.cos(x + y)])
 
 
-def _scene(curve: np.ndarray, false_share: float = 0.0, noise_px: float = NOISE_PX) -> tuple[BundleProblem, np.ndarray]:
+def _poked(rest: np.ndarray, share: float) -> np.ndarray:
+    """Tissue (n, 3) mm that is pushed by 5 mm at one place, and at rest 12 mm from it."""
+    near = np.exp(-((rest[:, :2] - [7, -5]) ** 2).sum(1) / 50)
+    return rest + share * near[:, None] * [3.0, 2.0, 3.5]
+
+
+def _scene(
+    curve: np.ndarray,
+    false_share: float = 0.0,
+    noise_px: float = NOISE_PX,
+    moved: Callable[[np.ndarray, float], np.ndarray] = _moved,
+    per_keyframe: int = PER_KEYFRAME,
+) -> tuple[BundleProblem, np.ndarray]:
     """A bundle problem with wrong depth and nearly right poses, and the true points (P, K, 3) over time."""
     rng = np.random.default_rng(5)
+    count = len(curve)
+    forward = 0.3 * np.minimum(np.arange(count), KEYFRAMES)
     twists = [
-        np.append(rng.normal(0, 0.01, 3), [4 * np.sin(0.6 * k), 3 * np.cos(0.5 * k), 0.3 * k]) for k in range(KEYFRAMES)
+        np.append(rng.normal(0, 0.01, 3), [4 * np.sin(0.6 * k), 3 * np.cos(0.5 * k), forward[k]]) for k in range(count)
     ]
     T = np.stack([inverse(se3_exp(twist)) for twist in twists])
     T = T @ inverse(T[0])
     # Of all tissue at rest each keyframe sees other points.
-    flat = rng.uniform(-22, 22, (KEYFRAMES * PER_KEYFRAME, 2))
+    flat = rng.uniform(-22, 22, (count * per_keyframe, 2))
     rest = np.column_stack([flat, 42 + 5 * np.sin(flat[:, 0] / 9) * np.cos(flat[:, 1] / 7)])
-    over_time = np.stack([_moved(rest, breath) for breath in curve], 1)
-    host, seen = np.repeat(np.arange(KEYFRAMES), PER_KEYFRAME), []
+    over_time = np.stack([moved(rest, breath) for breath in curve], 1)
+    host, seen = np.repeat(np.arange(count), per_keyframe), []
     pixel, depth = np.empty((len(host), 2)), np.empty(len(host))
     for p, h in enumerate(host):
         x = transform(T[h], over_time[p, h])
         pixel[p], depth[p] = FOCAL_PX * x[:2] / x[2], x[2]
         for t in (h + sign * gap for gap in GAPS for sign in (-1, 1)):
-            if 0 <= t < KEYFRAMES:
+            if 0 <= t < count:
                 x = transform(T[t], over_time[p, t])
                 seen.append((p, t, *(FOCAL_PX * x[:2] / x[2] + rng.normal(0, noise_px, 2))))
     table = np.array(seen)
@@ -58,8 +79,9 @@ def _scene(curve: np.ndarray, false_share: float = 0.0, noise_px: float = NOISE_
     estimated = np.log(depth) + 0.2 * np.sin(pixel[:, 0] / 40) + 0.1 * np.cos(pixel[:, 1] / 30)
     points = Points(host, pixel, estimated, np.full(len(host), 0.2))
     observations = Observations(table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:])
+    line = np.column_stack([np.arange(count - 1), np.arange(1, count)])
     T_tracked = tracked(T, rng, rotation_rad=0.002, translation_mm=0.1)
-    return BundleProblem(T_tracked, points, observations, Priors(), LINE, FOCAL_PX, correlated=4.0), over_time
+    return BundleProblem(T_tracked, points, observations, Priors(), line, FOCAL_PX, correlated=4.0), over_time
 
 
 def _over_time(problem: BundleProblem, found: NonRigidSolution) -> np.ndarray:
@@ -71,9 +93,13 @@ def _over_time(problem: BundleProblem, found: NonRigidSolution) -> np.ndarray:
         return np.stack([transform(inverse(T_camera_world[h]), each) for h, each in zip(points.host, x, strict=True)])
 
     state, motion, host = found.found.state, found.deformation, problem.points.host
-    skin = skin_of(motion.nodes, in_world(problem.T_camera_world, problem.points.log_depth))
     number, at_host = np.arange(len(host)), in_world(state.T_camera_world, state.log_depth)
-    moved = [skin.moved(motion.displacement, number, host, np.full(len(host), k)) for k in range(KEYFRAMES)]
+    skin = skin_of(motion.nodes, at_host)
+    # Nodes lie on the adjusted surface, which those who move it have.
+    assert not motion.basis.any() or np.median(np.linalg.norm(motion.nodes[:, None] - at_host, axis=-1).min(1)) < 2.5
+    moved = [
+        skin.moved(motion.displacement, number, host, np.full(len(host), k)) for k in range(len(state.T_camera_world))
+    ]
     return at_host[:, None] + np.stack(moved, 1)
 
 
@@ -82,9 +108,13 @@ def _shape_error_mm(points: np.ndarray, true: np.ndarray) -> float:
     return float(np.median(np.linalg.norm(umeyama(points, true, True).transform_points(points) - true, axis=-1)))
 
 
+def _adjusted(problem: BundleProblem) -> NonRigidSolution | None:
+    return adjust_moving_tissue(problem, adjust(problem).state, np.arange(len(problem.T_camera_world)) / 2)
+
+
 @pytest.fixture(scope="module")
 def breathing() -> NonRigidSolution:
-    found = adjust_moving_tissue(_scene(BREATH)[0])
+    found = _adjusted(_scene(BREATH)[0])
     assert found is not None
     return found
 
@@ -107,51 +137,109 @@ def test_tissue_that_breathes_is_recovered_with_its_curve_and_shape(breathing: N
     assert np.isfinite(found.found.log_depth_sigma).all()
 
 
+def test_beside_a_core_at_rest_the_part_that_moves_is_found() -> None:
+    problem, true = _scene(np.clip((np.arange(KEYFRAMES) - 5) / 5, 0, 1), moved=_poked)
+    rigid = adjust(problem).state
+    assert rigid.sigma_px < 0.4
+    found = _adjusted(problem)
+    assert found is not None
+    moving = np.linalg.norm(found.deformation.modes[0], axis=1) > 0
+    assert 0 < moving.sum() < 30
+    at = np.linalg.norm(found.deformation.nodes[:, :2] - [7, -5], axis=1)
+    assert at[moving].mean() < 10 < at[~moving].mean()
+    started = replace(problem, start=rigid)
+    held = found._replace(
+        found=found.found._replace(state=rigid), deformation=replace(found.deformation, modes=np.zeros((1, 60, 3)))
+    )
+    near = np.linalg.norm(true[:, 0, :2] - [7, -5], axis=1) < 6
+    errors = [
+        np.linalg.norm(points - true, axis=-1)[near].mean()
+        for points in (_over_time(started, found), _over_time(started, held))
+    ]
+    assert errors[0] < 0.6 * errors[1]
+
+
+def test_a_camera_does_not_breathe_with_the_tissue() -> None:
+    rng, time_s = np.random.default_rng(6), np.arange(20) / 2
+    breath, nodes = np.sin(2 * np.pi * time_s / 4), rng.uniform([-20, -20, 25], [20, 20, 65], (60, 3))
+    mode = rng.normal(0, 1.5, nodes.shape)
+    smooth = np.column_stack(
+        [0.1 * np.sin(time_s / 7), 0 * time_s, 0 * time_s, 5 * np.cos(time_s / 9), time_s, 0 * time_s]
+    )
+    path = np.stack([se3_exp(twist) for twist in smooth])
+    common = np.array([0.01, -0.02, 0.015, 1.0, -0.5, 0.8])
+    about = np.eye(4)
+    about[:3, 3] = nodes.mean(0)
+    with_breath = np.stack([about @ se3_exp(share * common) @ inverse(about) for share in breath]) @ path
+    moved = mode + np.cross(common[:3], nodes - nodes.mean(0)) + common[3:]
+    T_world_world, without = camera_without_curve(with_breath, time_s, breath, nodes, moved, 2.5)
+    before, after = (
+        np.linalg.norm((T - path)[:, :3, 3], axis=1).max() for T in (with_breath, T_world_world @ with_breath)
+    )
+    assert after < 0.1 < 1.0 < before
+    assert np.abs(without - mode).max() < 0.2
+    unchanged, _ = camera_without_curve(path, time_s, breath, nodes, mode, 2.5)
+    assert np.abs((unchanged @ path - path)[:, :3, 3]).max() < 0.1
+
+
 def test_tissue_at_rest_is_left_to_the_rigid_adjustment_whatever_the_matches_are() -> None:
     still, _ = _scene(0 * BREATH)
-    assert adjust_moving_tissue(still) is None
+    assert _adjusted(still) is None
     # False matches and noise take the shortcuts away: tracks left out refuse it.
     wrong, _ = _scene(0 * BREATH, false_share=0.15, noise_px=0.6)
     rigid = adjust(wrong).state
     assert rigid.sigma_px > 0.4
     assert (errors_px(wrong, rigid) > 2).mean() > 0.05
-    assert adjust_moving_tissue(wrong) is None
+    assert _adjusted(wrong) is None
 
 
-@pytest.mark.parametrize("keyframes", [5, 61])
+def test_the_curve_of_many_keyframes_is_found_by_fewer_nodes() -> None:
+    breath = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(80) / 9)
+    problem, true = _scene(breath, per_keyframe=40)
+    found = _adjusted(problem)
+    assert found is not None
+    assert abs(np.corrcoef(found.deformation.basis[:, 0], breath)[0, 1]) > 0.95
+    assert found.left_out.px < 0.6
+    assert _shape_error_mm(_over_time(problem, found).reshape(-1, 3), true.reshape(-1, 3)) < 2.0
+
+
+@pytest.mark.parametrize("keyframes", [5, 301])
 def test_few_and_many_keyframes_are_not_tried(keyframes: int) -> None:
     problem, _ = _scene(BREATH)
-    T = np.concatenate([problem.T_camera_world] * 6)[:keyframes]
+    T = np.concatenate([problem.T_camera_world] * 20)[:keyframes]
     kept = (problem.points.host[problem.observations.point] < 5) & (problem.observations.keyframe < 5)
     seen = problem.observations
-    some = seen if keyframes > 60 else Observations(seen.point[kept], seen.keyframe[kept], seen.pixel[kept])
-    assert adjust_moving_tissue(replace(problem, T_camera_world=T, observations=some)) is None
+    some = seen if keyframes > 300 else Observations(seen.point[kept], seen.keyframe[kept], seen.pixel[kept])
+    many = replace(problem, T_camera_world=T, observations=some)
+    assert adjust_moving_tissue(many, problem.tracked._replace(sigma_px=1.0), np.arange(keyframes) / 2) is None
 
 
-def _small() -> tuple[NonRigidProblem, NonRigidState]:
-    """A problem with 8 nodes and 4 curves, away from its solution."""
+def _small(free: bool) -> tuple[NonRigidProblem, NonRigidState]:
+    """A problem with 8 nodes and 3 curves, free or given, away from its solution."""
     rigid, true = _scene(BREATH)
     nodes, rng = spread_nodes(true[:, 0], 8), np.random.default_rng(2)
-    basis, at_host = hat_functions(KEYFRAMES, 4), true[np.arange(len(true)), rigid.points.host]
+    basis, at_host = hat_functions(KEYFRAMES, 3), true[np.arange(len(true)), rigid.points.host]
     prior = MotionPrior(0.1, 0.03, 0.01).normal_matrix(nodes, basis, rigid.unit_mm)
-    problem = NonRigidProblem(rigid, nodes, basis, skin_of(nodes, at_host), prior)
+    problem = NonRigidProblem(rigid, nodes, basis, skin_of(nodes, at_host), prior, free)
     state = rigid.tracked._replace(sigma_px=0.7, log_scale=rng.normal(0, 0.02, KEYFRAMES))
-    return problem, NonRigidState(state, rng.normal(0, 0.5, (4, 8, 3)))
+    return problem, NonRigidState(state, rng.normal(0, 0.5, (3, 8, 3)), basis + free * rng.normal(0, 0.05, basis.shape))
 
 
-def test_the_gradient_is_that_of_the_cost() -> None:
-    problem, state = _small()
+@pytest.mark.parametrize("free", [False, True])
+def test_the_gradient_is_that_of_the_cost(free: bool) -> None:
+    problem, state = _small(free)
     model, rng = NonRigidModel(problem, state), np.random.default_rng(3)
-    parts = [slice(6, 112), slice(112, 112 + 96), slice(208, None)]  # keyframes, modes, points
-    for part in parts:
+    bounds = np.cumsum([6, PER_KEYFRAME_UNKNOWNS * KEYFRAMES - 6, 72, problem.curve_unknowns])  # then points
+    for first, end in zip(bounds, [*bounds[1:], None], strict=True):
         step = np.zeros(len(model.gradient))
-        step[part] = rng.normal(size=len(step[part]))
+        step[first:end] = rng.normal(size=len(step[first:end]))
         ahead, behind = (NonRigidModel(problem, _retract(problem, state, s * step)).cost for s in (1e-6, -1e-6))
         assert (ahead - behind) / 2e-6 == pytest.approx(model.gradient @ step, rel=1e-4)
 
 
-def test_the_step_without_points_solves_the_normal_equations_of_all_unknowns() -> None:
-    model = NonRigidModel(*_small())
+@pytest.mark.parametrize("free", [False, True])
+def test_the_step_without_points_solves_the_normal_equations_of_all_unknowns(free: bool) -> None:
+    model = NonRigidModel(*_small(free))
     step, rng = model.gauss_newton_step(), np.random.default_rng(4)
     assert model.curvature(step) == pytest.approx(-model.gradient @ step, rel=1e-5)
     other = rng.normal(size=len(step)) * np.abs(step).max()

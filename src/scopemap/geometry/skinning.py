@@ -12,10 +12,15 @@ _LEAST_WEIGHT = 1e-3
 
 
 class Skin(NamedTuple):
-    """Nodes of P points, (P, 4) int, and their weights (P, 4), whose sum is 1."""
+    """Nodes of P points, (P, 4) int, and their weights (P, 4), whose sum is 1 unless nodes are held."""
 
     node: np.ndarray
     weight: np.ndarray
+
+    def among(self, moving: np.ndarray) -> Skin:
+        """Return the same with the moving nodes, (N,) bool, alone; the others are held."""
+        place = np.maximum(np.cumsum(moving) - 1, 0)
+        return Skin(place[self.node], self.weight * moving[self.node])
 
     def moved(self, displacement: np.ndarray, points: np.ndarray, since: np.ndarray, until: np.ndarray) -> np.ndarray:
         """Return the motion (n, 3) of numbered points between keyframes (n,), by the nodes' displacement (K, N, 3)."""

@@ -17,11 +17,14 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree
 
+from scopemap.geometry.se3 import hat, inverse, se3_exp, so3_log
+
 _NEIGHBOURS = 6  # of a node
 _FARTHEST_SHARE = 97  # percent of the points, nearest to their median, among which nodes are
 # A curve repeats itself where a sinusoid of at least so many periods explains so much of its variance.
 _LEAST_PERIODS, _PERIODIC_SHARE = 1.5, 0.8
 _RATES = 200
+_REWEIGHTINGS, _LEAST_GAP_S = 5, 1e-3
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,11 @@ class Deformation:
     def displacement(self) -> np.ndarray:
         """Displacement (K, N, 3) mm of the nodes at the keyframes."""
         return np.einsum("kl,lnc->knc", self.basis, self.modes)
+
+    @property
+    def has_core(self) -> bool:
+        """Whether some nodes are held: most of the tissue is at rest."""
+        return bool((self.modes == 0).all(axis=(0, 2)).any())
 
     def in_world(self, T_new_world: np.ndarray) -> Deformation:
         """Return the motion in another world; `T_new_world` (4, 4) takes points of this one to it."""
@@ -120,3 +128,53 @@ def periodic_rate(time_s: np.ndarray, curve: np.ndarray) -> float:
         if 1 - (left @ left) / (off @ off) > explained:
             best, explained = float(rate), 1 - (left @ left) / (off @ off)
     return best
+
+
+def camera_without_curve(
+    T_world_camera: np.ndarray,
+    time_s: np.ndarray,
+    curve: np.ndarray,
+    nodes: np.ndarray,
+    mode: np.ndarray,
+    size_mm: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the motion (K, 4, 4) of the world without which poses do not follow the curve (K,), and the mode with it.
+
+    Where camera and tissue move together along the tissue's curve nothing in the picture changes: six numbers are not
+    determined. A hand moves smoothly and does not breathe: of all motions along a curve that repeats itself, the
+    tissue's is the one without which the camera's path has the least acceleration, beside the prior of displacements.
+
+    nodes : (N, 3) mm. mode : (N, 3) mm. size_mm : prior standard deviation of a displacement. To first order poses and
+    mode with the motion explain the same pictures; it is the identity at the first keyframe.
+    """
+    along, middle = curve - curve[0], nodes.mean(0)
+    twist = _common_twist(T_world_camera, time_s, along, nodes, mode / size_mm, size_mm)
+    about = np.eye(4)
+    about[:3, 3] = middle
+    T_world_world = np.stack([about @ se3_exp(share * twist) @ inverse(about) for share in along])
+    return T_world_world, mode + np.cross(twist[:3], nodes - middle) + twist[3:]
+
+
+def _common_twist(
+    T: np.ndarray, time_s: np.ndarray, along: np.ndarray, nodes: np.ndarray, displaced: np.ndarray, size_mm: float
+) -> np.ndarray:
+    """Return the twist (6,), about the nodes' mean, of camera and tissue where the curve is 1: linear least squares."""
+    gaps = np.maximum(np.diff(time_s), _LEAST_GAP_S)
+    slope = np.diff(np.identity(len(T)), axis=0) / gaps[:, None]
+    each = np.sqrt((gaps[1:] + gaps[:-1]) / 2)[:, None]
+    change = np.diff(slope, axis=0) / each  # of velocity, (K - 2, K)
+    turns = np.stack([so3_log(T[k + 1, :3, :3] @ T[k, :3, :3].T) for k in range(len(T) - 1)]) / gaps[:, None]
+    from_middle = T[:, :3, 3] - nodes.mean(0)
+    count, by = len(change), change @ along
+    levers = np.einsum("jk,k,kab->jab", change, along, -np.stack([hat(x) for x in from_middle]))
+    of_turn = np.concatenate([np.einsum("j,ab->jab", by, np.eye(3)), np.zeros((count, 3, 3))], axis=2)
+    of_way = np.concatenate([levers, np.einsum("j,ab->jab", by, np.eye(3))], axis=2)
+    of_nodes = np.stack([np.hstack([-hat(x), np.eye(3)]) for x in nodes - nodes.mean(0)]) / size_mm
+    rows = [(of_turn.reshape(-1, 6), (np.diff(turns, axis=0) / each).ravel())]
+    rows += [(of_way.reshape(-1, 6), (change @ T[:, :3, 3]).ravel()), (of_nodes.reshape(-1, 6), displaced.ravel())]
+    twist = np.zeros(6)
+    for _ in range(_REWEIGHTINGS):
+        sigmas = [*(float(np.sqrt(np.mean((A @ twist + b) ** 2))) + 1e-12 for A, b in rows[:2]), 1.0]
+        A, b = (np.concatenate([row[i] / sigma for row, sigma in zip(rows, sigmas, strict=True)]) for i in range(2))
+        twist = -np.linalg.lstsq(A, b, rcond=None)[0]
+    return twist

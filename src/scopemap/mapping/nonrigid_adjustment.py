@@ -1,12 +1,13 @@
 """Non-rigid adjustment: where tissue moves, one curve over time moves the nodes of a deformation graph.
 
 Nodes that are free at every keyframe explain parallax by motion, and the shape falls back to the estimated depth. So
-they are found in two steps: nodes that move step by step give the curve, their first singular vector; then the nodes'
-modes, keyframes and points are solved anew with this curve alone, from the poses as tracked.
+they are found in two steps: nodes that move step by step give the curve, their first singular vector; then nodes,
+curve, keyframes and points are solved anew. Where most of the tissue is at rest, the nodes there are held, and the
+search begins at the rigid solution; else at the poses as tracked.
 
-The solution is accepted by tracks left out of it, a fifth of the picture's cells: tissue at rest gains nothing there.
-Motion of all tissue against the camera is not determined: the tracked motion decides. Tissue of which a part alone
-moves has a rigid core, which the robust rigid adjustment finds better.
+The solution is accepted by tracks left out of it, a fifth of the picture's cells, where nodes move: tissue at rest
+gains nothing there. Motion of all tissue against the camera is only determined where it repeats itself, and the camera
+does not: see `camera_without_curve`; else the tracked motion decides.
 """
 
 from __future__ import annotations
@@ -19,22 +20,26 @@ import numpy as np
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse, orthonormalised
 from scopemap.geometry.skinning import skin_of
-from scopemap.mapping.bundle_adjustment import BundleSolution, adjust, errors_px, log_depth_sigma, with_points
+from scopemap.mapping.bundle_adjustment import BundleSolution, errors_px, log_depth_sigma, with_points
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, State, reproject
 from scopemap.mapping.deformation_graph import (
     Deformation,
     MotionPrior,
+    camera_without_curve,
     first_mode,
     hat_functions,
+    periodic_rate,
     spread_nodes,
 )
 from scopemap.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, solve
 
-LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 60
+LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 300
 """With fewer keyframes no curve is known; with more, time and memory of the adjustment would grow too much."""
 RIGID_CORE_PX = 0.4
-"""Robust standard deviation of a rigid solution below which most of the tissue is at rest: it is left as it is."""
-_NODES, _CURVE_NODES, _MOST_CURVES = 60, 30, 30
+"""Robust standard deviation of a rigid solution below which most of the tissue is at rest."""
+_NODES = 60
+# Nodes that find the curves, of up to so many keyframes and of many, and the least hat functions of each.
+_CURVE_NODES, _FEW_KEYFRAMES, _LEAST_CURVE_NODES, _LEAST_HATS = 30, 60, 10, 30
 _THINNED = 3  # one of so many points finds the curve
 # Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
 _FREE, _ONE_CURVE, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05
@@ -42,6 +47,9 @@ _CELL_PX, _EVERY = 16, 5  # cells of the picture, and which share of them is lef
 # Left-out errors: that count as wrong, and beyond which an error counts no more, px.
 _WRONG_PX, _FALSE_PX = 2.0, 10.0
 _LEAST_FACTOR, _LEAST_FALL = 1.5, 0.05
+_LEAST_LEFT_OUT = 100  # observations
+# Beside a core at rest a node moves where the share of wrong observations exceeds that of most nodes by so much.
+_MOVING_SHARE = 0.02
 _RESCALINGS = 3
 
 
@@ -68,69 +76,131 @@ class NonRigidSolution(NamedTuple):
     left_out: LeftOutTracks
 
 
-def adjust_moving_tissue(problem: BundleProblem) -> NonRigidSolution | None:
+class _Nodes(NamedTuple):
+    """Nodes (N, 3) mm, and which of them move (N,) bool; the others are held."""
+
+    place: np.ndarray
+    moving: np.ndarray
+
+
+def adjust_moving_tissue(problem: BundleProblem, rigid: State, time_s: np.ndarray) -> NonRigidSolution | None:
     """Return the solution with moving tissue; None where tracks left out do not confirm it, or it is not tried.
 
-    It is tried with 6 to 60 keyframes, where the rigid solution leaves errors above 2 px and has no rigid core.
+    rigid : the rigid solution. time_s : (K,) of the keyframes. It is tried with 6 to 300 keyframes, where the rigid
+    solution leaves errors above 2 px.
     """
     observed = np.unique(problem.observations.point)
     few = len(observed) < _EVERY * _THINNED * _NODES
     if few or not LEAST_KEYFRAMES <= len(problem.T_camera_world) <= MOST_KEYFRAMES:
         return None
-    rigid = adjust(problem).state
-    if rigid.sigma_px < RIGID_CORE_PX or (errors_px(problem, rigid) > _WRONG_PX).mean() < _LEAST_FALL:
+    wrong, core = errors_px(problem, rigid) > _WRONG_PX, rigid.sigma_px < RIGID_CORE_PX
+    if not core and wrong.mean() < _LEAST_FALL:
         return None
-    problem = replace(problem, start=None)
+    problem = replace(problem, start=rigid if core else None)
     column, row = np.floor(problem.points.pixel / _CELL_PX).astype(int).T
     outside = (column + 2 * row) % _EVERY == 0
     seen = np.zeros(len(outside), bool)
     seen[observed] = True
     inside = _part(problem, ~outside & seen)
-    nodes = spread_nodes(_in_world(inside, inside.tracked), _NODES)
-    curve = _curve(inside, nodes[:_CURVE_NODES])  # far from each other, too
-    state = _with_curve(inside, nodes, curve)
-    left_out = _compared(_part(problem, outside & seen), rigid, state, Deformation(nodes, curve, state.modes))
-    if not left_out.accepts:
+    place = spread_nodes(_in_world(inside), _NODES)
+    nodes = _Nodes(place, _moving(problem, place, wrong) if core else np.ones(_NODES, bool))
+    if not nodes.moving.any():
         return None
-    state = _with_curve(problem, nodes, curve)
-    motion = _problem(problem, nodes, curve, _ONE_CURVE).moved(state.modes)
+    start = _with_curve(inside, nodes, _curve(inside, nodes))
+    left_out = _compared(_part(problem, outside & seen), rigid, start, nodes)
+    if left_out is None or not left_out.accepts:
+        return None
+    if not core and np.isfinite(periodic_rate(time_s, start.basis[:, 0])):
+        problem, start = _camera_at_rest(problem, time_s, nodes, start)
+    state = _with_curve(problem, nodes, start.basis, start.modes)
+    modes = np.zeros((1, _NODES, 3))
+    modes[:, nodes.moving] = state.modes
+    moved = _problem(problem, nodes, state.basis, _ONE_CURVE).moved(state.modes, state.basis)
     T = np.stack([orthonormalised(pose) for pose in state.rigid.T_camera_world])
-    final = with_points(problem, state.rigid._replace(T_camera_world=T), motion)
-    found = BundleSolution(final, log_depth_sigma(problem, final, motion), 0)
-    return NonRigidSolution(found, Deformation(nodes, curve, state.modes), left_out)
+    final = with_points(problem, state.rigid._replace(T_camera_world=T), moved)
+    motion = Deformation(_carried(place, problem, final), state.basis, modes)
+    return NonRigidSolution(BundleSolution(final, log_depth_sigma(problem, final, moved), 0), motion, left_out)
 
 
-def _curve(problem: BundleProblem, nodes: np.ndarray) -> np.ndarray:
-    """Return the curve (K, 1) of nodes that move step by step."""
-    thinned = _part(problem, np.arange(len(problem.points.host)) % _THINNED == 0)
-    basis = hat_functions(len(problem.T_camera_world), _MOST_CURVES)
+def _carried(nodes: np.ndarray, problem: BundleProblem, final: State) -> np.ndarray:
+    """Return the nodes (N, 3) where a solution has the points that move with them: by the weighted mean of shifts."""
+    before = _in_world(problem)
+    shift, skin = _in_world(replace(problem, start=final)) - before, skin_of(nodes, before)
+    place, weight = skin.node.ravel(), skin.weight.ravel()
+    total = np.zeros_like(nodes)
+    np.add.at(total, place, weight[:, None] * np.repeat(shift, skin.node.shape[1], axis=0))
+    return nodes + total / np.maximum(np.bincount(place, weight, len(nodes)), 1e-9)[:, None]
+
+
+def _camera_at_rest(
+    problem: BundleProblem, time_s: np.ndarray, nodes: _Nodes, state: NonRigidState
+) -> tuple[BundleProblem, NonRigidState]:
+    """Return problem and solution with a tracked motion that does not follow the curve."""
+    size_mm, T_world_camera = _ONE_CURVE.size * problem.unit_mm, inverse(state.rigid.T_camera_world)
+    curve, mode = state.basis[:, 0], state.modes[0]
+    T_world_world, mode = camera_without_curve(T_world_camera, time_s, curve, nodes.place, mode, size_mm)
+    T = problem.T_camera_world @ inverse(T_world_world)
+    return replace(problem, T_camera_world=T), state._replace(modes=mode[None])
+
+
+def _moving(problem: BundleProblem, nodes: np.ndarray, wrong: np.ndarray) -> np.ndarray:
+    """Return near which nodes (N,) bool more observations are wrong, (M,) bool, than near most of them."""
+    near = skin_of(nodes, _in_world(problem)).node[problem.observations.point, 0]
+    share = np.bincount(near, wrong, len(nodes)) / np.maximum(np.bincount(near, minlength=len(nodes)), 1)
+    moving: np.ndarray = share > np.median(share) + _MOVING_SHARE
+    return moving
+
+
+def _curve(problem: BundleProblem, nodes: _Nodes) -> np.ndarray:
+    """Return the curve (K, 1) of nodes that move step by step: with more keyframes fewer nodes, not more unknowns."""
+    thinned, keyframes = (
+        _part(problem, np.arange(len(problem.points.host)) % _THINNED == 0),
+        len(problem.T_camera_world),
+    )
+    if nodes.moving.all():
+        most = _CURVE_NODES * _FEW_KEYFRAMES // max(keyframes, _FEW_KEYFRAMES)
+        nodes = _Nodes(*(each[: max(most, _LEAST_CURVE_NODES)] for each in nodes))
+    basis = hat_functions(keyframes, max(_LEAST_HATS, _CURVE_NODES * _LEAST_HATS // len(nodes.place[nodes.moving])))
     state = _solved(_problem(thinned, nodes, basis, _FREE))
-    return first_mode(Deformation(nodes, basis, state.modes).displacement)
+    # Nodes that are held do not move.
+    return first_mode(Deformation(nodes.place[nodes.moving], basis, state.modes).displacement)
 
 
-def _with_curve(problem: BundleProblem, nodes: np.ndarray, curve: np.ndarray) -> NonRigidState:
-    """Return the solution with one curve, held more closely to the tracked motion."""
-    priors = problem.priors
-    rotation_rad, translation = priors.rotation_rad * _TRACKED_SHARE, priors.translation_share * _TRACKED_SHARE
-    tight = priors._replace(rotation_rad=rotation_rad, translation_share=translation)
-    return _solved(_problem(replace(problem, priors=tight), nodes, curve, _ONE_CURVE))
+def _with_curve(
+    problem: BundleProblem, nodes: _Nodes, curve: np.ndarray, modes: np.ndarray | None = None
+) -> NonRigidState:
+    """Return the solution with one curve; without a core at rest it is held more closely to the tracked motion.
+
+    modes : where to begin, None: at rest.
+    """
+    if nodes.moving.all():
+        priors = problem.priors
+        rotation_rad, translation = priors.rotation_rad * _TRACKED_SHARE, priors.translation_share * _TRACKED_SHARE
+        tight = priors._replace(rotation_rad=rotation_rad, translation_share=translation)
+        problem = replace(problem, priors=tight)
+    return _solved(_problem(problem, nodes, curve, _ONE_CURVE), modes)
 
 
-def _problem(rigid: BundleProblem, nodes: np.ndarray, basis: np.ndarray, prior: MotionPrior) -> NonRigidProblem:
-    # Nodes and skin stay where poses and depth as tracked have them: points of all hosts share the same errors.
-    skin = skin_of(nodes, _in_world(rigid, rigid.tracked))
-    return NonRigidProblem(rigid, nodes, basis, skin, prior.normal_matrix(nodes, basis, rigid.unit_mm))
+def _problem(rigid: BundleProblem, nodes: _Nodes, basis: np.ndarray, prior: MotionPrior) -> NonRigidProblem:
+    # Nodes and skin stay where the search begins: points of all hosts share the same errors.
+    skin = skin_of(nodes.place, _in_world(rigid)).among(nodes.moving)
+    free = np.tile(nodes.moving, basis.shape[1])
+    matrix = prior.normal_matrix(nodes.place, basis, rigid.unit_mm)[free][:, free]
+    return NonRigidProblem(rigid, nodes.place[nodes.moving], basis, skin, matrix, prior is _ONE_CURVE)
 
 
-def _solved(problem: NonRigidProblem) -> NonRigidState:
-    """Return the solution from the poses as tracked, and from tissue at rest."""
+def _solved(problem: NonRigidProblem, modes: np.ndarray | None = None) -> NonRigidState:
+    """Return the solution from where the search begins, and from these modes, or tissue at rest."""
     at_rest = np.zeros((problem.basis.shape[1], len(problem.nodes), 3))
-    return solve(problem, NonRigidState(problem.rigid.tracked, at_rest))
+    return solve(problem, NonRigidState(problem.rigid.begin, at_rest if modes is None else modes, problem.basis))
 
 
-def _compared(part: BundleProblem, rigid: State, state: NonRigidState, deformation: Deformation) -> LeftOutTracks:
-    """Return the errors of points that were left out, in the keyframes of two solutions."""
-    moving = _problem(part, deformation.nodes, deformation.basis, _ONE_CURVE).moved(state.modes)
+def _compared(part: BundleProblem, rigid: State, state: NonRigidState, nodes: _Nodes) -> LeftOutTracks | None:
+    """Return the errors of points that were left out near moving nodes, in the keyframes of two solutions."""
+    part = _part(part, nodes.moving[skin_of(nodes.place, _in_world(part)).node[:, 0]])
+    if len(part.observations.point) < _LEAST_LEFT_OUT:
+        return None
+    moving = _problem(part, nodes, state.basis, _ONE_CURVE).moved(state.modes, state.basis)
     (rigid_px, rigid_wrong), (px, wrong) = (
         _errors(part, keyframes, moved) for keyframes, moved in ((rigid, np.zeros_like(moving)), (state.rigid, moving))
     )
@@ -150,21 +220,21 @@ def _errors(part: BundleProblem, keyframes: State, moved: np.ndarray) -> tuple[f
 
 
 def _part(problem: BundleProblem, chosen: np.ndarray) -> BundleProblem:
-    """Return the problem of some points alone, (P,) bool, from the poses as tracked."""
-    points, seen = problem.points, problem.observations
+    """Return the problem of some points alone, (P,) bool."""
+    points, seen, start = problem.points, problem.observations, problem.start
     kept = chosen[seen.point]
     number = np.cumsum(chosen) - 1
     return replace(
         problem,
         points=Points(points.host[chosen], points.pixel[chosen], points.log_depth[chosen], points.sigma[chosen]),
         observations=Observations(number[seen.point[kept]], seen.keyframe[kept], seen.pixel[kept]),
-        start=None,
+        start=start and start._replace(log_depth=start.log_depth[chosen]),
     )
 
 
-def _in_world(problem: BundleProblem, state: State) -> np.ndarray:
-    """Return the points (P, 3), mm, where their hosts see them."""
-    points = problem.points
+def _in_world(problem: BundleProblem) -> np.ndarray:
+    """Return the points (P, 3), mm, where their hosts see them when the search begins."""
+    points, state = problem.points, problem.begin
     rays = np.column_stack([points.pixel / np.exp(state.lens[0]), np.ones(len(points.host))])
     T = inverse(state.T_camera_world)[points.host]
     return np.einsum("nij,nj->ni", T[:, :3, :3], np.exp(state.log_depth)[:, None] * rays) + T[:, :3, 3]

@@ -1,7 +1,8 @@
-"""Bundle adjustment with tissue that moves: the rigid problem, and modes of a deformation graph with given curves.
+"""Bundle adjustment with tissue that moves: the rigid problem, and modes and curves of a deformation graph.
 
-To the cost of `bundle_adjustment` comes the prior of the modes. Unknowns of the reduced system are those of the
-keyframes, then the modes, axis by axis; points are eliminated one by one, since each touches few nodes.
+To the cost of `bundle_adjustment` come the priors of the modes and of the curves. Unknowns of the reduced system are
+those of the keyframes, the modes, axis by axis, and the curves unless they are given. Points are eliminated one by one,
+since each touches few nodes.
 """
 
 from __future__ import annotations
@@ -32,13 +33,15 @@ from scopemap.mapping.deformation_graph import Deformation
 
 _RIDGE = 1e-9  # of the diagonal
 _MAX_ITERATIONS, _MIN_DECREASE = 20, 1e-3
+_CURVE_SIGMA = 0.3  # prior standard deviation of a curve, whose largest value is 1
 
 
 @dataclass(frozen=True)
 class NonRigidProblem:
     """What is adjusted: `rigid`, and the modes of a deformation with these nodes (N, 3) and curves `basis` (K, L).
 
-    skin : of the points of `rigid`. prior : (L N, L N), normal matrix of one axis of the modes.
+    skin : of the points of `rigid`. prior : (L N, L N), normal matrix of one axis of the modes. free : whether the
+    curves are adjusted, near `basis`.
     """
 
     rigid: BundleProblem
@@ -46,26 +49,33 @@ class NonRigidProblem:
     basis: np.ndarray
     skin: Skin
     prior: sparse.csr_matrix
+    free: bool = False
 
-    def moved(self, modes: np.ndarray) -> np.ndarray:
+    @property
+    def curve_unknowns(self) -> int:
+        """Number of unknowns of the curves, curve by curve."""
+        return self.basis.size if self.free else 0
+
+    def moved(self, modes: np.ndarray, basis: np.ndarray) -> np.ndarray:
         """Return by how much (N, 3) mm the point of each observation has moved since its host saw it."""
         seen, hosts = self.rigid.observations, self.rigid.points.host
-        displacement = Deformation(self.nodes, self.basis, modes).displacement
+        displacement = Deformation(self.nodes, basis, modes).displacement
         return self.skin.moved(displacement, seen.point, hosts[seen.point], seen.keyframe)
 
 
 class NonRigidState(NamedTuple):
-    """Keyframes and points, and the modes (L, N, 3) mm of the nodes."""
+    """Keyframes and points, the modes (L, N, 3) mm of the nodes, and their curves (K, L)."""
 
     rigid: State
     modes: np.ndarray
+    basis: np.ndarray
 
 
 def solve(problem: NonRigidProblem, start: NonRigidState) -> NonRigidState:
     """Return the state that the search finds from a start; the first keyframe keeps its pose."""
 
     def rescaled(state: NonRigidState) -> NonRigidState:
-        seen = reproject(problem.rigid, state.rigid, problem.moved(state.modes))
+        seen = reproject(problem.rigid, state.rigid, problem.moved(state.modes, state.basis))
         lengths_px = np.linalg.norm(seen.error[seen.ahead], axis=1)
         sigma_px = robust_sigma_2d(lengths_px, problem.rigid.least_sigma_px)
         return state._replace(rigid=state.rigid._replace(sigma_px=sigma_px))
@@ -77,9 +87,11 @@ def solve(problem: NonRigidProblem, start: NonRigidState) -> NonRigidState:
 
 def _retract(problem: NonRigidProblem, state: NonRigidState, step: np.ndarray) -> NonRigidState:
     first = PER_KEYFRAME * len(state.rigid.T_camera_world)
-    last = first + state.modes.size
+    end = first + state.modes.size
+    last = end + problem.curve_unknowns
     rigid = retract(problem.rigid, state.rigid, np.append(step[:first], step[last:]))
-    return NonRigidState(rigid, state.modes + _modes_of(step[first:last], state.modes.shape))
+    basis = state.basis + step[end:last].reshape(state.basis.T.shape).T if problem.free else state.basis
+    return NonRigidState(rigid, state.modes + _modes_of(step[first:end], state.modes.shape), basis)
 
 
 def _modes_of(unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -95,23 +107,27 @@ class _Linear(NamedTuple):
     by_host: np.ndarray  # (N, 2, 6)
     by_depth: np.ndarray  # (N, 2)
     by_world: np.ndarray  # (N, 2, 3), px / mm of the point's motion in the world
+    by_curve: np.ndarray  # (N, 2, L), px, by the observing keyframe's values of the curves
     weight: np.ndarray  # (N,)
     off: np.ndarray  # (P,)
     held: np.ndarray  # (P,)
 
 
 class NonRigidModel:
-    """Model of the cost around a state; steps are keyframes, modes, points."""
+    """Model of the cost around a state; steps are keyframes, modes, curve, points."""
 
     def __init__(self, problem: NonRigidProblem, state: NonRigidState) -> None:
         self._problem, self._state, rigid = problem, state, problem.rigid
         self._first = PER_KEYFRAME * len(state.rigid.T_camera_world)
-        self._unknowns = self._first + state.modes.size
+        self._end = self._first + state.modes.size
+        self._unknowns = self._end + problem.curve_unknowns
         self._modes = state.modes.transpose(2, 0, 1).reshape(3, -1)
-        self._seen: Reprojection = reproject(rigid, state.rigid, problem.moved(state.modes))
+        self._seen: Reprojection = reproject(rigid, state.rigid, problem.moved(state.modes, state.basis))
         self._edges = odometry_edges(rigid, state.rigid)
         self._off = state.rigid.log_depth - rigid.points.log_depth - state.rigid.log_scale[rigid.points.host]
         self.cost = cost(rigid, state.rigid, self._seen, self._edges) + 0.5 * self._stiffness(self._modes)
+        if problem.free:
+            self.cost += 0.5 * float((((state.basis - problem.basis) / _CURVE_SIGMA) ** 2).sum())
 
     def _stiffness(self, modes: np.ndarray) -> float:
         return float((modes.T * (self._problem.prior @ modes.T)).sum())
@@ -124,18 +140,32 @@ class NonRigidModel:
         by_world = by_camera[:, :, 3:] / rigid.unit_mm @ R
         held = cauchy((self._off / rigid.points.sigma) ** 2, CAUCHY)[1] / rigid.points.sigma**2
         weight = weights(state, self._seen) / rigid.correlated
-        return _Linear(self._seen.error, by_camera, by_host, by_depth, by_world, weight, self._off, held)
+        node, share = self._problem.skin.node, self._problem.skin.weight
+        # Of a basis that is given there are many curves, whose derivatives nobody needs.
+        modes = self._state.modes if self._problem.free else self._state.modes[:1]
+        at_points = np.einsum("pj,lpjc->pcl", share, modes[:, node])
+        by_curve = np.einsum("nij,njl->nil", by_world, at_points[rigid.observations.point])
+        return _Linear(self._seen.error, by_camera, by_host, by_depth, by_world, by_curve, weight, self._off, held)
 
     @cached_property
     def _priors(self) -> list[CameraBlock]:
-        return camera_blocks(self._problem.rigid, self._state.rigid, self._edges)
+        blocks = camera_blocks(self._problem.rigid, self._state.rigid, self._edges)
+        if self._problem.free:
+            off = (self._state.basis - self._problem.basis).T.ravel() / _CURVE_SIGMA**2
+            own = np.arange(self._end, self._unknowns)
+            blocks.append(CameraBlock(own, np.identity(len(own)) / _CURVE_SIGMA**2, off))
+        return blocks
 
     def _change(self, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what keyframes and modes of a step change: all observations (N, 2), and ln scale at points (P,)."""
+        """Return what a step without its points changes: all observations (N, 2), and ln scale at points (P,)."""
         rigid, linear = self._problem.rigid, self._linear
         own = step[: self._first].reshape(-1, PER_KEYFRAME)
         host = rigid.points.host[rigid.observations.point]
-        moved = self._problem.moved(_modes_of(step[self._first : self._unknowns], self._state.modes.shape))
+        modes = _modes_of(step[self._first : self._end], self._state.modes.shape)
+        moved = self._problem.moved(modes, self._state.basis)
+        if self._problem.free:
+            basis = step[self._end : self._unknowns].reshape(self._state.basis.T.shape).T
+            moved += self._problem.moved(self._state.modes, basis)
         change = np.einsum("nij,nj->ni", linear.by_camera, own[rigid.observations.keyframe, :6])
         change += np.einsum("nij,nj->ni", linear.by_host, own[host, :6])
         return change + np.einsum("nij,nj->ni", linear.by_world, moved), own[rigid.points.host, 6]
@@ -156,10 +186,11 @@ class NonRigidModel:
         for node, weight in zip(skin.node[seen.point].T, skin.weight[seen.point].T, strict=True):
             np.add.at(nodes, (seen.keyframe, node), weight[:, None] * force)
             np.add.at(nodes, (host, node), -weight[:, None] * force)
-        modes = np.einsum("kl,knc->cln", self._problem.basis, nodes).reshape(3, -1)
+        modes = np.einsum("kl,knc->cln", self._state.basis, nodes).reshape(3, -1)
         modes += (self._problem.prior @ self._modes.T).T
         depth = np.bincount(seen.point, (linear.by_depth * error).sum(1), len(held)) + held
-        gradient = np.concatenate([own.ravel(), modes.ravel(), depth])
+        basis = np.einsum("knc,lnc->lk", nodes, self._state.modes) if self._problem.free else np.zeros(0)
+        gradient = np.concatenate([own.ravel(), modes.ravel(), basis.ravel(), depth])
         for prior in self._priors:
             gradient[prior.columns] += prior.b
         gradient[:6] = 0
@@ -172,12 +203,12 @@ class NonRigidModel:
         matrix, rhs = np.zeros((self._unknowns, self._unknowns)), np.zeros(self._unknowns)
         start = np.searchsorted(seen.point, np.arange(len(points.host) + 1))
         ends = _Ends(start, points.host, seen.keyframe)
-        _add_points(matrix, rhs, ends, linear, problem.skin, problem.basis)
+        _add_points(matrix, rhs, ends, linear, problem.skin, self._state.basis, len(problem.nodes))
         for prior in self._priors:
             matrix[np.ix_(prior.columns, prior.columns)] += prior.A
             rhs[prior.columns] -= prior.b
         size = self._modes.shape[1]
-        for first, modes in zip(range(self._first, self._unknowns, size), self._modes, strict=True):
+        for first, modes in zip(range(self._first, self._end, size), self._modes, strict=True):
             own = slice(first, first + size)
             matrix[own, own] += problem.prior.toarray()
             rhs[own] -= problem.prior @ modes
@@ -201,7 +232,7 @@ class NonRigidModel:
         change = change + linear.by_depth * points[self._problem.rigid.observations.point][:, None]
         total = float(linear.weight @ (change**2).sum(1) + linear.held @ (points - log_scale) ** 2)
         total += sum(float(step[prior.columns] @ prior.A @ step[prior.columns]) for prior in self._priors)
-        return total + self._stiffness(step[self._first : self._unknowns].reshape(3, -1))
+        return total + self._stiffness(step[self._first : self._end].reshape(3, -1))
 
 
 class _Ends(NamedTuple):
@@ -214,13 +245,14 @@ class _Ends(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _add_points(
-    matrix: np.ndarray, rhs: np.ndarray, ends: _Ends, linear: _Linear, skin: Skin, basis: np.ndarray
+    matrix: np.ndarray, rhs: np.ndarray, ends: _Ends, linear: _Linear, skin: Skin, basis: np.ndarray, nodes: int
 ) -> None:
-    """Add the normal equations of keyframes and modes, without the points, to matrix and right-hand side."""
+    """Add the normal equations of keyframes, modes and curves, without the points, to matrix and right-hand side."""
     curves, size = basis.shape[1], len(rhs)
     first = PER_KEYFRAME * len(basis)
-    nodes = (size - first) // (3 * curves)
-    most = 12 + 3 * curves * skin.node.shape[1]
+    end = first + 3 * curves * nodes
+    free = curves if size > end else 0
+    most = 12 + 3 * curves * skin.node.shape[1] + 2 * free
     columns, row = np.empty(most, np.int64), np.empty((2, most))
     E, touched, known = np.zeros(size), np.empty(size, np.int64), np.zeros(size, np.bool_)
     for p in range(len(ends.host)):
@@ -240,10 +272,17 @@ def _add_points(
                 if change == 0:
                     continue
                 for j in range(skin.node.shape[1]):
+                    if skin.weight[p, j] == 0:
+                        continue
                     for axis in range(3):
                         columns[used] = first + (axis * curves + curve) * nodes + skin.node[p, j]
                         row[:, used] = change * skin.weight[p, j] * linear.by_world[k, :, axis]
                         used += 1
+            for curve in range(free):
+                column = end + curve * len(basis)
+                columns[used], columns[used + 1] = column + ends.keyframe[k], column + host
+                row[:, used], row[:, used + 1] = linear.by_curve[k, :, curve], -linear.by_curve[k, :, curve]
+                used += 2
             for side in range(2):
                 depth = linear.weight[k] * linear.by_depth[k, side]
                 h += depth * linear.by_depth[k, side]

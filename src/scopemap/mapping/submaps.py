@@ -225,13 +225,15 @@ class FinalFrames:
     Attributes
     ----------
     T_world_camera : corrected poses (4, 4) by number. keyframes : numbers of those whose depth can be triangulated:
-    none where a rigid scene does not explain the observations.
+    none where neither a rigid scene nor one with a rigid core explains the observations.
     """
 
     def __init__(self, submap: Submap, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]) -> None:
         """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
         self._stored, self._tracked, self._correction = read, T_world_camera, submap.correction
-        rigid = submap.correction is not None and not (submap.correction.refused or submap.correction.tissue)
+        correction = submap.correction
+        moves = correction is not None and correction.tissue is not None and not correction.tissue.deformation.has_core
+        rigid = correction is not None and not correction.refused and not moves
         correct = submap.correction.pose if submap.correction is not None else lambda _, pose: pose
         self.T_world_camera = {index: correct(index, pose) for index, pose in sorted(T_world_camera.items())}
         adjusted = submap.correction.index.tolist() if rigid and submap.correction is not None else []
