@@ -209,13 +209,17 @@ class _Finishing:
             # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
             median_mm = store.median_depth_mm(submap.main_frames)
             moving = MovingTissue(block_edge_mm(median_mm))
-            state: SurfaceState | SeenAt | None = None if states is None else SurfaceState(states)
-            if at_s is not None and states is None:
-                state = SeenAt(final.frames(None), at_s, block_edge_mm(median_mm))
+            state, seen_at = None if states is None else SurfaceState(states), None
+            if at_s is not None:
+                # What one curve does not explain is as the frames around that second have it.
+                at_rest = final.frames(None) if state is None else map(state.fused, final.frames(None))
+                seen_at = SeenAt(at_rest, at_s, block_edge_mm(median_mm))
             checked = self.run.checked.pop(submap.main, SpreadFrames())
             all_frames = sum(len(submap.frames) for submap in submaps)
             written = self._written(corrected, checked, moving, all_frames)
-            seen = in_thread(written if state is None else map(state.fused, written), "write")
+            for part in (state, seen_at):
+                written = written if part is None else map(part.fused, written)
+            seen = in_thread(written, "write")
             with closing(seen):
                 fused: FusedSurface = self.run.clock.timed(
                     "fuse", pipeline.fusion.fuse, seen, submap.main_frames, submap.main
@@ -228,7 +232,7 @@ class _Finishing:
         provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
         notices = self.notices + motion_notices(frames, config)
         notices += [] if submap.correction is None else submap.correction.notices
-        notices += [part.notice for part in (state, depths) if part is not None] + fused.notices
+        notices += [part.notice for part in (state, seen_at, depths) if part is not None] + fused.notices
         notices += [] if free_space.notice is None else [free_space.notice]
         masks, known_mm = pipeline.estimators.masks, self.frames["median_depth_mm"]
         notices += [] if masks is None else masks.notices
