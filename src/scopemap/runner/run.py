@@ -200,7 +200,7 @@ class _Finishing:
         final = FinalFrames(submap, self._stored_poses(submap), store.frame)
         frames, at_s = frames_of_submap(number, submaps, self.frames), config.fusion.surface_at_s
         states = _states(submap, frames.only(frames.tracked), at_s)
-        depths = self._triangulated_depths(final)
+        depths = self._triangulated_depths(final, states)
         with closing(depths) if depths is not None else nullcontext():
             views = views_among(list(final.T_world_camera)) if config.fusion.constants.free_space else []
             free_space: FreeSpace = self.run.clock.timed("free space", FreeSpace, final.frames(None, among=views))
@@ -261,13 +261,14 @@ class _Finishing:
         poses = zip(self.frames["index"].tolist(), self.frames["T_world_camera"], strict=True)
         return {index: T_world_camera for index, T_world_camera in poses if index in submap.frames}
 
-    def _triangulated_depths(self, final: FinalFrames) -> KeyframeDepths | None:
+    def _triangulated_depths(self, final: FinalFrames, states: TissueStates | None) -> KeyframeDepths | None:
         """Return what triangulates the depth of a submap's keyframes; None where nothing can."""
         config, flow = self.run.pipeline.config, self.run.pipeline.estimators.keyframe_flow
         used = bool(self.run.writers) or config.fusion.enabled
         if not (used and config.mapping.constants.triangulate_depth and final.keyframes) or flow.name == "none":
             return None
-        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, self.run.sequence.camera, flow)
+        camera = self.run.sequence.camera
+        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow, states)
 
     def _written(
         self, frames: Iterator[Frame], checked: SpreadFrames, moving: MovingTissue, count: int

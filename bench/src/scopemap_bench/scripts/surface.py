@@ -8,7 +8,7 @@ AbsRel is that of all depth maps with one scale. Runs of `overview --out FOLDER`
 `--camera-at-rest` on EndoNeRF's `pulling_soft_tissues`: median of |z - stereo| at the vertices of each frame's surface
 outside `gt_masks`, with one scale for all. Third table: laparoscopy phantoms, a part of whose tissue is pushed by 8 mm
 in the middle of three seconds: the mesh of all frames and that of `--surface-at` against the frame of that second,
-where tissue moved by 2 mm or more.
+where tissue moved by 2 mm or more, and against its true depth there, with one scale where tissue is at rest.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import trimesh
 
 from scopemap.actions.inputs import open_truth
 from scopemap.fusion.agreement import compare_with_frame
+from scopemap.geometry.rendering import render_mesh
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.depth_maps import DepthReader
 from scopemap.trajectory.formats.opening import read_trajectory
@@ -93,20 +94,26 @@ def moved_part(source: Path, run: Path, index: int) -> np.ndarray:
 
 
 def agreement_there(source: Path, run: Path, index: int) -> str:
-    """Return the depth error and the SSIM of a run's mesh against frame `index`, where tissue moves."""
-    frame = next(frame for frame, _ in open_truth(run, source) if frame.index == index)
+    """Return the depth error and the SSIM of a run's mesh against frame `index`, where tissue moves, and to truth."""
+    frame, truth = next(pair for pair in open_truth(run, source) if pair[0].index == index)
     depth_mm, T = DepthReader(run).read(index), read_trajectory(run).T_world_camera[index]
-    known_mm = np.where(moved_part(source, run, index) & frame.valid, depth_mm, np.nan)
+    moved = moved_part(source, run, index) & frame.valid
     mesh = trimesh.load(run / "mesh.ply", process=False)
+    known_mm = np.where(moved, depth_mm, np.nan)
     found, _ = compare_with_frame(mesh, frame.camera, T, frame.rgb, known_mm, albedo=True)
-    return f"{found.depth_error:.1%}, {found.ssim:.2f}"
+    assert truth is not None
+    assert truth.depth_mm is not None
+    # Of one size where tissue is at rest.
+    error = np.log(render_mesh(mesh, frame.camera, T).depth_mm / np.where(truth.depth_mm > 0, truth.depth_mm, np.nan))
+    to_truth = np.nanmedian(np.abs(error[moved] - np.nanmedian(error[~moved & frame.valid])))
+    return f"{found.depth_error:.1%}, {found.ssim:.2f}, {to_truth:.1%}"
 
 
 def print_at_a_second(out: Path) -> None:
     """Run a poked phantom as a whole and at its first and last second; print the third table."""
     source = measuring.phantom(out / "phantoms" / "poke", *POKED)
     whole = measuring.run_once(source, out / "poke-whole")
-    measuring.print_head("second", "all frames: depth, SSIM", "`--surface-at`: depth, SSIM")
+    measuring.print_head("second", "all frames: depth, SSIM, to truth", "`--surface-at`: depth, SSIM, to truth")
     for index, second in SECONDS.items():
         at = measuring.run_once(source, out / f"poke-{index}", "--surface-at", second)
         measuring.print_row(f"{second:.1f}", *(agreement_there(source, run, index) for run in (whole, at)))
