@@ -184,6 +184,8 @@ def parse_polyps(text: str) -> tuple[Polyp, ...]:
     for part in filter(None, (piece.strip() for piece in text.split(","))):
         match = re.fullmatch(rf"({'|'.join(kinds)}):(\d+(?:\.\d+)?)@(\d+)", part)
         if not match:
-            raise SettingsError(f"cannot read the polyp '{part}': expected KIND:MM@FRAME, KIND one of {', '.join(kinds)}")
+            raise SettingsError(
+                f"cannot read the polyp '{part}': expected KIND:MM@FRAME, KIND one of {', '.join(kinds)}"
+            )
         polyps.append(Polyp(match[1], float(match[2]), int(match[3])))  # type: ignore[arg-type]
     return tuple(polyps)
