@@ -14,29 +14,32 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trimesh
+from scipy import ndimage
 
 from scopemap.actions.export.exported_run import ExportedRun, read_exported, write_image
-from scopemap.actions.measure import Known, Measure, known_scale
+from scopemap.actions.measure import Known, KnownScale, Measure, known_scale
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.rectification import Rectifier
 from scopemap.errors import InputError
-from scopemap.geometry.lesion_shape import FIGURES, view_shape
-from scopemap.geometry.rendering import render_mesh
+from scopemap.geometry.lesion_shape import LesionView, view_shape
+from scopemap.geometry.rendering import render_mesh, vertex_colours
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.decoding import by_number, read_decoded
 from scopemap.report.measured_surface import drawn
 
-_NAMES = {
-    "diameter": "largest diameter",
-    "cross": "diameter across it",
-    "along": "along the surface",
-    "area": "area",
-    "height": "height",
+_FIGURES = {
+    "diameter": ("largest diameter", 1, 0.07),
+    "cross": ("diameter across it", 1, 0.12),
+    "along": ("along the surface", 1, 0.12),
+    "area": ("area that is seen", 2, 0.12),
 }
-_POWERS = {"area": 2}
-_LOCAL_ERROR = {"diameter": 0.05, "cross": 0.07, "along": 0.10, "area": 0.08, "height": 0.25}
-"""Standard deviation, as a share (of the square root of an area), that all frames have in common; by phantoms."""
-_OUTLINE_PX, _COMMON = 1.0, 0.5
+"""Name, power of the unit, and the standard deviation, as a share of a length, that all frames have in common.
+
+It is by phantoms (docs/measure.md): local errors of depth, and that lesions are not round.
+"""
+_LOWER, _HIGHER = 0.1, 0.5
+"""A height is too large by no more than this share of the diameter, too small by no more than that: depth is smooth."""
+_OUTLINE_PX, _COMMON, _LEAST_FACING = 0.7, 0.5, 0.1
 _EDGE_PX, _LEAST_PX, _MOST_FRAMES = 2, 60, 60
 _IN_FRONT, _LEAST_LEFT = 0.1, 0.8
 _FIRST_ROW = 30  # of the drawn numbers, after those of the scale
@@ -73,23 +76,20 @@ def measure_lesion(folder: Path, lesion: Lesion, known: Known | None = None) -> 
     scale = known_scale(run, known)
     given = _given_masks(run, lesion)
     masks = given if lesion.frame is None else carried_masks(run, lesion.frame, given[lesion.frame])
-    views = {index: view for index, mask in masks.items() if (view := _view(run, index, mask))}
+    views = {index: view for index, mask in masks.items() if (view := _view(run, index, mask)) is not None}
     if not views:
         raise InputError(
-            f"no frame of {folder} sees the whole lesion with its depth: it is cut off, smaller than {_LEAST_PX} pixels, "
-            "or its depth is unknown"
+            f"no frame of {folder} sees the whole lesion with its depth: it is cut off, smaller than {_LEAST_PX} "
+            "pixels, or its depth is unknown"
         )
     found = []
-    for row, figure in enumerate(FIGURES, start=_FIRST_ROW):
-        power = _POWERS.get(figure, 1)
-        combined = _combined(run, views, masks, figure)
-        if combined is not None:
-            value, sigma = combined
-            draws = (
-                np.exp(power * sigma * drawn(row, 1, scale.sizes["draws"])[0]) * (scale.draws / scale.focal) ** power
-            )
-            unit = scale.unit if power == 1 else scale.square
-            found.append(Measure.of(_NAMES[figure], value / scale.divisor**power, draws, unit, scale.sizes))
+    for row, (figure, (name, power, common)) in enumerate(_FIGURES.items(), start=_FIRST_ROW):
+        value, sigma = _combined(views, masks, figure, common)
+        own = np.exp(sigma * drawn(row, 1, scale.sizes["draws"])[0])
+        draws = (own * scale.draws * scale.depth / scale.focal) ** power
+        unit = scale.unit if power == 1 else scale.square
+        found.append(Measure.of(name, value / scale.divisor**power, draws, unit, scale.sizes))
+    found.append(_height(views, found[0], scale))
     return MeasuredLesion(found, scale.words, {index: masks[index] for index in views})
 
 
@@ -129,14 +129,42 @@ def _read_mask(run: ExportedRun, file: Path) -> np.ndarray:
     return Rectifier(calibration.camera, camera).nearest(mask.astype(np.uint8)) > 0
 
 
+def frame_at(folder: Path, second: float) -> int:
+    """Return the number of the frame with a pose that is nearest to a time, s."""
+    trajectory = read_exported(folder).trajectory
+    return int(trajectory.indices[np.abs(trajectory.times_s - second).argmin()])
+
+
+def shaft_width(folder: Path, file: Path) -> np.ndarray:
+    """Return two pixels (2, 2) as far apart as an instrument's shaft is wide, beside its tip, from a mask of it.
+
+    The tip is the end of the mask that is farther from the picture's border.
+    """
+    mask = _read_mask(read_exported(folder), file)
+    pixels = np.argwhere(mask)[:, ::-1].astype(float)
+    if len(pixels) < _LEAST_PX:
+        raise InputError(f"the mask {file} shows no shaft: it has {len(pixels)} pixels")
+    middle = pixels.mean(axis=0)
+    along, across = np.linalg.svd(pixels - middle, full_matrices=False)[2]
+    place = (pixels - middle) @ along
+    ends = middle + np.outer([place.min(), place.max()], along)
+    from_border = np.minimum(ends, [mask.shape[1], mask.shape[0]] - ends).min(axis=1)
+    along, place = (along, place) if from_border[1] >= from_border[0] else (-along, -place)
+    width = len(pixels) / np.ptp(place)
+    part = np.abs(place - (place.max() - width)) < 0.5 * width
+    width = part.sum() / np.ptp(place[part])
+    centre = middle + along * place[part].mean() + across * ((pixels - middle)[part] @ across).mean()
+    return centre + np.outer([-0.5, 0.5], width * across)
+
+
 def carried_masks(run: ExportedRun, frame: int, mask: np.ndarray) -> dict[int, np.ndarray]:
     """Return the masks (H, W) bool of what a mask of one frame shows, in all frames that see it, by number."""
     poses = dict(zip(run.trajectory.indices.tolist(), run.trajectory.T_world_camera, strict=True))
     surface = _marked(run, frame, mask, poses[frame])
-    middle = np.asarray(surface.vertices)[np.asarray(surface.visual.vertex_colors)[:, 0] > 127].mean(axis=0)
+    middle = np.asarray(surface.vertices)[vertex_colours(surface)[:, 0] > 127].mean(axis=0)
     pixels = {n: run.camera.project(transform(inverse(pose), middle[None]))[0] for n, pose in poses.items()}
     size = np.array([run.camera.width, run.camera.height])
-    near = [n for n, pixel in pixels.items() if n != frame and np.isfinite(pixel).all() and (0 <= pixel).all()]
+    near = [n for n, pixel in pixels.items() if n != frame and np.isfinite(pixel).all() and (pixel >= 0).all()]
     near = [n for n in near if (pixels[n] < size).all()]
     masks = {frame: mask}
     for index in near[:: -(-len(near) // _MOST_FRAMES) or 1]:
@@ -147,8 +175,14 @@ def carried_masks(run: ExportedRun, frame: int, mask: np.ndarray) -> dict[int, n
         there = seen.rgb[..., 0] > 127
         clear = there & ~(depth_mm < (1 - _IN_FRONT) * seen.depth_mm)
         if there.any() and clear.sum() >= _LEAST_LEFT * there.sum():
-            masks[index] = there
+            masks[index] = _largest_part(there)
     return dict(sorted(masks.items()))
+
+
+def _largest_part(mask: np.ndarray) -> np.ndarray:
+    """Return the largest connected part of a mask (H, W) bool: beside a gap of the surface lies what is behind."""
+    _, parts, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    return np.asarray(parts == 1 + facts[1:, cv2.CC_STAT_AREA].argmax())
 
 
 def _at(run: ExportedRun, mesh: trimesh.Trimesh, index: int) -> trimesh.Trimesh:
@@ -163,8 +197,8 @@ def _marked(run: ExportedRun, frame: int, mask: np.ndarray, pose: np.ndarray) ->
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = run.camera.project(points).astype(np.float32)
     u, v = np.nan_to_num(pixels, nan=-9).clip(-9, 1e4).T
-    level = cv2.remap(mask.astype(np.float32), u, v, cv2.INTER_LINEAR).ravel()
-    there = cv2.remap(seen, u, v, cv2.INTER_NEAREST).ravel()
+    level = ndimage.map_coordinates(mask.astype(np.float32), [v, u], order=1)
+    there = ndimage.map_coordinates(seen, [v, u], order=0, cval=np.nan)
     level[~(points[:, 2] < (1 + _IN_FRONT / 2) * there) | (points[:, 2] <= 0)] = 0
     if not (level > 0.5).any():
         raise InputError(f"no surface where frame {frame} shows the lesion: a mask there can be carried nowhere")
@@ -172,35 +206,44 @@ def _marked(run: ExportedRun, frame: int, mask: np.ndarray, pose: np.ndarray) ->
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
 
-def _view(run: ExportedRun, index: int, mask: np.ndarray) -> dict[str, float]:
-    """Return the figures of a lesion in a frame; {} where it is cut off, too small, or its depth unknown."""
+def _view(run: ExportedRun, index: int, mask: np.ndarray) -> LesionView | None:
+    """Return the sizes of a lesion in a frame; None where it is cut off, too small, or its depth unknown."""
     depth_mm = run.depth.read(index)
-    inner = np.zeros(mask.shape, bool)
-    inner[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX] = True
-    if depth_mm is None or (mask & ~inner).any() or mask.sum() < _LEAST_PX:
-        return {}
+    inner = mask[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX]
+    if depth_mm is None or inner.sum() < mask.sum() or mask.sum() < _LEAST_PX:
+        return None
     return view_shape(mask, depth_mm, run.camera)
 
 
 def _combined(
-    run: ExportedRun, views: dict[int, dict[str, float]], masks: dict[int, np.ndarray], figure: str
-) -> tuple[float, float] | None:
-    """Return a figure by all frames, and its relative standard deviation without the scale's; None: it is unknown."""
-    power = _POWERS.get(figure, 1)
-    known = {n: view for n, view in views.items() if np.isfinite(view[figure]) and view[figure] > 0}
-    if not known:
-        return None
-    values = np.array([view[figure] for view in known.values()])
-    width_px = np.array([2 * np.sqrt(masks[n].sum() / np.pi) for n in known])
-    facing = np.array([np.nan_to_num(view["facing"], nan=0.5) for view in known.values()]).clip(0.05, 1)
+    views: dict[int, LesionView], masks: dict[int, np.ndarray], figure: str, common: float
+) -> tuple[float, float]:
+    """Return a figure by all frames, and its relative standard deviation (of a length) without that of the scale."""
+    power = _FIGURES[figure][1]
+    values = np.array([getattr(view, figure) for view in views.values()])
+    width_px = np.array([2 * np.sqrt(masks[index].sum() / np.pi) for index in views])
     outline = np.sqrt(2) * _OUTLINE_PX / width_px
-    weights = facing**2 / (outline**2 + _LOCAL_ERROR[figure] ** 2)
+    weights = _facing(views) ** 2 / (outline**2 + np.array([view.sigma for view in views.values()]) ** 2)
     value = _weighted_median(values, weights)
     spread = 1.48 * _weighted_median(np.abs(np.log(values / value)), weights) / power
     effective = weights.sum() ** 2 / (weights**2).sum()
     own = spread**2 * (_COMMON + (1 - _COMMON) / effective)
-    common = np.average(outline**2, weights=weights) + _LOCAL_ERROR[figure] ** 2
-    return value, float(np.sqrt(own + common))
+    return value, float(np.sqrt(own + np.average(outline**2, weights=weights) + common**2))
+
+
+def _height(views: dict[int, LesionView], diameter: Measure, scale: KnownScale) -> Measure:
+    """Return the height by all frames that know it, 0 where none does; its interval is by the diameter."""
+    values = np.array([view.height for view in views.values()])
+    known = np.isfinite(values)
+    value = _weighted_median(values[known], _facing(views)[known] ** 2) / scale.divisor if known.any() else 0.0
+    value = max(value, 0.0)
+    low, high = max(value - _LOWER * diameter.high, 0.0), value + _HIGHER * diameter.high
+    return Measure("height", value, low, high, diameter.unit)
+
+
+def _facing(views: dict[int, LesionView]) -> np.ndarray:
+    """Return the cosines (N,) at which views see the wall, at least 0.1, also where it is unknown."""
+    return np.nan_to_num([view.facing for view in views.values()]).clip(_LEAST_FACING, 1)
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:

@@ -21,6 +21,7 @@ from scopemap.report.measured_surface import drawn, measure_errors, measured_dep
 
 _REFERENCE_ROW, _FIRST_ROW = 3, 9
 """Of the drawn numbers: 0 to 2 are what all share, then three for each point."""
+_LEAST_REFERENCE_PX = 10
 
 
 @dataclass(frozen=True)
@@ -116,13 +117,14 @@ class Known:
 class KnownScale:
     """The scale of a run's millimetres: what lengths are divided by, (D,) draws of its error, unit and its square.
 
-    focal : (D,) draws of the focal length over its value. words : what the scale rests on. sizes : of the errors, from
+    focal, depth : (D,) draws of the focal length, and of what is common to depth, over their values. words : what the scale rests on. sizes : of the errors, from
     `measure_errors`.
     """
 
     divisor: float
     draws: np.ndarray
     focal: np.ndarray
+    depth: np.ndarray
     unit: str
     square: str
     words: str
@@ -138,18 +140,20 @@ def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
                 f"{run.path}: {run.scale}; give two points as a reference: measures are then multiples of their "
                 "distance, and millimetres where that is given, too"
             )
-        return KnownScale(1.0, errors.scale, errors.focal, "mm", "mm2", run.scale, errors.sizes)
+        alike = np.ones_like(errors.scale)
+        return KnownScale(1.0, errors.scale, errors.focal, alike, "mm", "mm2", run.scale, errors.sizes)
+    if (far_px := float(np.linalg.norm(known.pixels[1] - known.pixels[0]))) < _LEAST_REFERENCE_PX:
+        raise InputError(f"the reference is {far_px:.1f} px long: {_LEAST_REFERENCE_PX} px are needed")
     picked = _picked(run, measured_mesh(run, known.frame), known.frame, _pose(run, known.frame), known.pixels)
     length = _straight(np.stack([point.position for point in picked.points]))
-    if length <= 0:
-        raise InputError("the reference's two points are the same")
     draws = 1 / _relative(run, picked, errors, _straight, _REFERENCE_ROW)
     if known.length_mm is None:
         unit, words = "times the reference", f"two points of frame {known.frame}, whose distance in mm is not known"
     else:
         unit, words = "mm", f"two points of frame {known.frame}, taken to be {known.length_mm:g} mm apart"
     square = {"mm": "mm2"}.get(unit, "times the reference's square")
-    return KnownScale(length / (known.length_mm or 1.0), draws, errors.focal, unit, square, words, errors.sizes)
+    alike = np.exp(picked.depth_error.mean() * errors.depth / np.sqrt(2))
+    return KnownScale(length / (known.length_mm or 1.0), draws, errors.focal, alike, unit, square, words, errors.sizes)
 
 
 def _pose(run: ExportedRun, frame: int) -> np.ndarray:

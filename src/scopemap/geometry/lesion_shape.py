@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -9,11 +11,32 @@ from scipy.spatial.distance import pdist, squareform
 
 from scopemap.cameras.camera import PinholeCamera
 
-FIGURES = ("diameter", "cross", "along", "area", "height")
-_SMOOTH_PX, _PROFILE = 1.0, 64
+_SMOOTH_PX, _PROFILE = 1.0, 12
+_RIM_PX, _RIM_SHARE = 2.5, 0.5
 _RING = (0.15, 0.6)  # the wall beside a lesion: from so far outside its outline to so far, over its radius
-_GAP_PX, _LEAST_RING_PX = 2.0, 30
-_OUTLIER = 2.5
+_GAP_PX, _LEAST_RING_PX, _OUTLIER = 2.0, 30, 2.5
+_LEAST_KNOWN, _LEAST_PX = 0.7, 12
+# A lesion's largest diameter over the largest across the line of sight, and its standard deviation, as a share; that of
+# the diameter by depth, and what it grows by with the depth that is in it over what is not; by phantoms.
+_OVER_ACROSS, _ROUND_ERROR, _DEPTH_ERROR, _SLANT_ERROR = 1.0, 0.1, 0.06, 0.3
+
+
+@dataclass(frozen=True)
+class LesionView:
+    """A lesion as a view shows it, mm and mm2; NaN: unknown.
+
+    diameter, cross : the largest, and the largest across it. along : on the surface between the ends of the diameter.
+    area : of what is seen. height : of its top over the plane of the wall beside it. facing : cosine at which that
+    plane is seen. sigma : standard deviation of the diameter, as a share.
+    """
+
+    diameter: float
+    cross: float
+    along: float
+    area: float
+    height: float
+    facing: float
+    sigma: float
 
 
 def extents(points: np.ndarray) -> tuple[float, float]:
@@ -25,57 +48,87 @@ def extents(points: np.ndarray) -> tuple[float, float]:
     return largest, _farthest((points - points[first]) @ across.T)[0]
 
 
-def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) -> dict[str, float]:
-    """Return the figures of a lesion in a view, mm and mm2, and `facing`: the cosine at which its wall is seen.
+def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) -> LesionView | None:
+    """Return the sizes of a lesion in a view; None where too little of its depth is known.
 
-    mask : (H, W) bool. depth_mm : (H, W), NaN = unknown. diameter, cross : `extents` of what is seen. along : length
-    on the surface between the diameter's ends, where the view shows them joined by a straight line. height : from the
-    wall beside it, NaN where too little of that is seen. {} where too little depth is known.
+    mask : (H, W) bool. depth_mm : (H, W), NaN = unknown. Depth errs most along the line of sight, so the diameter by
+    depth is joined with that across the line of sight, which is nearly as large as lesions are round; each has its
+    weight.
     """
-    smooth = _smoothed(mask, depth_mm)
-    known = mask & np.isfinite(smooth)
-    if known.sum() < 0.7 * mask.sum() or known.sum() < 12:
-        return {}
-    v, u = np.nonzero(known)
+    known = mask & np.isfinite(depth_mm)
+    if known.sum() < max(_LEAST_KNOWN * mask.sum(), _LEAST_PX):
+        return None
+    smooth, outline = _smoothed(mask, depth_mm)
+    v, u = np.nonzero(mask)
     # A pixel is an area: its sides count.
     sides = np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
     pixels = (np.stack([u, v], -1)[:, None] + sides).reshape(-1, 2)
-    points = camera.unproject(pixels) * np.repeat(smooth[known], len(sides))[:, None]
-    diameter, cross = extents(points)
-    _, first, last = _farthest(points)
-    line = np.linspace(pixels[first], pixels[last], _PROFILE).astype(np.float32)
-    filled = np.where(known, smooth, 0).astype(np.float32)
-    weight = cv2.remap(known.astype(np.float32), line[:, 0], line[:, 1], cv2.INTER_LINEAR).ravel()
-    profile = cv2.remap(filled, line[:, 0], line[:, 1], cv2.INTER_LINEAR).ravel() / np.maximum(weight, 1e-6)
-    ends = weight > 0.05
-    path = camera.unproject(line[ends].astype(float)) * profile[ends, None]
-    along = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) * _PROFILE / max(int(ends.sum()), 1)
+    rays = camera.unproject(pixels)
+    points = rays * np.repeat(smooth[mask], len(sides))[:, None]
+    largest, first, last = _farthest(points)
+    flat = _farthest(rays[:, :2])[0] * float(np.median(smooth[outline]))
+    if largest == 0 or flat == 0:
+        return None
+    slant = _slant(points[first], points[last])
+    weights = np.array([_DEPTH_ERROR**2 + (_SLANT_ERROR * slant) ** 2, _ROUND_ERROR**2]) ** -1
+    diameter = float(np.exp(np.average(np.log([largest, _OVER_ACROSS * flat]), weights=weights)))
+    along = _length(smooth, pixels[first], pixels[last], camera) / largest
     height, facing = _height(mask, depth_mm, camera, points)
-    return {
-        "diameter": diameter,
-        "cross": cross,
-        "along": max(along, diameter),
-        "area": _area(known, smooth, camera) * mask.sum() / known.sum(),
-        "height": height,
-        "facing": facing,
-    }
+    return LesionView(
+        diameter,
+        min(extents(points)[1], diameter),
+        diameter * max(along, 1.0),
+        _area(smooth, camera),
+        height,
+        facing,
+        float(weights.sum() ** -0.5),
+    )
 
 
-def _smoothed(mask: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
-    """Return depth (H, W) smoothed inside a mask, by pixels of it alone; NaN outside."""
-    known = (mask & np.isfinite(depth_mm)).astype(np.float64)
-    inverse = np.where(known > 0, 1 / np.where(known > 0, depth_mm, 1.0), 0.0)
-    total, weight = (cv2.GaussianBlur(image, (0, 0), _SMOOTH_PX) for image in (inverse, known))
-    return np.where(mask & (weight > 0.2), weight / np.maximum(total, 1e-12), np.nan)
+def _slant(first: np.ndarray, last: np.ndarray) -> float:
+    """Return how much of the way between two points (3,) is along the line of sight, over what is across it."""
+    sight = (first + last) / np.linalg.norm(first + last)
+    along = abs(float((last - first) @ sight))
+    return along / max(float(np.linalg.norm(last - first - ((last - first) @ sight) * sight)), 1e-9)
 
 
-def _area(known: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) -> float:
-    """Return the area of the cells between four known pixels, over their share of the known pixels."""
-    points = camera.rays * np.where(known, depth_mm, np.nan)[..., None]
+def _length(depth_mm: np.ndarray, start: np.ndarray, end: np.ndarray, camera: PinholeCamera) -> float:
+    """Return the length, mm, of the surface between two pixels (2,), where the view shows a straight line."""
+    line = np.linspace(start, end, _PROFILE)
+    height, width = depth_mm.shape
+    column, row = np.rint(line).astype(int).T
+    depths = depth_mm[row.clip(0, height - 1), column.clip(0, width - 1)]
+    seen = np.isfinite(depths)
+    depths = np.interp(np.arange(_PROFILE), np.flatnonzero(seen), depths[seen])
+    return float(np.linalg.norm(np.diff(camera.unproject(line) * depths[:, None], axis=0), axis=1).sum())
+
+
+def _smoothed(mask: np.ndarray, depth_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return depth (H, W) of a mask's pixels, smoothed, NaN outside; and which pixels are beside the outline.
+
+    There depth runs into that of what is behind: it is replaced by that of the nearest pixel farther inside.
+    """
+    within = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    outline = mask & (within <= min(_RIM_PX, _RIM_SHARE * float(within.max())))
+    inner = mask & np.isfinite(depth_mm) & ~outline
+    inner = inner if inner.any() else mask & np.isfinite(depth_mm)
+    labels = cv2.distanceTransformWithLabels((~inner).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[
+        1
+    ]
+    inverse = np.zeros(labels.max() + 1)
+    inverse[labels[inner]] = 1 / depth_mm[inner]
+    inside = mask.astype(np.float64)
+    total, weight = (cv2.GaussianBlur(x, (0, 0), _SMOOTH_PX) for x in (inverse[labels] * inside, inside))
+    return np.where(mask, weight / np.maximum(total, 1e-12), np.nan), outline if outline.any() else mask
+
+
+def _area(depth_mm: np.ndarray, camera: PinholeCamera) -> float:
+    """Return the area of the cells between four pixels with depth (H, W), times pixels over cells."""
+    points = camera.rays * depth_mm[..., None]
     one, other = points[1:, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, 1:]
     area = np.linalg.norm(np.cross(one, other), axis=-1) / 2
     cells = np.isfinite(area)
-    return float(area[cells].sum() * known.sum() / max(int(cells.sum()), 1))
+    return float(area[cells].sum() * np.isfinite(depth_mm).sum() / max(int(cells.sum()), 1))
 
 
 def _height(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera, points: np.ndarray) -> tuple[float, float]:

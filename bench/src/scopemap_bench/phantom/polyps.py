@@ -1,7 +1,7 @@
 """Polyps on the wall of a phantom: where they grow, the shape that they give it, which points are theirs.
 
-A polyp is a body in coordinates that follow the wall: two along its tangent plane, and the distance from it. It is
-melted into the wall; its own are the points that the wall without it has well in front of it.
+A polyp is a body on the tangent plane of the wall; a flat one follows the wall. It is melted into the wall; its own are
+the points that the wall without it has well in front of it.
 """
 
 from __future__ import annotations
@@ -56,19 +56,21 @@ class GrownPolyp:
         return 0.6 * self.polyp.diameter_mm + self.height_mm + 2.0
 
     def distance(self, points_mm: np.ndarray, from_wall_mm: np.ndarray) -> np.ndarray:
-        """Return about the distance (N,), mm, negative inside, of points (N, 3) that are so far from the wall."""
-        x, y, along_normal = ((points_mm - self.point_mm) @ self.axes.T).T
-        radius, z = 0.5 * self.polyp.diameter_mm, from_wall_mm
-        if self.polyp.kind == "pedunculated":
+        """Return about the distance (N,), mm, negative inside, of points (N, 3), which are so far from the wall."""
+        x, y, z = ((points_mm - self.point_mm) @ self.axes.T).T
+        radius = 0.5 * self.polyp.diameter_mm
+        thin = min(_CROSS * radius, self.height_mm)
+        if self.polyp.kind == "flat":
+            body = _rounded(x / radius, y / (_CROSS * radius), from_wall_mm / self.height_mm, True) * thin
+        elif self.polyp.kind == "sessile":
+            body = _rounded(x / radius, y / (_CROSS * radius), z / self.height_mm, False) * thin
+        else:
             half = 2 * _HEAD * radius
             head = _rounded(x / radius, y / (_CROSS * radius), (z - self.height_mm + half) / half, False) * half
             stalk = np.hypot(x, y) - max(2 * _STALK * radius, _STALK_MM)
             body = np.minimum(head, np.maximum(stalk, z - self.height_mm + half))
-        else:
-            steep, thin = self.polyp.kind == "flat", min(_CROSS * radius, self.height_mm)
-            body = _rounded(x / radius, y / (_CROSS * radius), z / self.height_mm, steep) * thin
         # The other side of a fold has none.
-        return np.maximum(body, -along_normal - max(_BEHIND_MM, 2 * _BEHIND * radius))
+        return np.maximum(body, -z - max(_BEHIND_MM, 2 * _BEHIND * radius))
 
 
 @dataclass(frozen=True)

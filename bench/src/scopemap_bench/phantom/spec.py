@@ -49,7 +49,8 @@ class Event:
 class Polyp:
     """A polyp so wide on the wall, where frame `frame` sees it well.
 
-    sessile : half an ellipsoid. pedunculated : a head on a stalk. flat : a disc 1.5 mm high. Each is 0.8 as wide across.
+    sessile : half an ellipsoid. pedunculated : a head on a stalk. flat : a disc 1.5 mm high. Across, each is 0.8 times
+    as wide.
     """
 
     kind: PolypName

@@ -4,8 +4,8 @@
 [lesions/truth.json  lesions/1/0000.png]  phantom.json
 
 `displacement_truth.npz` follows material points: `positions_mm` (frames, points, 3) float32, world mm, where points of
-the tissue that was seen, the same ones in all frames, are in each. `lesions/N` has the masks, 255, of the polyp N in the
-frames that see it; `truth.json` the sizes of each at rest, mm and mm2, over its whole surface.
+the tissue that was seen, the same ones in all frames, are in each. `lesions/N` has the masks, 255, of the polyp N in
+the frames that see it; `truth.json` the sizes of each at rest, mm and mm2, over its whole surface.
 """
 
 from __future__ import annotations
