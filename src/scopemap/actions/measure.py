@@ -117,8 +117,8 @@ class Known:
 class KnownScale:
     """The scale of a run's millimetres: what lengths are divided by, (D,) draws of its error, unit and its square.
 
-    focal, depth : (D,) draws of the focal length, and of what is common to depth, over their values. words : what the scale rests on. sizes : of the errors, from
-    `measure_errors`.
+    focal, depth : (D,) draws of the focal length, and of what is common to the depth of a frame, over their values.
+    words : what the scale rests on. sizes : of the errors, from `measure_errors`.
     """
 
     divisor: float
