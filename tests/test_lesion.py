@@ -14,11 +14,10 @@ from front_door import call, refused
 
 from scopemap.actions.export.exported_run import read_exported
 from scopemap.actions.lesion import Lesion, carried_masks, measure_lesion, shaft_width
-from scopemap.actions.measure import Known
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.lesion_shape import LesionView, extents, view_shape
 from scopemap.geometry.rendering import render_mesh
-from scopemap.geometry.se3 import inverse, transform
+from scopemap.geometry.se3 import transform
 
 WALL_MM, RADIUS_MM = 40.0, 5.0
 WIDE = PinholeCamera(200.0, 200.0, 119.5, 95.5, 240, 192)
@@ -48,20 +47,20 @@ def test_a_hemisphere_from_above(aside_mm: float) -> None:
     found = shape(*hemisphere(aside_mm, 0.0))
     assert found.diameter == pytest.approx(2 * RADIUS_MM, rel=0.05)
     assert found.cross == pytest.approx(2 * RADIUS_MM, rel=0.05)
-    assert found.along == pytest.approx(np.pi * RADIUS_MM, rel=0.12)
-    assert found.area == pytest.approx(2 * np.pi * RADIUS_MM**2, rel=0.2)
+    assert found.along == pytest.approx(np.pi * RADIUS_MM, rel=0.05)
+    assert found.area == pytest.approx(2 * np.pi * RADIUS_MM**2, rel=0.08)
     assert found.height == pytest.approx(RADIUS_MM, rel=0.05)
     assert found.facing == pytest.approx(np.cos(np.arctan(aside_mm / WALL_MM)), abs=0.02)
 
 
-def test_a_slanted_view_is_less_certain_but_not_smaller() -> None:
+def test_a_slanted_view_is_less_certain() -> None:
     above, slanted = shape(*hemisphere(0.0, 0.0)), shape(*hemisphere(0.0, 0.8))
     assert slanted.diameter == pytest.approx(2 * RADIUS_MM, rel=0.08)
     assert slanted.height == pytest.approx(RADIUS_MM, rel=0.1)
     assert slanted.facing < above.facing
     disc = np.hypot(*np.moveaxis(WIDE.rays[..., :2], -1, 0)) < 0.1
     level, steep = (shape(disc, WALL_MM / (1 + lean * WIDE.rays[..., 0])) for lean in (0.0, 1.5))
-    assert level.sigma < 0.8 * steep.sigma
+    assert level.sigma < 0.01 < steep.sigma
 
 
 def test_extents_of_a_box_are_its_diagonal_and_what_is_across_it() -> None:
@@ -103,11 +102,11 @@ def unknown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def patch(index: int) -> np.ndarray:
-    """Which pixels of a frame show a patch of the wall, 10 mm along the tube and 8 mm around it."""
+    """Which pixels of a frame show a patch of the wall, 6 mm along the tube and 8 mm around it."""
     seen = render_mesh(tube(), CAMERA, pose_of(index)).depth_mm
     points = transform(pose_of(index), (CAMERA.rays * seen[..., None]).reshape(-1, 3).astype(float))
     angle = np.arctan2(points[:, 1], points[:, 0])
-    inside = (np.abs(angle - 1.2) < 0.4) & (points[:, 2] > 20) & (points[:, 2] < 30)
+    inside = (np.abs(angle - 1.2) < 0.4) & (points[:, 2] > 22) & (points[:, 2] < 28)
     return np.asarray(inside.reshape(seen.shape))
 
 
@@ -125,18 +124,17 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 def test_a_mask_is_carried_to_the_other_frames(known: Path) -> None:
     run = read_exported(known)
     carried = carried_masks(run, 2, patch(2))
-    assert len(carried) >= 10
-    for index in (0, 5, 9):
-        assert overlap(carried[index], patch(index)) > 0.8
-    alone = carried_masks(run, 9, patch(9))
-    assert (alone[9] == patch(9)).all()
+    assert len(carried) >= 8
+    for index in (0, 5, 8):
+        assert overlap(carried[index], patch(index)) > 0.82
+    assert (carried[2] == patch(2)).all()
 
 
 def test_what_is_in_front_ends_a_mask(known: Path) -> None:
     run = read_exported(known)
     file = known / "depth" / "000005.png"
     kept = file.read_bytes()
-    near = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) // 3
+    near = np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)) // 3
     cv2.imwrite(str(file), near)
     try:
         assert 5 not in carried_masks(run, 2, patch(2))
@@ -152,14 +150,14 @@ def measured(capfd: pytest.CaptureFixture[str], run: Path, *more: object) -> dic
 
 def test_a_patch_of_the_tube(known: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder = masks_of(tmp_path / "masks", range(12))
-    exact = {"area that is seen": 80.0, "largest diameter": np.hypot(10, 2 * RADIUS * np.sin(0.4))}
+    exact = {"area": 48.0, "largest diameter": np.hypot(6, 2 * RADIUS * np.sin(0.4))}
     ways = [("--lesion", folder), ("--lesion", folder / "mask_0003.png", "--frame", 3)]
     for way in ways:
         found = measured(capfd, known, *way, "--pictures", tmp_path / "outlines")
         assert "measured depth" in found["scale"]
         sizes = {one["what"]: one for one in found["measures"]}
         for what, true in exact.items():
-            assert sizes[what]["value"] == pytest.approx(true, rel=0.2), what
+            assert sizes[what]["value"] == pytest.approx(true, rel=0.3 if what == "area" else 0.15), what
             assert sizes[what]["low"] < true < sizes[what]["high"]
         assert sizes["largest diameter"]["unit"] == "mm"
         assert sizes["height"]["low"] <= sizes["height"]["value"] < 2
@@ -172,7 +170,7 @@ def test_many_frames_do_not_make_an_interval_vanish(known: Path, tmp_path: Path)
         one = measure_lesion(known, Lesion(masks_of(tmp_path / str(len(frames)), frames))).measures[0]
         return (one.high - one.low) / 2 / one.value
 
-    assert half(range(12)) > 0.8 * half(range(4, 5)) > 0.1
+    assert half(range(12)) > 0.8 * half(range(2, 3)) > 0.1
 
 
 def test_an_unknown_scale_gives_no_bare_number(
@@ -187,7 +185,7 @@ def test_an_unknown_scale_gives_no_bare_number(
     mm = measured(capfd, unknown, "--lesion", folder, *reference, "--reference-mm", 2 * RADIUS * np.sin(0.5))
     assert ratio["measures"][0]["unit"] == "times the reference"
     assert "frame 0, taken to be 9.58851 mm apart" in mm["scale"]
-    assert mm["measures"][0]["value"] == pytest.approx(12.6, rel=0.15)
+    assert mm["measures"][0]["value"] == pytest.approx(9.8, rel=0.15)
     assert mm["measures"][0]["value"] == pytest.approx(2 * RADIUS * np.sin(0.5) * ratio["measures"][0]["value"])
     assert call("measure", unknown, "--lesion", folder, *reference) == 0
     assert "the scale rests on two points of frame 0" in capfd.readouterr().out

@@ -28,7 +28,7 @@ from scopemap.io.decoding import by_number, read_decoded
 from scopemap.report.measured_surface import drawn
 
 _FIGURES = {
-    "diameter": ("largest diameter", 1, 0.06),
+    "diameter": ("largest diameter", 1, 0.07),
     "cross": ("diameter across it", 1, 0.12),
     "along": ("along the surface", 1, 0.12),
     "area": ("area", 2, 0.12),
@@ -50,7 +50,7 @@ _OUTLINE_BGR = (0, 255, 255)
 class Lesion:
     """Where a lesion is: `masks`, a folder of pictures numbered as frames, or one picture, or corners (N, 2), px.
 
-    frame : that a picture or corners are of; of no matter for a folder. A pixel belongs to the lesion where it is not 0.
+    frame : that a picture or corners are of; of no matter for a folder. Pixels above 127 are the lesion's.
     """
 
     masks: Path | np.ndarray

@@ -81,7 +81,7 @@ def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) ->
     length, width = extents(np.column_stack([pixels, np.zeros(len(pixels))]))
     base = diameter * cross * mask.sum() / (length * width)
     apart = float(np.sqrt(np.average((both - np.log(diameter)) ** 2, weights=weights)))
-    return LesionView(diameter, cross, along, base + np.pi * rise**2, height, facing, apart)
+    return LesionView(diameter, cross, along, float(base + np.pi * rise**2), height, facing, apart)
 
 
 def _slant(first: np.ndarray, last: np.ndarray) -> float:
@@ -94,19 +94,24 @@ def _slant(first: np.ndarray, last: np.ndarray) -> float:
 def _smoothed(mask: np.ndarray, depth_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return depth (H, W) of a mask's pixels, smoothed, NaN outside; and which pixels are beside the outline.
 
-    There depth runs into that of what is behind: it is replaced by that of the nearest pixel farther inside.
+    There depth runs into that of what is behind: it is off the plane of what is farther inside as the nearest pixel of
+    that is.
     """
     within = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
     outline = mask & (within <= min(_RIM_PX, _RIM_SHARE * float(within.max())))
     inner = mask & np.isfinite(depth_mm) & ~outline
     inner = inner if inner.any() else mask & np.isfinite(depth_mm)
+    # A plane has a linear inverse depth.
+    v, u = np.indices(mask.shape)
+    linear = np.stack([np.ones(mask.shape), u, v], axis=-1)
+    plane = linear @ np.linalg.lstsq(linear[inner], 1 / depth_mm[inner])[0]
     labels = cv2.distanceTransformWithLabels((~inner).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[
         1
     ]
-    inverse = np.zeros(labels.max() + 1)
-    inverse[labels[inner]] = 1 / depth_mm[inner]
+    off = np.zeros(labels.max() + 1)
+    off[labels[inner]] = 1 / depth_mm[inner] - plane[inner]
     inside = mask.astype(np.float64)
-    total, weight = (cv2.GaussianBlur(x, (0, 0), _SMOOTH_PX) for x in (inverse[labels] * inside, inside))
+    total, weight = (cv2.GaussianBlur(x, (0, 0), _SMOOTH_PX) for x in ((plane + off[labels]) * inside, inside))
     return np.where(mask, weight / np.maximum(total, 1e-12), np.nan), outline if outline.any() else mask
 
 
