@@ -86,7 +86,7 @@ def measure_lesion(folder: Path, lesion: Lesion, known: Known | None = None) -> 
     for row, (figure, (name, power, common)) in enumerate(_FIGURES.items(), start=_FIRST_ROW):
         value, sigma = _combined(views, masks, figure, common)
         own = np.exp(sigma * drawn(row, 1, scale.sizes["draws"])[0])
-        draws = (own * scale.draws * scale.depth / scale.focal) ** power
+        draws = (own * scale.from_views) ** power
         unit = scale.unit if power == 1 else scale.square
         found.append(Measure.of(name, value / scale.divisor**power, draws, unit, scale.sizes))
     found.append(_height(views, found[0], scale))

@@ -105,9 +105,8 @@ def _smoothed(mask: np.ndarray, depth_mm: np.ndarray) -> tuple[np.ndarray, np.nd
     v, u = np.indices(mask.shape)
     linear = np.stack([np.ones(mask.shape), u, v], axis=-1)
     plane = linear @ np.linalg.lstsq(linear[inner], 1 / depth_mm[inner])[0]
-    labels = cv2.distanceTransformWithLabels((~inner).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[
-        1
-    ]
+    outside = (~inner).astype(np.uint8)
+    labels = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
     off = np.zeros(labels.max() + 1)
     off[labels[inner]] = 1 / depth_mm[inner] - plane[inner]
     inside = mask.astype(np.float64)
