@@ -28,6 +28,7 @@ from scopemap_bench.phantom.motion import (
     touching,
     turned,
 )
+from scopemap_bench.phantom.polyps import Polyps, grow
 from scopemap_bench.phantom.scenes import Tint, colon_volume, laparoscopy_volume, tube_volume
 from scopemap_bench.phantom.shading import (
     Appearance,
@@ -60,7 +61,7 @@ _PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 @dataclass(frozen=True)
 class Phantom:
     """A scene and the path (N, 4, 4) through it, camera to world, mm; `exposure`: of all frames, of each (N,), or None:
-    own.
+    own. `polyps` : those that are in `volume`.
     """
 
     spec: PhantomSpec
@@ -69,6 +70,7 @@ class Phantom:
     poses: np.ndarray
     motion: TissueMotion
     exposure: float | np.ndarray | None
+    polyps: Polyps | None = None
 
 
 def prepare(spec: PhantomSpec) -> Phantom:
@@ -77,7 +79,10 @@ def prepare(spec: PhantomSpec) -> Phantom:
     volume, appearance = build_scene(spec, poses)
     for event in _events(spec, "contact"):
         poses = touching(poses, event.first, event.last, lambda point: float(volume.values_at(point[None])[0][0]))
-    phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None)
+    polyps = None
+    if spec.polyps:
+        volume, polyps = grow(volume, spec.polyps, poses, spec.camera, spec.seed)
+    phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None, polyps)
     if not spec.auto_exposure:
         return replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
     return replace(phantom, exposure=_lagging_exposure(phantom)) if spec.exposure_lag_frames > 0 else phantom
@@ -188,6 +193,8 @@ def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers
     rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.central.fx)
     albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
     albedo[in_wound(displacement.slits, rest)] *= _WOUND_RGB
+    if phantom.polyps is not None:
+        albedo = albedo * phantom.polyps.tint(rest)
     radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
     for tool in _tools(phantom, time):
         radiance, surface = insert(tool, radiance, surface, camera)
