@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scopemap.calibration.focal_length.trial import KINDS, LensTrial, try_lenses
-from scopemap.calibration.focal_length.window_adjustment import Scene, Solution, adjusted, at_rest
+from scopemap.calibration.focal_length.window_adjustment import Scene, WindowSolution, adjusted, at_rest
 from scopemap.calibration.focal_length.windows import MAX_FRAMES, Window, windows_of
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
@@ -68,7 +68,7 @@ def adjust_window(window: Window, assumed_focal_px: float) -> WindowFit | None:
     return WindowFit(log_focal, deviation, best.sigma_px, tilt_deg, bend)
 
 
-def _log_focal_deviation(scene: Scene, found: Solution) -> float:
+def _log_focal_deviation(scene: Scene, found: WindowSolution) -> float:
     """Return the cluster-robust standard deviation of ln f, all else marginalised; NaN where it is undetermined."""
     try:
         influence = np.linalg.pinv(found.reduced(), hermitian=True)[-2]

@@ -56,7 +56,7 @@ class Scene(NamedTuple):
     lens_sigma: np.ndarray
 
 
-class Solution(NamedTuple):
+class WindowSolution(NamedTuple):
     """Where the adjustment ended.
 
     state : as `Start`. error : (N, K, 2) px, NaN where not observed, infinite behind a camera. sigma_px : their robust
@@ -85,7 +85,7 @@ def at_rest(scene: Scene) -> Start:
 
 
 @njit(cache=True, nogil=True)
-def adjusted(scene: Scene, begin: Start, most: int, min_decrease: float) -> Solution:
+def adjusted(scene: Scene, begin: Start, most: int, min_decrease: float) -> WindowSolution:
     """Return what is found from a start in `most` iterations, or until one lowers the cost by less than a share."""
     damping, found = 0.0, _linearised(scene, begin, _errors(scene, begin))
     cost = _cost(scene, begin, found.error, found.sigma_px)
@@ -174,7 +174,7 @@ def _cost(scene: Scene, state: Start, error: np.ndarray, sigma_px: float) -> flo
 
 
 @njit(cache=True, nogil=True)
-def _linearised(scene: Scene, state: Start, error: np.ndarray) -> Solution:
+def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution:
     """Return the normal equations at a state; A with the prior of the lens."""
     points, partners, sigma_px = error.shape[0], error.shape[1], _robust_sigma(error)
     known = scene.lens_sigma[0] == 0
@@ -230,11 +230,11 @@ def _linearised(scene: Scene, state: Start, error: np.ndarray) -> Solution:
         g[n] += held * off * scene.sigma[n]
     for i in range(size - 6 * partners):
         A[6 * partners + i, 6 * partners + i] += 1 / scene.lens_sigma[i] ** 2
-    return Solution(state, error, sigma_px, A, scores, E, h, g)
+    return WindowSolution(state, error, sigma_px, A, scores, E, h, g)
 
 
 @njit(cache=True, nogil=True)
-def _stepped(scene: Scene, found: Solution, damping: float) -> Start:
+def _stepped(scene: Scene, found: WindowSolution, damping: float) -> Start:
     """Return the state after a damped Gauss-Newton step; points move in inverse depth, which parallax is linear in."""
     state, A, E, g, h = found.state, found.A, found.E, found.g, found.h
     size, partners = len(A), len(state.T)
