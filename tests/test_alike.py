@@ -53,6 +53,26 @@ def test_features_are_those_of_before() -> None:
     np.testing.assert_allclose(features.descriptors[0, :4], EXPECTED_DESCRIPTOR, atol=2e-3)
 
 
+def test_a_picture_is_described_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers, network = list[np.ndarray](), alike.network_answer
+
+    def answer(rgb: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+        answers.append(rgb)
+        return network(rgb)
+
+    monkeypatch.setattr(alike, "network_answer", answer)
+    detector, frame = AlikeFeatures(), _frame(RGB)
+    blind = detector.detect(replace(frame, depth_mm=None))
+    seeing = detector.detect(frame)
+    assert len(answers) == 1
+    assert np.isnan(blind.points_mm).all()
+    assert np.isfinite(seeing.points_mm).any()
+    np.testing.assert_array_equal(blind.descriptors, seeing.descriptors)
+    masked = detector.detect(replace(frame, valid=frame.valid & (np.arange(frame.valid.shape[1]) > 60)))
+    assert len(answers) == 2
+    assert masked.pixels[:, 0].min() > 55
+
+
 def test_an_installation_without_the_network_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(alike, "_NETWORK", "none.onnx")
     alike._network.cache_clear()

@@ -23,10 +23,10 @@ from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
 from scopemap.tracking.alike import AlikeFeatures
 from scopemap.tracking.corner_pose import pose_from_correspondences
-from scopemap.tracking.features import FeatureDetector, Features, relative_pose_pnp
+from scopemap.tracking.features import FeatureDetector, Features, relative_pose_pnp, similarity
 
 _CANDIDATES = 8  # keyframes whose matches are verified
-_STRONGEST, _MIN_SIMILARITY = 128, 0.8  # descriptors by which they are ranked, and the cosine above which these count
+_STRONGEST = 128  # descriptors by which they are ranked
 # Of the best keyframe, where chance gives up to 26 on phantoms, and of another one whose matches are used.
 _LEAST_INLIERS, _LEAST_SUPPORT = 30, 10
 _AGREE_DEPTH, _AGREE_RAD = 0.1, 0.1  # of the poses by two keyframes
@@ -118,12 +118,12 @@ class PlaceMap:
         """Return the poses by the most similar keyframes."""
         current = self._detector.detect(replace(frame, depth_mm=None))
         strongest = current.descriptors[:_STRONGEST]
-        similarity = [_similarity(strongest, place.strongest) for place in self._places]
+        alike = [similarity(strongest, place.strongest) for place in self._places]
         found = []
-        for number in np.argsort(-np.array(similarity), kind="stable")[:_CANDIDATES]:
+        for number in np.argsort(-np.array(alike), kind="stable")[:_CANDIDATES]:
             place = self._places[number]
             relative = relative_pose_pnp(place.features, current, frame.camera, _LEAST_SUPPORT)
-            if similarity[number] > 0 and relative is not None:
+            if alike[number] > 0 and relative is not None:
                 own, new = relative.pairs.T
                 points_mm = transform(place.T_world_camera, place.features.points_mm[own])
                 T_world_camera = place.T_world_camera @ inverse(relative.T_current_reference)
@@ -178,12 +178,6 @@ def write_located(frames: Sequence[LocatedFrame], file: Path) -> None:
 def _placed(index: int, poses: dict[int, tuple[int, np.ndarray]]) -> tuple[int, int, np.ndarray]:
     number, T_world_camera = poses[index]
     return number, index, T_world_camera
-
-
-def _similarity(strongest: np.ndarray, other: np.ndarray) -> float:
-    """Return the sum over descriptors of the cosine to the nearest one of a keyframe, above the threshold."""
-    cosine = strongest @ other.T
-    return float(np.maximum(cosine.max(1) - _MIN_SIMILARITY, 0).sum()) if cosine.size else 0.0
 
 
 def _agree(match: _Match, best: _Match, frame: Frame) -> bool:

@@ -195,12 +195,13 @@ class Backend:
             found = alone = self._adjusted(worlds, map_number)
             if not alone.correction.refused:
                 break
-        others = [*self._merged(map_number, allowed)][1:]
+        others, tried = [*self._merged(map_number, allowed)][1:], {frozenset(worlds)}
         # All maps at once if they fit; else one by one, because a single one may not fit.
         for some in (others, *([number] for number in others if len(others) > 1)):
             more = self._merged(map_number, {*worlds, *some})
-            if len(more) == len(worlds):
+            if frozenset(more) in tried:  # the rest may be added to what is merged already, and all were refused before
                 continue
+            tried.add(frozenset(more))
             together = self._adjusted(more, map_number)
             if together.accepted(alone, self.settings.max_sigma_px):
                 found, worlds = together, more

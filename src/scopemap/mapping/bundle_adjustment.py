@@ -34,7 +34,6 @@ from scopemap.mapping.bundle_problem import (
     Points,
     Reprojection,
     State,
-    UnknownLens,
     jacobians,
     reproject,
 )
@@ -46,8 +45,7 @@ _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 _POINT_STEPS = 5  # of the points alone, after the keyframes
 WINDOW = 300
 """Most keyframes that are adjusted at once."""
-# Prior standard deviations of ln f, of the distortion, which is held, and of the principal point over f.
-_RESIDUAL_SIGMA = np.array([0.3, 1e-4, 0.2, 0.2])
+_RESIDUAL_SIGMA = np.array([0.3, 0.2, 0.2])  # prior standard deviations of ln f, and of the principal point over f
 _RESIDUAL_DEPTH = 3.0  # factor of the estimated depth's deviation there: errors of a network bend the lens, too
 _SIGNIFICANT = 5.0  # standard deviations: a right lens of a real clip had 3.4, the least noticed wrong one 6.7
 _HELD_SIGMA = 0.01  # least standard deviation of ln depth of points that an earlier window adjusted
@@ -160,17 +158,16 @@ def lens_residual(problem: BundleProblem, found: BundleSolution) -> LensResidual
     """
     if not len(problem.observations.point) or len(problem.T_camera_world) > WINDOW:
         return LensResidual()
-    unit = np.array([1.0, 1.0, problem.focal_px, problem.focal_px])
+    unit = np.array([1.0, problem.focal_px, problem.focal_px])
     points = replace(problem.points, sigma=_RESIDUAL_DEPTH * problem.points.sigma)
-    lens = UnknownLens(problem.focal_px, _RESIDUAL_SIGMA * unit)
-    free = replace(problem, start=found.state, points=points, lens=lens)
+    free = replace(problem, start=found.state, points=points, lens_sigma=_RESIDUAL_SIGMA * unit)
     state = adjust(free, max_iterations=40, min_decrease=1e-4).state  # a wrong lens may be far away
     try:
         covariance = np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)
     except np.linalg.LinAlgError:
         return LensResidual()
-    change, deviation = (state.lens - problem.tracked.lens) / unit, np.sqrt(np.diag(covariance)[-4:]) / unit
-    log_focal, _, x, y = np.where(np.abs(change) > _SIGNIFICANT * deviation, change, 0.0).tolist()
+    change, deviation = (state.lens - problem.tracked.lens) / unit, np.sqrt(np.diag(covariance)[-3:]) / unit
+    log_focal, x, y = np.where(np.abs(change) > _SIGNIFICANT * deviation, change, 0.0).tolist()
     return LensResidual(log_focal, x, y, float(deviation[0]))
 
 
@@ -189,7 +186,7 @@ def weights(state: State, seen: Reprojection) -> np.ndarray:
 
 def linearised(problem: BundleProblem, state: State) -> SchurModel:
     """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
-    count, lens = len(state.T_camera_world), 0 if problem.lens is None else len(problem.lens.sigma)
+    count, lens = len(state.T_camera_world), 0 if problem.lens_sigma is None else 3
     seen = reproject(problem, state)
     edges = odometry_edges(problem, state)
     held = [6 + PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
@@ -214,9 +211,8 @@ def cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[O
     cost += 0.5 * sum(float(edge.error @ (edge.information * edge.error)) for edge in edges)
     if priors.scale > 0:
         cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
-    if problem.lens is not None:
-        change = (state.lens - problem.tracked.lens)[: len(problem.lens.sigma)]
-        cost += 0.5 * ((change / problem.lens.sigma) ** 2).sum()
+    if problem.lens_sigma is not None:
+        cost += 0.5 * (((state.lens - problem.tracked.lens) / problem.lens_sigma) ** 2).sum()
     return float(cost)
 
 
@@ -249,9 +245,9 @@ def camera_blocks(problem: BundleProblem, state: State, edges: list[OdometryEdge
     if problem.priors.scale > 0:
         information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + PER_KEYFRAME * np.arange(len(T))
         blocks.append(CameraBlock(own, np.diag(information), information * state.log_scale))
-    if problem.lens is not None:
-        information, own = problem.lens.sigma**-2.0, PER_KEYFRAME * len(T) + np.arange(len(problem.lens.sigma))
-        change = (state.lens - problem.tracked.lens)[: len(own)]
+    if problem.lens_sigma is not None:
+        information, own = problem.lens_sigma**-2.0, PER_KEYFRAME * len(T) + np.arange(3)
+        change = state.lens - problem.tracked.lens
         blocks.append(CameraBlock(own, np.diag(information), information * change))
     return blocks
 
@@ -264,7 +260,7 @@ class _Rows(NamedTuple):
     by_camera: np.ndarray  # (N, 2, 6)
     by_host: np.ndarray  # (N, 2, 6)
     by_depth: np.ndarray  # (N, 2)
-    by_lens: np.ndarray  # (N, 2, L), or (N, 2, 0)
+    by_lens: np.ndarray  # (N, 2, 3), or (N, 2, 0)
 
 
 def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -> PointBlock:
@@ -355,10 +351,7 @@ def retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
     own = step[:count].reshape(-1, PER_KEYFRAME)
     twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
     T = np.stack([se3_exp(twist) @ pose for twist, pose in zip(twists, state.T_camera_world, strict=True)])
-    lens = state.lens.copy()
-    if problem.lens is not None:
-        unknown = len(problem.lens.sigma)
-        lens[:unknown] += step[count : count + unknown]
+    lens = state.lens if problem.lens_sigma is None else state.lens + step[count : count + 3]
     by_points = step[len(step) - len(state.log_depth) :]
     log_depth = state.log_depth - np.log(np.clip(1 - by_points, *_INVERSE_DEPTH_STEP))
     return State(T, state.log_scale + own[:, 6], log_depth, lens, state.sigma_px)

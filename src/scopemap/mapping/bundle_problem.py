@@ -1,8 +1,7 @@
 """The problem of bundle adjustment: reprojection errors of points on rays of their host keyframe, and derivatives.
 
 A point p is on the ray of a pixel of its host keyframe h at depth exp(u_p). With T_h, T_t from world to camera, another
-keyframe t observes it at project(T_t T_h^-1 exp(u_p) ray_p). A lens with focal length f and distortion b sees x where a
-straight one sees x (1 + b |x|^2 / w^2), w half the image width.
+keyframe t observes it at project(T_t T_h^-1 exp(u_p) ray_p).
 """
 
 from __future__ import annotations
@@ -14,9 +13,7 @@ import numpy as np
 
 from scopemap.geometry.se3 import inverse
 
-_LEAST_Z, _LEAST_SLOPE = 1e-3, 0.1
-_UNDISTORTION_STEPS = 6
-_FARTHEST = 10.0  # half widths, beyond which Newton's method would diverge
+_LEAST_Z = 1e-3
 
 
 @dataclass(frozen=True)
@@ -55,22 +52,16 @@ class Priors(NamedTuple):
     translation_share: float = 0.1
 
 
-class UnknownLens(NamedTuple):
-    """Prior of a lens: half_width_px of the image, standard deviations (L,) of its unknowns, the first L of `State`."""
-
-    half_width_px: float
-    sigma: np.ndarray
-
-
 @dataclass(frozen=True)
 class BundleProblem:
     """What is adjusted.
 
     T_camera_world : (K, 4, 4) as tracked. points, observations, priors : as named. neighbours : (C, 2) int, pairs of
     keyframes between which the motion was tracked. focal_px : fx, as expected where the lens is unknown. start : where
-    to begin, None: as tracked. lens : None: the focal length is known. least_sigma_px : of the reprojection errors.
-    correlated : so many observations count as one, since errors of flow are alike at neighbouring corners. held : so
-    many first keyframes keep pose and scale; the first one keeps its pose in any case.
+    to begin, None: as tracked. lens_sigma : (3,) standard deviations of `State.lens` from what is expected, None: it is
+    known. least_sigma_px : of the reprojection errors. correlated : so many observations count as one, since errors of
+    flow are alike at neighbouring corners. held : so many first keyframes keep pose and scale; the first one keeps its
+    pose in any case.
     """
 
     T_camera_world: np.ndarray
@@ -80,7 +71,7 @@ class BundleProblem:
     neighbours: np.ndarray
     focal_px: float
     start: State | None = None
-    lens: UnknownLens | None = None
+    lens_sigma: np.ndarray | None = None
     least_sigma_px: float = 0.1
     correlated: float = 1.0
     held: int = 0
@@ -98,14 +89,14 @@ class BundleProblem:
     @property
     def tracked(self) -> State:
         """The state as tracked."""
-        count, lens = len(self.T_camera_world), np.array([np.log(self.focal_px), 0.0, 0.0, 0.0])
+        count, lens = len(self.T_camera_world), np.array([np.log(self.focal_px), 0.0, 0.0])
         return State(self.T_camera_world, np.zeros(count), self.points.log_depth, lens)
 
 
 class State(NamedTuple):
     """T_camera_world (K, 4, 4), ln of the depth scales (K,), ln of the depths (P,).
 
-    lens : (4,) ln f, b, and how far the principal point is from where it was taken to be, px.
+    lens : (3,) ln f, and how far the principal point is from where it was taken to be, px.
     """
 
     T_camera_world: np.ndarray
@@ -123,7 +114,7 @@ class Reprojection(NamedTuple):
     point: np.ndarray  # (N, 3) in the observing camera
     in_host: np.ndarray  # (N, 3) in the host's
     R: np.ndarray  # (N, 3, 3) from the host to the observing camera
-    straight: np.ndarray  # (N, 2) px, through a lens without distortion
+    pixel: np.ndarray  # (N, 2) px from the principal point
 
 
 def reproject(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> Reprojection:
@@ -133,8 +124,7 @@ def reproject(problem: BundleProblem, state: State, moved: np.ndarray | None = N
     """
     points, observations, T = problem.points, problem.observations, state.T_camera_world
     focal, host = np.exp(state.lens[0]), points.host[observations.point]
-    centred = points.pixel - state.lens[2:]
-    rays = np.column_stack([_undistorted(problem, centred, state.lens[1]) / focal, np.ones(len(points.host))])
+    rays = np.column_stack([(points.pixel - state.lens[1:]) / focal, np.ones(len(points.host))])
     in_host = (np.exp(state.log_depth)[:, None] * rays)[observations.point]
     pairs, which = np.unique(host * len(T) + observations.keyframe, return_inverse=True)
     between = T[pairs % len(T)] @ inverse(T[pairs // len(T)])
@@ -143,34 +133,9 @@ def reproject(problem: BundleProblem, state: State, moved: np.ndarray | None = N
     if moved is not None:
         seen += np.einsum("nij,nj->ni", T[observations.keyframe, :3, :3], moved)
     ahead = seen[:, 2] > _LEAST_Z * np.linalg.norm(seen, axis=1)
-    straight = focal * seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
-    pixel = _distorted(problem, straight, state.lens[1])
-    error = np.where(ahead[:, None], pixel - (observations.pixel - state.lens[2:]), 0.0)
-    return Reprojection(error, ahead, seen, in_host, R, straight)
-
-
-def _square(problem: BundleProblem, pixel: np.ndarray) -> np.ndarray:
-    """Squared distance (n, 1) from the principal point in half widths; 0 where the lens is known."""
-    if problem.lens is None:
-        return np.zeros((len(pixel), 1))
-    square: np.ndarray = (pixel**2).sum(1, keepdims=True) / problem.lens.half_width_px**2
-    return square
-
-
-def _undistorted(problem: BundleProblem, pixel: np.ndarray, b: float) -> np.ndarray:
-    undistorted: np.ndarray = pixel * (1 + b * _square(problem, pixel))
-    return undistorted
-
-
-def _distorted(problem: BundleProblem, straight: np.ndarray, b: float) -> np.ndarray:
-    """Return the pixels (n, 2) that `_undistorted` takes to `straight`, by Newton's method on the radius."""
-    if problem.lens is None or b == 0:
-        return straight
-    radius = wanted = np.minimum(np.sqrt(_square(problem, straight)), _FARTHEST)
-    for _ in range(_UNDISTORTION_STEPS):
-        slope = np.maximum(1 + 3 * b * radius**2, _LEAST_SLOPE)
-        radius = np.clip(radius - (radius * (1 + b * radius**2) - wanted) / slope, 0, _FARTHEST)
-    return np.where(wanted > 0, radius / np.maximum(wanted, 1e-12), 1.0) * straight
+    pixel = focal * seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
+    error = np.where(ahead[:, None], pixel - (observations.pixel - state.lens[1:]), 0.0)
+    return Reprojection(error, ahead, seen, in_host, R, pixel)
 
 
 def jacobians(
@@ -178,40 +143,23 @@ def jacobians(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the derivatives of pixels by twists of the observing camera and of the host (N, 2, 6), ln depth and lens.
 
-    By ln depth (N, 2); by the lens (N, 2, L), (N, 2, 0) where it is known. Translations are in units of the typical
+    By ln depth (N, 2); by the lens (N, 2, 3), (N, 2, 0) where it is known. Translations are in units of the typical
     depth.
     """
-    focal, b = np.exp(state.lens[0]), state.lens[1]
-    z = np.where(seen.ahead, seen.point[:, 2], 1.0)
+    focal, z = np.exp(state.lens[0]), np.where(seen.ahead, seen.point[:, 2], 1.0)
     by_point = np.zeros((len(z), 2, 3))
     by_point[:, 0, 0] = by_point[:, 1, 1] = focal / z
-    by_point[:, :, 2] = -seen.straight / z[:, None]
+    by_point[:, :, 2] = -seen.pixel / z[:, None]
     by_lens = np.zeros((len(z), 2, 0))
-    if problem.lens is not None:
-        pixel = seen.error + problem.observations.pixel - state.lens[2:]
-        by_straight = _by_straight(problem, pixel, b)
-        by_point = by_straight @ by_point
-        in_host = problem.points.pixel[problem.observations.point] - state.lens[2:]
+    if problem.lens_sigma is not None:
+        in_host = problem.points.pixel[problem.observations.point] - state.lens[1:]
         by_corner = (by_point @ seen.R)[..., :2] * (seen.in_host[:, 2] / focal)[:, None, None]
-        by_focal = by_straight @ seen.straight[..., None]
-        by_focal -= by_corner @ _undistorted(problem, in_host, b)[..., None]
-        by_b = by_corner @ (in_host * _square(problem, in_host))[..., None]
-        by_b -= by_straight @ (pixel * _square(problem, pixel))[..., None]
-        by_lens = np.concatenate([by_focal, by_b, np.eye(2) - by_corner], -1)[..., : len(problem.lens.sigma)]
+        by_focal = seen.pixel[..., None] - by_corner @ in_host[..., None]
+        by_lens = np.concatenate([by_focal, np.eye(2) - by_corner], -1)
     by_host = by_point @ seen.R
     by_depth = np.einsum("nij,nj->ni", by_host, seen.in_host)
     unit_mm = problem.unit_mm
     return _by_twist(by_point, seen.point, unit_mm), -_by_twist(by_host, seen.in_host, unit_mm), by_depth, by_lens
-
-
-def _by_straight(problem: BundleProblem, pixel: np.ndarray, b: float) -> np.ndarray:
-    """Derivative (n, 2, 2) of `_distorted` where it leads to `pixel`: the inverse of that of `_undistorted`."""
-    assert problem.lens is not None
-    square = _square(problem, pixel)[..., None]
-    factor = np.maximum(1 + b * square, _LEAST_SLOPE)
-    outer = 2 * b * pixel[:, :, None] * pixel[:, None, :] / problem.lens.half_width_px**2
-    by_straight: np.ndarray = (np.eye(2) - outer / np.maximum(factor + 2 * b * square, _LEAST_SLOPE)) / factor
-    return by_straight
 
 
 def _by_twist(by_point: np.ndarray, points: np.ndarray, unit_mm: float) -> np.ndarray:

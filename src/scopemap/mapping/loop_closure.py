@@ -13,10 +13,9 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
 from scopemap.frame import Frame, RowTable, rows_in_memory
-from scopemap.tracking.features import FeatureDetector, Features, SiftFeatures, relative_pose_pnp
+from scopemap.tracking.features import FeatureDetector, Features, SiftFeatures, relative_pose_pnp, similarity
 
 _STRONGEST_VALUES = 8192  # of the descriptors of the strongest features, by which candidates are ranked
-_MIN_SIMILARITY = 0.8  # cosine of descriptors above which they count for a candidate
 _CANDIDATES = 3
 _STATIC_PX = 2.0
 # With a camera at rest every keyframe would close loops to the same few ones; the adjustment's cost is their square.
@@ -142,7 +141,7 @@ class LoopFinder:
             if map_of[past] != map_of[new] and new not in self._loops_to[past]:
                 maps = min(map_of[past], map_of[new]), max(map_of[past], map_of[new])
                 strongest = self._features[new].strongest.astype(np.float32)
-                ranked[maps].append((self._similarity(strongest, self._features[past]), past, new))
+                ranked[maps].append((similarity(strongest, self._features[past].strongest), past, new))
         likely = [pair for pairs in ranked.values() for pair in sorted(pairs, reverse=True)[:_TRIED_BETWEEN]]
         loops = []
         for _, past, new in sorted(likely, reverse=True)[:_MOST_TRIED]:
@@ -181,16 +180,10 @@ class LoopFinder:
         elsewhere = [k for k in kept if self._map_of[k] != map_number]
         candidates: list[int] = []
         for some in (own, elsewhere):
-            similarity = np.array([self._similarity(strongest, self._features[k]) for k in some])
-            ranked = [some[k] for k in np.argsort(-similarity, kind="stable") if similarity[k] > 0]
+            alike = np.array([similarity(strongest, self._features[k].strongest) for k in some])
+            ranked = [some[k] for k in np.argsort(-alike, kind="stable") if alike[k] > 0]
             candidates += [k for k in ranked if self._allows_loop(k)][:_CANDIDATES]
         return candidates
-
-    @staticmethod
-    def _similarity(strongest: np.ndarray, past: _KeptFeatures) -> float:
-        """Sum over descriptors of the cosine to the nearest one of a keyframe, above the threshold."""
-        cosine = strongest @ past.strongest.T.astype(np.float32)
-        return float(np.maximum(cosine.max(1) - _MIN_SIMILARITY, 0).sum()) if cosine.size else 0.0
 
     def _allows_loop(self, past: int) -> bool:
         loops = self._loops_to[past]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from functools import lru_cache
 from importlib import resources
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -26,21 +28,37 @@ _RADIUS_PX = 2  # of the surroundings of which a keypoint has the highest score
 _TEMPERATURE = 0.1  # of the soft argmax
 # Local brightness that pictures are brought to, its width as a share of the picture's, and what is added to the dark.
 _EVEN_LEVEL, _EVEN_SHARE, _DARKEST, _LOW_RESOLUTION = 110.0, 1 / 16, 8.0, 4
+_MOST_KEPT = 8
 
 
 class AlikeFeatures:
-    """ALIKE-t's keypoints and descriptors (64), matched as mutual nearest neighbours."""
+    """ALIKE-t's keypoints and descriptors (64), matched as mutual nearest neighbours.
+
+    Those of the last pictures are kept: tracking, relocalisation and loop closure ask for the same ones.
+    """
 
     name, descriptor_size, max_ratio = "alike", 64, 1.0
+    NOT_IN_CHECKPOINT: ClassVar = ("_kept",)
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = deque(maxlen=_MOST_KEPT)
 
     def detect(self, frame: Frame) -> Features:
         """Return at most 1000 features in the usable pixels of a frame, with depth if known; raises `WeightsError`."""
-        height, width = frame.valid.shape
-        scores, maps, head = network_answer(evenly_lit(frame.rgb))
-        scores = scores[:height, :width]
-        pixels = _keypoints(scores, usable_pixels(frame.valid))
-        descriptors = descriptors_at(pixels, maps, head)
+        pixels, descriptors = self._described(frame.rgb, frame.valid)
         return Features(pixels, descriptors, points_at(pixels, frame.depth_mm, frame.camera), max_ratio=self.max_ratio)
+
+    def _described(self, rgb: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels (N, 2) x, y and the descriptors (N, 64) of a picture."""
+        for picture, usable, pixels, descriptors in tuple(self._kept):
+            if picture is rgb and np.array_equal(usable, valid):
+                return pixels, descriptors
+        height, width = valid.shape
+        scores, maps, head = network_answer(evenly_lit(rgb))
+        pixels = _keypoints(scores[:height, :width], usable_pixels(valid))
+        descriptors = descriptors_at(pixels, maps, head)
+        self._kept.append((rgb, valid, pixels, descriptors))
+        return pixels, descriptors
 
     def provenance(self) -> dict[str, str]:
         """Return the name, the network's hash, and the runtime."""

@@ -17,6 +17,7 @@ _MAX_FEATURES = 500
 _MIN_CONTRAST = 0.01  # a quarter of OpenCV's default: tissue texture is faint
 _MAX_EDGE_RATIO = 15.0
 _MAX_RATIO = 0.8  # Lowe's ratio test
+_MIN_SIMILARITY = 0.8  # cosine of descriptors above which they count for the similarity of two pictures
 _MAX_ITERATIONS = 500
 _CONFIDENCE = 0.999
 _INLIER_SHARE = 1 / 80  # largest reprojection error of an inlier, share of the image's width
@@ -103,6 +104,12 @@ def match_features(reference: Features, current: Features) -> np.ndarray:
         # Of unit vectors the squared distance is 2 (1 - cosine).
         mutual &= 1 - first < reference.max_ratio**2 * (1 - cosine.max(1))
     return np.column_stack([rows, best])[mutual]
+
+
+def similarity(strongest: np.ndarray, others: np.ndarray) -> float:
+    """Return the sum over descriptors (n, D) of the cosine to the nearest of a picture's (m, D), above a threshold."""
+    cosine = strongest @ others.astype(strongest.dtype).T
+    return float(np.maximum(cosine.max(1) - _MIN_SIMILARITY, 0).sum()) if cosine.size else 0.0
 
 
 def relative_pose_pnp(

@@ -15,12 +15,13 @@ from scopemap.flow.corners import Correspondences2D3D
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, transform
 from scopemap.tracking.corner_pose import pose_from_correspondences, reprojection_error_px
-from scopemap.tracking.features import FeatureDetector, Features, RelativePose, points_at, relative_pose_pnp
+from scopemap.tracking.features import FeatureDetector, Features, RelativePose, points_at, relative_pose_pnp, similarity
 from scopemap.tracking.keyframe_alignment import Keyframe
 from scopemap.tracking.rtdl import Alignment
 from scopemap.tracking.track import Track
 
 _MIN_INLIERS = 20
+_STRONGEST, _CANDIDATES = 128, 3  # descriptors by which keyframes are ranked; those that are tried, of either group
 _MAX_APART, _NEARER = 0.3, 0.7  # distance of an earlier keyframe's view, at most, and over that of the current one
 _CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less is a close-up
 _EVERY_PX, _RANGE = 4, (5, 95)
@@ -156,16 +157,18 @@ class Relocaliser:
         """Return the keyframe with the best accepted alignment of a frame, and that alignment; None without any.
 
         align : returns the alignment with a keyframe from its relative pose by features. near : keyframes
-        that are searched in any case. recent : whether those of the current map are, too. other_maps : whether those of
-        other maps are, where none of these is found.
+        that are searched in any case. recent : whether the most similar ones of the current map are, too. other_maps :
+        whether those of other maps are, where none of these is found.
         """
         if self.settings.constants.relocalisation_keyframes == 0:
             return None
         current = self.detector.detect(replace(frame, depth_mm=None))
-        own = {keyframe.frame.index: keyframe for keyframe in (*(self._keyframes if recent else ()), *near)}
-        groups = [own.values(), self._of_other_maps if other_maps else ()]
-        searched = {keyframe.frame.index for group in groups for keyframe in group}
-        self._features = {index: known for index, known in self._features.items() if index in searched}
+        kept = {keyframe.frame.index for keyframe in (*self._keyframes, *self._of_other_maps, *near)}
+        self._features = {index: known for index, known in self._features.items() if index in kept}
+        numbers = {keyframe.frame.index for keyframe in near}
+        others = [keyframe for keyframe in self._keyframes if recent and keyframe.frame.index not in numbers]
+        groups = [[*near, *self._most_similar(others, current)]]
+        groups += [self._most_similar(self._of_other_maps, current)] if other_maps else []
         for keyframes in groups:
             found = []
             for keyframe in keyframes:
@@ -177,6 +180,15 @@ class Relocaliser:
             if found:
                 return max(found, key=lambda pair: pair[1].agreement)
         return None
+
+    def _most_similar(self, keyframes: Iterable[Keyframe], current: Features) -> list[Keyframe]:
+        """Return the keyframes whose strongest features are most like those of a frame."""
+        strongest = current.descriptors[:_STRONGEST]
+
+        def unlike(keyframe: Keyframe) -> float:
+            return -similarity(strongest, self._known(keyframe).descriptors[:_STRONGEST])
+
+        return sorted(keyframes, key=unlike)[:_CANDIDATES]
 
     def _known(self, keyframe: Keyframe) -> Features:
         """Return the features of a keyframe, detected on first use: most clips never need them."""

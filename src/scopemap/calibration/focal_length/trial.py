@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from scopemap.calibration.focal_length.window_adjustment import Scene, Start, adjusted, at_rest
 from scopemap.calibration.focal_length.windows import Window
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.geometry.least_squares import cauchy, robust_sigma_2d
-from scopemap.mapping.bundle_adjustment import adjust
-from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State, reproject
+from scopemap.io.device import cpu_threads
 
 KINDS: dict[str, tuple[float, ...]] = {
     "pinhole": (),
@@ -43,8 +42,8 @@ _CAUCHY = 2.0
 _OUTSIDE_PX = 50.0
 _LOG_DEPTH_SIGMA, _ESTIMATED_SIGMA = 1.0, 0.3  # of a depth that is not known, and of an estimated one
 _MIN_SIGMA_PX = 0.03
-_FIRST, _NEXT = 15, 8  # iterations, from a start without motion and from that of the lens before
-_STEP_PX = 0.5
+_FIRST, _NEXT, _MIN_DECREASE = 15, 8, 1e-3  # iterations, from a start without motion and from that of the lens before
+_AXIS = 1e-9  # least distance from the axis, focal lengths
 _LEAST_CERTAIN = 0.95
 _MOST_AT_END = 0.02  # of the probability, within a twentieth of the range of either end
 _MIN_WINDOWS = 2
@@ -72,13 +71,8 @@ class LensTrial:
 
 def try_lenses(windows: Sequence[Window]) -> LensTrial | None:
     """Return what windows of one camera say of its lens; None where fewer than two show a rigid scene."""
-    tried = []
-    for window in windows:
-        one = _Tried(window)
-        for kind in KINDS:
-            one.at(kind, _COARSE)
-        if one.sigma_px <= _MAX_RESIDUAL * one.width_px:
-            tried.append(one)
+    with ThreadPoolExecutor(cpu_threads()) as pool:
+        tried = [one for one in pool.map(_Tried, windows) if one.sigma_px <= _MAX_RESIDUAL * one.width_px]
     if len(tried) < _MIN_WINDOWS:
         return None
     costs = _costs(tried)
@@ -92,12 +86,17 @@ def try_lenses(windows: Sequence[Window]) -> LensTrial | None:
 
 
 class _Tried:
-    """A window with the reprojection errors through each lens that was tried: by kind and focal length over width."""
+    """A window with the reprojection errors through each lens that was tried: by kind and focal length over width.
+
+    All kinds of `_COARSE` focal lengths are tried at once.
+    """
 
     def __init__(self, window: Window) -> None:
         self.window, self.width_px = window, 2 * window.half_width_px
         self.errors: dict[tuple[str, float], np.ndarray] = {}
-        self._states: dict[tuple[str, float], State] = {}
+        self._states: dict[tuple[str, float], Start] = {}
+        for kind in KINDS:
+            self.at(kind, _COARSE)
 
     @property
     def sigma_px(self) -> float:
@@ -109,49 +108,34 @@ class _Tried:
         """Adjust the window through lenses of a kind, each from where a lens like it ended."""
         # Small motion converges best through a wide lens.
         for share in sorted(map(float, shares), key=lambda share: abs(math.log(share / _FIRST_FOCAL))):
-            camera = _camera(share * self.width_px, self.window, kind)
             # Of its own kind where there is one, then of the nearest focal length.
             near = min(self._states, key=lambda key: (key[0] != kind, abs(math.log(key[1] / share))), default=None)
             start = None if near is None else self._states[near]
-            self.errors[kind, share], self._states[kind, share] = _adjusted(self.window, camera, start)
+            found = _adjusted(self.window, kind, share * self.width_px, start)
+            self.errors[kind, share], self._states[kind, share] = found
 
 
-def _camera(focal_px: float, window: Window, kind: str) -> CameraModel:
-    """Return a lens whose pixels count from the axis, as those of windows do."""
-    width = round(2 * window.half_width_px)
-    return _lens(kind, PinholeCamera(focal_px, focal_px * window.aspect, 0.0, 0.0, width, width))
-
-
-def _lens(kind: str, plane: PinholeCamera) -> CameraModel:
-    return FisheyeCamera(plane, KINDS[kind]) if KINDS[kind] else plane
-
-
-def _adjusted(window: Window, camera: CameraModel, start: State | None) -> tuple[np.ndarray, State]:
+def _adjusted(window: Window, kind: str, focal_px: float, start: Start | None) -> tuple[np.ndarray, Start]:
     """Return the reprojection errors (n,), picture px, NaN too far out, `_OUTSIDE_PX` if unseen; and the state."""
-    focal_px = camera.central.fx
-    corner, partner = np.nonzero(np.isfinite(window.seen).all(-1))
-    pixel = window.seen[corner, partner]
-    host, seen = _straight(camera, window.start), _straight(camera, pixel)
+    unit = focal_px * np.array([1.0, window.aspect])
+    host, seen, is_seen = _straight(kind, window.start / unit), _straight(kind, window.seen / unit), _observed(window)
     reach = math.tan(_WIDEST_RAD)
-    near = (np.linalg.norm(host, axis=1) <= reach)[corner] & (np.linalg.norm(seen, axis=1) <= reach)
-    errors = np.where(np.isfinite(host[corner] + seen).all(1), np.nan, _OUTSIDE_PX)
-    count = len(window.start)
-    problem = BundleProblem(
-        np.tile(np.eye(4), (window.seen.shape[1] + 1, 1, 1)),
-        Points(np.zeros(count, int), focal_px * np.nan_to_num(host), *_expected(window, host)),
-        Observations(corner[near], partner[near] + 1, focal_px * seen[near]),
-        Priors(scale=0.0),
-        np.zeros((0, 2), int),
-        focal_px,
-        least_sigma_px=_MIN_SIGMA_PX,
+    near = is_seen & (np.linalg.norm(host, axis=1) <= reach)[:, None] & (np.linalg.norm(seen, axis=-1) <= reach)
+    errors = np.where(np.isfinite(host[:, None] + seen).all(-1), np.nan, _OUTSIDE_PX)
+    seen = np.where(near[..., None], focal_px * seen, np.nan)
+    lens = np.array([math.log(focal_px), 0.0])
+    scene = Scene(
+        focal_px * np.nan_to_num(host), seen, *_expected(window, host), window.half_width_px, lens, np.zeros(2)
     )
-    if start is not None:
-        problem = replace(problem, start=start._replace(lens=problem.tracked.lens))
-    state = adjust(problem, max_iterations=_FIRST if start is None else _NEXT).state
-    found = reproject(problem, state)
-    bent = np.linalg.solve(_slopes(camera, pixel[near]), found.error[..., None] / focal_px)[..., 0]
-    errors[near] = np.where(found.ahead, np.linalg.norm(bent, axis=1), _OUTSIDE_PX)
-    return errors, state
+    begin = at_rest(scene) if start is None else start._replace(lens=lens)
+    found = adjusted(scene, begin, _FIRST if start is None else _NEXT, _MIN_DECREASE)
+    bent = unit * _bent(kind, window.seen / unit, found.error / focal_px)
+    errors[near] = np.where(np.isfinite(found.error[near, 0]), np.linalg.norm(bent[near], axis=1), _OUTSIDE_PX)
+    return errors[is_seen], found.state
+
+
+def _observed(window: Window) -> np.ndarray:
+    return np.isfinite(window.seen).all(-1)
 
 
 def _expected(window: Window, host: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -164,18 +148,29 @@ def _expected(window: Window, host: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return log_depth - np.median(log_depth), np.full(count, _ESTIMATED_SIGMA)
 
 
-def _straight(camera: CameraModel, pixel: np.ndarray) -> np.ndarray:
-    """Return where the rays of pixels (n, 2) meet the plane z = 1."""
-    return camera.unproject(pixel)[:, :2]
+def _angle(kind: str, radius: np.ndarray) -> np.ndarray:
+    """Return the angle of rays from the axis, rad, whose pixels are `radius` focal lengths from it; NaN: none."""
+    if kind == "pinhole":
+        return np.arctan(radius)
+    angle = radius if kind == "equidistant fisheye" else np.arcsin(np.where(radius < 1, radius, np.nan))
+    return np.where(angle < math.pi / 2, angle, np.nan)
 
 
-def _slopes(camera: CameraModel, pixel: np.ndarray) -> np.ndarray:
-    """Return the derivatives (n, 2, 2) of `_straight`."""
-    steps = [
-        (_straight(camera, pixel + step) - _straight(camera, pixel - step)) / (2 * _STEP_PX)
-        for step in _STEP_PX * np.eye(2)
-    ]
-    return np.nan_to_num(np.stack(steps, -1), nan=0.0) + 1e-9 * np.eye(2)
+def _straight(kind: str, pixel: np.ndarray) -> np.ndarray:
+    """Return where the rays of pixels (..., 2), in focal lengths, meet the plane z = 1; NaN: nowhere."""
+    radius = np.linalg.norm(pixel, axis=-1, keepdims=True)
+    straight: np.ndarray = pixel * np.tan(_angle(kind, radius)) / np.maximum(radius, _AXIS)
+    return straight
+
+
+def _bent(kind: str, pixel: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return small errors (..., 2) on the plane z = 1 at pixels (..., 2) as errors of the pixels, in focal lengths."""
+    radius = np.maximum(np.linalg.norm(pixel, axis=-1, keepdims=True), _AXIS)
+    angle, out = _angle(kind, radius), pixel / radius
+    slope = {"pinhole": np.cos(angle) ** -2, "equidistant fisheye": 1.0, "orthographic fisheye": np.cos(angle)}
+    along = (error * out).sum(-1, keepdims=True) * out
+    bent: np.ndarray = along * np.cos(angle) ** 2 * slope[kind] + (error - along) * radius / np.tan(angle)
+    return bent
 
 
 def _costs(tried: list[_Tried]) -> dict[str, dict[float, float]]:
@@ -231,6 +226,5 @@ def _weights(costs: dict[str, dict[float, float]], fine: np.ndarray) -> dict[str
 
 def _fov_deg(kind: str, focal_px: float, width_px: float) -> float:
     """Return the horizontal field of view of a lens, degrees."""
-    lens = _lens(kind, PinholeCamera(focal_px, focal_px, 0.0, 0.0, 1, 1))
-    edge = lens.unproject(np.array([[width_px / 2, 0.0]]))[0, 0]
-    return 2 * math.degrees(math.atan(np.nan_to_num(edge, nan=np.inf)))
+    edge = _angle(kind, np.array([width_px / 2 / focal_px]))
+    return 2 * math.degrees(np.nan_to_num(edge, nan=math.pi / 2)[0])
