@@ -81,9 +81,7 @@ def similarity_to_truth(run: Path, source: Path) -> Similarity:
 def coverage_errors(found: Coverage, to_truth: Similarity, mesh: trimesh.Trimesh, shown: np.ndarray) -> CoverageErrors:
     """Return what was found of a run beside the truth of `shown_faces`."""
     back, chart = to_truth.inverse(), found.map
-    row, hours, wall = found.layout.place(
-        back.transform_points(mesh.triangles_center), mesh.face_normals @ back.R.T
-    )
+    row, hours, wall = found.layout.place(back.transform_points(mesh.triangles_center), mesh.face_normals @ back.R.T)
     row, column, rows = row - found.first, column_of(hours), len(chart.along)
     own = (row >= 0) & (row < rows)
     own[own] = np.isfinite(chart.unseen[row[own], column[own]])

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter, label
 from scipy.spatial import cKDTree
 
 from scopemap.actions.coverage.layout import CLOCK_BINS, Layout, binned, column_of, layout_of
-from scopemap.actions.coverage.unseen import Views, unseen_probability, views_of
+from scopemap.actions.coverage.unseen import Views, features, unseen_probability, views_of
 from scopemap.errors import InputError, reporting
 from scopemap.fusion.watertight import SEEN_CELLS, closed_space
 from scopemap.io.run_folder import RunFolder
@@ -29,7 +29,7 @@ from scopemap.trajectory.frame_table import FrameTable
 HIDDEN_AREA = 1.25
 BLIND = 0.3
 """Share not seen of a bin from which it belongs to a blind spot; the regression is cautious about single faces."""
-ODDS, SEGMENT_ODDS = 1.4, 2.2
+ODDS, SEGMENT_ODDS = 1.4, 3.0
 """Factors of the odds of a share at the ends of its interval: of the whole, and of one segment."""
 SEEN, SEEN_BADLY, NOT_SEEN = 1, 2, 3
 """Classes of the map: seen; from afar or obliquely only; probably not seen. 0 is outside of what was examined."""
@@ -113,7 +113,7 @@ class Coverage:
     kind : lumen: places along are distances on the centreline from the beginning of the examined part; cavity: degrees
     from the mean direction of view. unit : of lengths: "mm", or "unit" where the scale is unknown; scale : what is known
     of it. 12 o'clock is up in the first picture. spots : the largest first. surface : the closed mesh, unseen : (F,) the
-    probability that no frame saw a face, NaN outside of what was examined. layout : where points are; first : its row
+    probability that no frame saw a face, NaN outside of what was examined, by its features (F, 5). layout : where points are; first : its row
     that is the map's first.
     """
 
@@ -125,6 +125,7 @@ class Coverage:
     map: CoverageMap
     surface: trimesh.Trimesh
     unseen: np.ndarray
+    features: np.ndarray
     layout: Layout
     first: int
 
@@ -172,7 +173,7 @@ def coverage(folder: Path) -> Coverage:
     layout = layout_of(space, np.asarray(run.mesh.vertices), tracked["T_world_camera"])
     views = views_of(run, surface)
     present = cKDTree(run.mesh.vertices).query(surface.triangles_center)[0] <= SEEN_CELLS * space.cell_mm
-    probability = unseen_probability(surface, views, present, layout.radius_mm)
+    known = features(surface, views, present, layout.radius_mm)
     row, hours, wall = layout.place(surface.triangles_center, surface.face_normals)
     area = surface.area_faces * (wall | present)
     inside = layout.examined(*(binned(row, hours, weights, layout.rows) for weights in (area, area * present)))
@@ -185,7 +186,7 @@ def coverage(folder: Path) -> Coverage:
     counted = np.flatnonzero((row >= 0) & (row < len(inside)) & (area > 0))
     counted = counted[inside[row[counted], column_of(hours[counted])]]
     unseen = np.full(len(area), np.nan)
-    unseen[counted] = probability[counted]
+    unseen[counted] = unseen_probability(known[counted])
     faces = _Faces(surface.triangles_center[counted], row[counted], hours[counted], area[counted], unseen[counted])
     chart = _chart(faces, inside, views, counted, layout)
     spots = _spots(chart, faces, tracked, layout)
@@ -194,7 +195,7 @@ def coverage(folder: Path) -> Coverage:
     parts = [_share(faces, first, last, layout.step, SEGMENT_ODDS) for first, last in pairwise(ends)]
     total = _share(faces, 0, len(inside), layout.step, ODDS)
     unit = "mm" if run.scale_known else "unit"
-    return Coverage(unit, run.scale, total, parts, spots, chart, surface, unseen, layout, first)
+    return Coverage(unit, run.scale, total, parts, spots, chart, surface, unseen, known, layout, first)
 
 
 def _percent(share: Share) -> str:

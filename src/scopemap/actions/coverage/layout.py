@@ -14,8 +14,8 @@ CLOCK_BINS = 36
 LUMEN_RADII = 3.0
 """Length of the examined part, over its radius, from which a space is a lumen."""
 _RING_DEG, _RINGS = 4.0, 45
-_HALF = 0.5
-_FARTHEST_SEEN = 0.98  # share of what was seen in a clock direction of a cavity, up to whose angle it was examined
+_HALF, _END_RADII = 0.5, 0.25
+_FARTHEST_SEEN = 0.95  # share of what was seen in a clock direction of a cavity, up to whose angle it was examined
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,13 @@ class Lumen:
     def examined(self, area: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """Return the bins (S, 36) bool of the examined part: from the first to the last row half of which was seen.
 
-        The ends of the line, beyond which the surface closes, do not count.
+        A quarter of the radius at both ends does not count, since the surface closes there.
         """
-        rows = np.flatnonzero(seen.sum(1)[1:-1] > _HALF * area.sum(1)[1:-1]) + 1
+        rows = np.flatnonzero(seen.sum(1) > _HALF * area.sum(1))
         inside = np.zeros(area.shape, bool)
         if len(rows):
-            inside[rows[0] : rows[-1] + 1] = True
+            end = max(1, round(_END_RADII * self.radius_mm / self.step))
+            inside[max(rows[0], end) : min(rows[-1] + 1, len(area) - end)] = True
         return inside
 
 
@@ -82,8 +83,7 @@ class Cavity:
 
     def examined(self, area: np.ndarray, seen: np.ndarray) -> np.ndarray:
         """Return the bins (S, 36) bool of the examined part: in each clock direction, up to the farthest seen."""
-        share = np.cumsum(seen, axis=0) / np.maximum(seen.sum(0), 1e-9)
-        return np.asarray((share - seen / np.maximum(seen.sum(0), 1e-9) < _FARTHEST_SEEN) & (seen.sum(0) > 0))
+        return np.asarray((np.cumsum(seen, axis=0) <= _FARTHEST_SEEN * seen.sum(0)) & (seen.sum(0) > 0))
 
 
 Layout = Lumen | Cavity

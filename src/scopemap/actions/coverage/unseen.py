@@ -19,7 +19,7 @@ from scopemap.io.run_folder import RunFolder
 
 MOST_FRAMES = 200
 _SAME_DEPTH = 0.05
-_JUMP_PX, _JUMPS = 5, (0.01, 2.0)
+_JUMP_RAD, _JUMPS = 1 / 32, (0.01, 2.0)
 _MOST_RADII, _SMOOTHING_STEPS = 8.0, 30
 # Of a constant, the cosine, the logarithm of the jump, the surface's presence, and the distance in radii.
 WEIGHTS = np.array([3.633, -4.096, 0.72, -0.306, -0.311])
@@ -30,7 +30,7 @@ class Views:
     """How frames see the faces (F,) of a surface.
 
     cosine : the largest of the angle between normal and line of sight, 0 where none sees the face. jump : the smallest
-    range of the logarithm of depth in 5 x 5 pixels around it. distance_mm : the smallest, infinite where none sees it.
+    range of the logarithm of depth within 1/32 of a radian around it. distance_mm : the smallest, infinite where none sees it.
     share : of the frames that see it. A frame sees a face whose depth it has within 5 %.
     """
 
@@ -65,17 +65,22 @@ def views_of(run: RunFolder, surface: trimesh.Trimesh) -> Views:
         facing = -(rays * (normals[seen] @ T_world_camera[:3, :3])).sum(1) / length
         cosine[seen] = np.maximum(cosine[seen], facing)
         distance_mm[seen] = np.minimum(distance_mm[seen], length)
-        jump[seen] = np.minimum(jump[seen], _depth_range(depth_mm)[pixel])
+        jump[seen] = np.minimum(jump[seen], _depth_range(depth_mm, camera.fx)[pixel])
         share[seen] += 1 / len(frames)
     return Views(cosine, jump, distance_mm, share)
 
 
-def _depth_range(depth_mm: np.ndarray) -> np.ndarray:
-    """Return the range (H, W) of the logarithm of depth around each pixel."""
-    known, around = depth_mm > 0, np.ones((_JUMP_PX, _JUMP_PX), np.uint8)
+def _depth_range(depth_mm: np.ndarray, focal_px: float) -> np.ndarray:
+    """Return the range (H, W) of the logarithm of depth within 1/32 of a radian around each pixel.
+
+    In pictures whose pixels are too coarse for that, it is in proportion to the range within 3 pixels.
+    """
+    size = max(3, 2 * round((_JUMP_RAD * focal_px - 1) / 2) + 1)
+    known, around = depth_mm > 0, np.ones((size, size), np.uint8)
     logarithm = np.log(np.where(known, depth_mm, 1)).astype(np.float32)
     high = cv2.dilate(np.where(known, logarithm, -99).astype(np.float32), around)
-    return np.asarray(high - cv2.erode(np.where(known, logarithm, 99).astype(np.float32), around))
+    low = cv2.erode(np.where(known, logarithm, 99).astype(np.float32), around)
+    return np.asarray((high - low) * (_JUMP_RAD * focal_px / size))
 
 
 def features(surface: trimesh.Trimesh, views: Views, present: np.ndarray, radius_mm: float) -> np.ndarray:
@@ -89,11 +94,9 @@ def features(surface: trimesh.Trimesh, views: Views, present: np.ndarray, radius
     return np.column_stack([np.ones(len(radii)), around, radii])
 
 
-def unseen_probability(
-    surface: trimesh.Trimesh, views: Views, present: np.ndarray, radius_mm: float
-) -> np.ndarray:
-    """Return the probability (F,) that no frame saw a face; the parameters are those of `features`."""
-    return np.asarray(expit(features(surface, views, present, radius_mm) @ WEIGHTS))
+def unseen_probability(of: np.ndarray) -> np.ndarray:
+    """Return the probability (F,) that no frame saw a face, by its `features`."""
+    return np.asarray(expit(of @ WEIGHTS))
 
 
 def _smoothed(surface: trimesh.Trimesh, values: np.ndarray) -> np.ndarray:
