@@ -177,7 +177,7 @@ def test_the_examined_part_ends_where_half_was_seen() -> None:
 
 
 def bowl() -> trimesh.Trimesh:
-    """Return the far part of a ball of 30 mm around the origin, up to 32 degrees from z, its faces towards its middle."""
+    """Return a part of a ball of 30 mm, up to 32 degrees from z, its faces towards its middle."""
     ball = trimesh.creation.icosphere(5, 30.0)
     ball.invert()
     return without(ball, lambda p: p[:, 2] < 30 * np.cos(np.radians(32)))

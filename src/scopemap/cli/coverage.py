@@ -21,7 +21,7 @@ def coverage(
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Estimate which share of the tissue no frame saw, with an interval of 95 %, and list where.
+    """Estimate which share of the tissue no frame saw, with an interval of 90 %, and list where.
 
     Writes coverage.json, map.csv and map.png. An estimate, calibrated on synthetic colons; not for decisions about a
     patient.

@@ -63,7 +63,7 @@ def clock(right: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def centreline(inside: np.ndarray, corner_mm: np.ndarray, cell_mm: float) -> Centreline:
-    """Return the centreline of the cells `inside` (l, m, n) bool, which are one space, of a grid that begins at a corner.
+    """Return the centreline of one space, the cells `inside` (l, m, n) bool of a grid that begins at a corner.
 
     Its direction is arbitrary, as is its 12 o'clock.
     """

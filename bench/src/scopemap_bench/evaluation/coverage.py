@@ -1,8 +1,8 @@
 """The truth for `scopemap coverage`: which of a phantom's faces any frame shows, and errors of shares and blind spots.
 
-A frame shows a face that is turned to the camera and whose middle is not behind the farthest of 3 x 3 pixels of the true
-depth around it. The tissue that there is are the faces in the bins of the map that were examined, after the Sim(3) of
-the run's path to the truth.
+A frame shows a face that is turned to the camera and whose middle is not behind the farthest of 3 x 3 pixels of the
+true depth around it. The tissue that there is are the faces in the bins of the map that were examined, after the
+Sim(3) of the run's path to the truth.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _MOST_UNSEEN = 0.5  # share of a true bin that is not seen from which it belongs
 class CoverageErrors:
     """The truth beside what `scopemap coverage` found.
 
-    share, segments : true shares not seen, of the whole and of each segment. found : for each true blind spot of 1 cm2 and more whether listed spots of that size hold half of what was not seen
-    of it. right : for each listed one of that size whether half of the tissue there was not seen.
+    share, segments : true shares not seen, of the whole and of each segment. found : for each true blind spot of 1 cm2
+    and more whether listed spots of that size hold half of what was not seen of it. right : for each listed one of that size whether half of the tissue there was not seen.
     """
 
     share: float
@@ -81,7 +81,7 @@ def similarity_to_truth(run: Path, source: Path) -> Similarity:
 def coverage_errors(found: Coverage, to_truth: Similarity, mesh: trimesh.Trimesh, shown: np.ndarray) -> CoverageErrors:
     """Return what was found of a run beside the truth of `shown_faces`."""
     back, chart = to_truth.inverse(), found.map
-    row, hours, wall = found.layout.place(back.transform_points(mesh.triangles_center), mesh.face_normals @ back.R.T)
+    row, hours, _ = found.layout.place(back.transform_points(mesh.triangles_center), mesh.face_normals @ back.R.T)
     row, column, rows = row - found.first, column_of(hours), len(chart.along)
     own = (row >= 0) & (row < rows)
     own[own] = np.isfinite(chart.unseen[row[own], column[own]])

@@ -1,7 +1,7 @@
 """The share of the tissue of a result that was never seen, with an interval, and where: a map and blind spots.
 
-The tissue that there should be is the result's surface, closed smoothly where it has gaps (`fusion/watertight.py`), with
-a quarter more area where it was not seen: what a fold hides has more area than the sheet in front of it.
+The tissue that there should be is the result's surface, closed smoothly where it has gaps (`fusion/watertight.py`),
+with a quarter more area where it was not seen: what a fold hides has more area than the sheet in front of it.
 """
 
 from __future__ import annotations
@@ -29,8 +29,10 @@ from scopemap.trajectory.frame_table import FrameTable
 HIDDEN_AREA = 1.25
 BLIND = 0.3
 """Share not seen of a bin from which it belongs to a blind spot; the regression is cautious about single faces."""
-ODDS, SEGMENT_ODDS = 1.4, 3.0
+ODDS, SEGMENT_ODDS = {"lumen": 1.4, "cavity": 4.0}, {"lumen": 2.2, "cavity": 6.0}
 """Factors of the odds of a share at the ends of its interval: of the whole, and of one segment."""
+_NOTHING_HIDDEN = 0.1
+"""By so much the low end of a segment is lower still: where wall is seen from afar only, nothing may be hidden."""
 SEEN, SEEN_BADLY, NOT_SEEN = 1, 2, 3
 """Classes of the map: seen; from afar or obliquely only; probably not seen. 0 is outside of what was examined."""
 _GOOD_COSINE, _GOOD_RADII = 0.5, 2.0
@@ -42,7 +44,7 @@ _ALL_ROUND = 0.35  # length of the mean direction below which a blind spot is al
 
 
 class Share(NamedTuple):
-    """A share not seen, the ends of its 95 % interval, and the area of all tissue from `start` to `end`."""
+    """A share not seen, the ends of its 90 % interval, and the area of all tissue from `start` to `end`."""
 
     start: float
     end: float
@@ -110,11 +112,11 @@ class CoverageMap:
 class Coverage:
     """Which share of the tissue was not seen, and where.
 
-    kind : lumen: places along are distances on the centreline from the beginning of the examined part; cavity: degrees
-    from the mean direction of view. unit : of lengths: "mm", or "unit" where the scale is unknown; scale : what is known
-    of it. 12 o'clock is up in the first picture. spots : the largest first. surface : the closed mesh, unseen : (F,) the
-    probability that no frame saw a face, NaN outside of what was examined, by its features (F, 5). layout : where points are; first : its row
-    that is the map's first.
+    unit : of lengths, "mm", or "unit" where the scale is unknown; scale : what is known of it. Places along are
+    distances on the centreline of a lumen from the beginning of the examined part, or degrees from a cavity's mean
+    direction of view; 12 o'clock is up in the first picture. spots : the largest first. surface : the closed mesh.
+    unseen : (F,) probability that no frame saw a face, by its features (F, 5); NaN outside of what was examined.
+    layout : where points are on the map; first : its row that is the map's first.
     """
 
     unit: str
@@ -192,8 +194,9 @@ def coverage(folder: Path) -> Coverage:
     spots = _spots(chart, faces, tracked, layout)
     every = max(1, round((_SEGMENT_RADII * layout.radius_mm if layout.kind == "lumen" else _SEGMENT_DEG) / layout.step))
     ends = [*range(0, max(len(inside) - every // 2, 1), every), len(inside)]
-    parts = [_share(faces, first, last, layout.step, SEGMENT_ODDS) for first, last in pairwise(ends)]
-    total = _share(faces, 0, len(inside), layout.step, ODDS)
+    odds, step = SEGMENT_ODDS[layout.kind], layout.step
+    parts = [_share(faces, start, end, step, odds, _NOTHING_HIDDEN) for start, end in pairwise(ends)]
+    total = _share(faces, 0, len(inside), layout.step, ODDS[layout.kind])
     unit = "mm" if run.scale_known else "unit"
     return Coverage(unit, run.scale, total, parts, spots, chart, surface, unseen, known, layout, first)
 
@@ -228,13 +231,16 @@ def _checked(folder: Path) -> RunFolder:
     return run
 
 
-def _share(faces: _Faces, first: int, last: int, step: float, odds: float) -> Share:
-    """Return the share not seen of the rows from `first` up to `last`, whose odds are uncertain by a factor."""
+def _share(faces: _Faces, first: int, last: int, step: float, odds: float, lower: float = 0.0) -> Share:
+    """Return the share not seen of the rows from `first` up to `last`; its odds are uncertain by a factor.
+
+    lower : by so much its low end is lower still.
+    """
     inside = (faces.row >= first) & (faces.row < last)
     hidden = float(faces.hidden[inside].sum())
     seen = float((faces.area * (1 - faces.unseen))[inside].sum())
     low, share, high = (hidden * f / max(hidden * f + seen, 1e-12) for f in (1 / odds, 1.0, odds))
-    return Share(first * step, last * step, share, low, high, hidden + seen)
+    return Share(first * step, last * step, share, max(low - lower, 0.0), high, hidden + seen)
 
 
 def _chart(faces: _Faces, inside: np.ndarray, views: Views, counted: np.ndarray, layout: Layout) -> CoverageMap:

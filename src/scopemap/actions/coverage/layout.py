@@ -90,7 +90,7 @@ Layout = Lumen | Cavity
 
 
 def layout_of(space: ClosedSpace, points_mm: np.ndarray, poses: np.ndarray) -> Layout:
-    """Return the layout of a closed space by points (N, 3) of the surface that was seen and the camera's poses (M, 4, 4).
+    """Return the layout of a closed space, by points (N, 3) of the run's surface and the camera's poses (M, 4, 4).
 
     It is a lumen where the surface surrounds the free space, and where what was seen of it extends over three radii of
     its centreline or more; else a cavity. 12 o'clock is up in the first picture; a lumen is followed in the direction

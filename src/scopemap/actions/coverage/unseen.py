@@ -30,8 +30,8 @@ class Views:
     """How frames see the faces (F,) of a surface.
 
     cosine : the largest of the angle between normal and line of sight, 0 where none sees the face. jump : the smallest
-    range of the logarithm of depth within 1/32 of a radian around it. distance_mm : the smallest, infinite where none sees it.
-    share : of the frames that see it. A frame sees a face whose depth it has within 5 %.
+    range of the logarithm of depth within 1/32 of a radian around it. distance_mm : the smallest, infinite where none
+    sees it. share : of the frames that see it. A frame sees a face whose depth it has within 5 %.
     """
 
     cosine: np.ndarray
