@@ -35,7 +35,8 @@ class CoverageErrors:
     """The truth beside what `scopemap coverage` found.
 
     share, segments : true shares not seen, of the whole and of each segment. found : for each true blind spot of 1 cm2
-    and more whether listed spots of that size hold half of what was not seen of it. right : for each listed one of that size whether half of the tissue there was not seen.
+    and more whether listed spots of that size hold half of what was not seen of it. right : for each
+    listed one of that size whether half of the tissue there was not seen.
     """
 
     share: float
