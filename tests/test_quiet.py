@@ -119,7 +119,7 @@ def _assert_quiet(folder: Path, command: str) -> None:
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a phantom, its images, a video, pictures of a board, and a run, itself made quietly."""
     folder = tmp_path_factory.mktemp("quiet")
-    only_images(write_tiny(folder / "tiny"), folder / "in")
+    only_images(write_tiny(folder / "tiny", frames=12), folder / "in")  # fewer are not usable
     write(folder / "clip.mp4", clip(50))
     (folder / "board").mkdir()
     studio = Studio(PINHOLE, CHECKERBOARD)
