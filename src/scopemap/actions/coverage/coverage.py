@@ -144,13 +144,13 @@ class Coverage:
         """The figures in a few lines: the whole, the segments, and the largest blind spots."""
         along, area = ("deg" if self.layout.kind == "cavity" else self.unit), f"{self.unit}2"
         of = "a lumen" if self.layout.kind == "lumen" else "a cavity, by angles from the mean direction of view"
-        lines = [f"not seen: {_percent(self.total)} of {self.total.area:.3g} {area} of {of}; {self.scale}"]
+        lines = [f"not seen: {_percent(self.total)} of {_three_digits(self.total.area)} {area} of {of}; {self.scale}"]
         lines += [f"  {part.start:.0f} to {part.end:.0f} {along}: {_percent(part)}" for part in self.segments]
         lines += [f"blind spots: {len(self.spots)}" + (", the largest:" if self.spots else "")]
         for number, spot in enumerate(self.spots[:_SHOWN], 1):
             where = "all round" if spot.clock is None else f"{round(spot.clock) or 12} o'clock"
             when = f"camera nearest at {spot.time_s:.1f} s (frame {spot.frame})"
-            lines.append(f"  {number}. {spot.area:.3g} {area} at {spot.along:.0f} {along}, {where}; {when}")
+            lines.append(f"  {number}. {_three_digits(spot.area)} {area} at {spot.along:.0f} {along}, {where}; {when}")
         return "\n".join(lines)
 
     def draw(self, file: Path) -> None:
@@ -203,6 +203,10 @@ def coverage(folder: Path) -> Coverage:
 
 def _percent(share: Share) -> str:
     return f"{share.share:.0%} ({share.low:.0%} to {share.high:.0%})"
+
+
+def _three_digits(number: float) -> str:
+    return np.format_float_positional(float(f"{number:.3g}"), trim="-")
 
 
 class _Faces(NamedTuple):
