@@ -10,6 +10,7 @@ Phantoms of 50 frames, three times as fast as usual: forward, withdrawn, there a
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -84,17 +85,15 @@ def print_table(names: list[str], folder: Path) -> None:
         measuring.print_row(name, f"{errors.share:.1%}", estimated, f"{_points(found, errors):+.1f}", *cells)
     for kind, parts in everything.items():
         points = [abs(_points(*part)) for part in parts]
-        inside = [_inside(*part) for part in parts]
-        cells = [
-            _of([one for part in of for one in part])
-            for of in (
-                [part[1:] for part in inside],
-                [errors.right for _, errors in parts],
-                [errors.found for _, errors in parts],
-            )
+        held = [_inside(*part) for part in parts]
+        lists = [
+            [one[1:] for one in held],
+            [errors.right for _, errors in parts],
+            [errors.found for _, errors in parts],
         ]
+        cells = [_of([*chain(*values)]) for values in lists]
         error = f"{np.median(points):.1f} median, {max(points):.1f} most"
-        measuring.print_row(f"all: {kind}", "", f"{_of([part[0] for part in inside])} inside", error, *cells)
+        measuring.print_row(f"all: {kind}", "", f"{_of([one[0] for one in held])} inside", error, *cells)
 
 
 def _points(found: Coverage, errors: CoverageErrors) -> float:
