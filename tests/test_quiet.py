@@ -41,7 +41,7 @@ COMMANDS = (
     *("export run --to colmap --out colmap", "export run --to glb --out a.glb", "export run --to mcap --out a.mcap"),
     *("export run --to dicom --out a.dcm", "calibrate board --board 9x6 --square-mm 3 --model pinhole"),
     "measure run --frame 2 --points '60,60 90,90' --reference '60,60 90,60'",
-    "locate run tiny --out located.csv",
+    *("locate run tiny --out located.csv", "coverage run --out covered"),
     *(
         "phantom made --frames 3 --size 160x128",
         "compare run --truth tiny --out compared",
@@ -119,7 +119,7 @@ def _assert_quiet(folder: Path, command: str) -> None:
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a phantom, its images, a video, pictures of a board, and a run, itself made quietly."""
     folder = tmp_path_factory.mktemp("quiet")
-    only_images(write_tiny(folder / "tiny"), folder / "in")
+    only_images(write_tiny(folder / "tiny", frames=12), folder / "in")  # fewer are not usable
     write(folder / "clip.mp4", clip(50))
     (folder / "board").mkdir()
     studio = Studio(PINHOLE, CHECKERBOARD)

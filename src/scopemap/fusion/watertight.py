@@ -8,6 +8,8 @@ in view.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import trimesh
 from numba import njit, prange
@@ -21,13 +23,32 @@ _MOST_CELLS = 160  # along the longest side of the mesh
 _MARGIN_CELLS = 10
 # The distance is known so far from the surface, in cells, and is the mean over the planes of so many vertices.
 _BAND_CELLS, _PLANES = 2, 4
-_SEEN_CELLS = 1.5  # vertices farther from the mesh than this were not seen
+SEEN_CELLS = 1.5  # vertices farther from the mesh than this were not seen
 _LEVELS = (8, 4, 2, 1)  # cell sizes over the finest; each level starts from the one before
 _SWEEPS, _OVER_RELAXATION = 40, 1.7
 # Length of the mean normal above which a surface faces one way: that of a cavity as deep as its radius.
 _ONE_WAY = 1 / 3
 _SMALLEST_CELLS = 1e-3  # no vertex on a grid corner, where its edge would be ambiguous
 _UNSEEN_GREY = 128
+
+
+@dataclass(frozen=True)
+class ClosedSpace:
+    """The space that a surface encloses, in a grid of cells.
+
+    field : (l, m, n) float64, positive inside, about the distance to the surface in cells near it. corner_mm : (3,),
+    world, the grid's. tissue : whether the tissue behind the surface is inside; else the free space in front of it.
+    """
+
+    field: np.ndarray
+    corner_mm: np.ndarray
+    cell_mm: float
+    tissue: bool
+
+    def surface(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return vertices (V, 3), world mm, and faces (F, 3), whose normals point to the free space."""
+        vertices, faces = marching_cubes(self.field, np.ones(np.array(self.field.shape) - 1, bool))
+        return self.corner_mm + (vertices + 0.5) * self.cell_mm, faces[:, :: -1 if self.tissue else 1]
 
 
 def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
@@ -38,6 +59,20 @@ def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
     """
     if not len(mesh.faces):
         return mesh
+    space = closed_space(mesh, voxel_mm)
+    vertices, faces = space.surface()
+    distance_mm, nearest = cKDTree(mesh.vertices).query(vertices)
+    seen = distance_mm <= SEEN_CELLS * space.cell_mm
+    colours = vertex_colours(mesh)[nearest]
+    colours[~seen, :3] = _UNSEEN_GREY
+    attributes = {name: np.asarray(values)[nearest].copy() for name, values in mesh.vertex_attributes.items()}
+    for values in attributes.values():
+        values[~seen] = 0
+    return trimesh.Trimesh(vertices, faces, vertex_colors=colours, vertex_attributes=attributes, process=False)
+
+
+def closed_space(mesh: trimesh.Trimesh, voxel_mm: float) -> ClosedSpace:
+    """Return the space that the surface of a mesh with faces encloses, once it is closed; cells as in `watertight`."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     cell_mm = max(voxel_mm, float((high - low).max()) / _MOST_CELLS)
     coarse = np.ceil(((high - low) / cell_mm + 2 * _MARGIN_CELLS) / _LEVELS[0]).astype(int)
@@ -52,16 +87,7 @@ def watertight(mesh: trimesh.Trimesh, voxel_mm: float) -> trimesh.Trimesh:
         fixed = _set_distances(field, planes, tree, corner, level * cell_mm)
         _relax(field, fixed, _SWEEPS)
     field = _one_space(np.where(np.abs(field) < _SMALLEST_CELLS, np.copysign(_SMALLEST_CELLS, field), field))
-    vertices, faces = marching_cubes(field, np.ones(np.array(field.shape) - 1, bool))
-    vertices, faces = corner + (vertices + 0.5) * cell_mm, faces[:, ::side]
-    distance_mm, nearest = tree.query(vertices)
-    seen = distance_mm <= _SEEN_CELLS * cell_mm
-    colours = vertex_colours(mesh)[nearest]
-    colours[~seen, :3] = _UNSEEN_GREY
-    attributes = {name: np.asarray(values)[nearest].copy() for name, values in mesh.vertex_attributes.items()}
-    for values in attributes.values():
-        values[~seen] = 0
-    return trimesh.Trimesh(vertices, faces, vertex_colors=colours, vertex_attributes=attributes, process=False)
+    return ClosedSpace(field, corner, cell_mm, side < 0)
 
 
 def _set_distances(

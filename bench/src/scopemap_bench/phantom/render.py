@@ -168,7 +168,7 @@ def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearanc
         return tube_volume(poses), Appearance(_TUBE_RGB, 0.0, 0.0, spec.seed)
     base: np.ndarray | Tint
     if spec.scene == "colon":
-        volume, base = colon_volume(poses, spec.seed), _COLON_RGB
+        volume, base = colon_volume(poses, spec.seed, spec.fold_mm), _COLON_RGB
     else:
         volume, base = laparoscopy_volume(poses, spec.seed, _OPEN[spec.scene])
     return volume, Appearance(base, spec.texture, spec.gloss, spec.seed)

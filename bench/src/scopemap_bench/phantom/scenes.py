@@ -148,8 +148,11 @@ def _torus(p: np.ndarray, centre: np.ndarray, ring: float, pipe: float) -> np.nd
     return np.hypot(np.hypot(q[:, 0], q[:, 1]) - ring, q[:, 2]) - thickness
 
 
-def colon_volume(poses: np.ndarray, seed: int) -> Volume:
-    """Return a colon-like lumen around camera poses (N, 4, 4): at least 6 mm of free space, a blind end ahead."""
+def colon_volume(poses: np.ndarray, seed: int, fold_mm: float = 6.0) -> Volume:
+    """Return a colon-like lumen around camera poses (N, 4, 4): at least 6 mm of free space, a blind end ahead.
+
+    fold_mm : how far folds rise from the wall, at most.
+    """
     rng = np.random.default_rng((seed, 2))
     centres = backbone(poses, rng)
     along = _distances_along(centres)
@@ -162,7 +165,7 @@ def colon_volume(poses: np.ndarray, seed: int) -> Volume:
     # Far inside nothing is changed: rays cross the empty middle by the distance map alone.
     wall = (value > _OUTSIDE_MM + 0.5) & (value < 14.0)
     points = np.argwhere(wall) * voxel + origin
-    value[wall] -= _lumen_relief(points, station[wall], seed)
+    value[wall] -= _lumen_relief(points, station[wall], seed, fold_mm)
     return Volume(value, origin, voxel)
 
 
@@ -212,11 +215,11 @@ def _distances_along(centres: np.ndarray) -> np.ndarray:
     return dijkstra(links, directed=False, indices=len(centres) - 1)
 
 
-def _lumen_relief(points: np.ndarray, station: np.ndarray, seed: int) -> np.ndarray:
+def _lumen_relief(points: np.ndarray, station: np.ndarray, seed: int, fold_mm: float) -> np.ndarray:
     """Height (N,) in mm of folds, wrinkles and bumps above the plain wall at points (N, 3)."""
     wobble = 5.0 * noise_at(points, 24.0, seed + 11)
     crescent = np.clip(0.5 + 1.3 * noise_at(points, 26.0, seed + 12), 0.1, 1.0)
-    folds = 6.0 * crescent * np.exp(4.5 * (np.cos(2 * np.pi * (station + wobble) / 19.0) - 1))
+    folds = fold_mm * crescent * np.exp(4.5 * (np.cos(2 * np.pi * (station + wobble) / 19.0) - 1))
     wrinkles = 0.35 * np.sin(2 * np.pi * (station + 1.6 * wobble) / 5.2) * (0.6 + noise_at(points, 15.0, seed + 13))
     shape = 3.5 * noise_at(points, 32.0, seed + 14)
     bumps = 1.0 * noise_at(points, 9.0, seed + 15) + 0.3 * noise_at(points, 4.0, seed + 16)

@@ -1,0 +1,128 @@
+"""Errors of `scopemap coverage` on phantoms: the share that was not seen, its intervals, blind spots.
+
+    python -m scopemap_bench.scripts.coverage [--out FOLDER] [--only NAME ...]
+    python -m scopemap_bench.scripts.coverage --fit [--out FOLDER]
+
+Phantoms of 50 frames, three times as fast as usual: forward, withdrawn, there and back, with the camera turned away by
+30 degrees on the way, with folds of 9 mm in place of 6 mm, and cavities. None of them was used for choosing constants;
+`--fit` prints the regression's weights from those that were.
+"""
+
+from __future__ import annotations
+
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import expit
+
+from scopemap.actions.coverage.coverage import Coverage, coverage
+from scopemap.actions.coverage.unseen import WEIGHTS
+from scopemap_bench.evaluation.coverage import CoverageErrors, coverage_errors, shown_faces, similarity_to_truth
+from scopemap_bench.scripts import measuring
+
+FAST = ("--frames", 50, "--set", "speed=3")
+BACK, DEEP = ("--set", "route=withdrawal"), ("--set", "fold_mm=9")
+TURNS, TURNS_BACK = ("--events", "turn:14-20,turn:34-40"), ("--events", "turn:18-24,turn:34-40")
+CAVITY = ("--scene", "laparoscopy")
+PHANTOMS: dict[str, tuple[object, ...]] = {
+    **{f"wander-{seed}": FAST for seed in (71, 72)},
+    "loop-73": (*FAST, "--loop"),
+    **{f"withdrawal-{seed}": (*FAST, *BACK) for seed in (74, 75)},
+    "deep-withdrawal-76": (*FAST, *DEEP, *BACK),
+    **{f"turn-{seed}": (*FAST, *TURNS) for seed in (77, 78)},
+    "turn-withdrawal-79": (*FAST, *BACK, *TURNS_BACK),
+    **{f"deep-{seed}": (*FAST, *DEEP) for seed in (80, 81, 82)},
+    **{f"laparoscopy-{seed}": (*FAST, *CAVITY) for seed in (83, 84)},
+}
+FITTED: dict[str, tuple[object, ...]] = {
+    **{f"fitted-{seed}": ("--frames", 150) for seed in (51, 53)},
+    **{f"fitted-{seed}": ("--frames", 150, *BACK) for seed in (52, 54)},
+    "fitted-55": ("--frames", 150, *DEEP),
+    "fitted-57": (*FAST, *TURNS),
+}
+_EVERY, _STEPS = 12, 12
+
+
+def found_and_true(name: str, words: tuple[object, ...], folder: Path) -> tuple[Coverage, CoverageErrors, np.ndarray]:
+    """Render and run a phantom unless that was done; return coverage, errors, and which true faces are hidden (F,)."""
+    source = measuring.phantom(folder / name, *words, "--seed", name.split("-")[-1])
+    run = measuring.run_once(source, folder / f"{name}-run")
+    found, similarity = coverage(run), similarity_to_truth(run, source)
+    mesh, shown = shown_faces(source)
+    nearest = cKDTree(mesh.triangles_center).query(similarity.transform_points(found.surface.triangles_center))[1]
+    return found, coverage_errors(found, similarity, mesh, shown), ~shown[nearest]
+
+
+def fitted_weights(folder: Path) -> np.ndarray:
+    """Return the weights of the logistic regression, by Newton's method, on every 12th face of the fitted phantoms."""
+    rows, labels = [], []
+    for name, words in FITTED.items():
+        found, _, hidden = found_and_true(name, words, folder)
+        chosen = np.flatnonzero(np.isfinite(found.unseen))[::_EVERY]
+        rows.append(found.features[chosen])
+        labels.append(hidden[chosen])
+    x, y = np.concatenate(rows), np.concatenate(labels)
+    weights = np.zeros(len(WEIGHTS))
+    for _ in range(_STEPS):
+        p = expit(x @ weights)
+        weights += np.linalg.solve((x * (p * (1 - p))[:, None]).T @ x, x.T @ (y - p))
+    return weights
+
+
+def print_table(names: list[str], folder: Path) -> None:
+    """Print a row for each phantom, and the sums over lumens and cavities."""
+    heads = ("not seen, true", "estimated", "error, points", "segments inside", "spots right", "spots found")
+    measuring.print_head("phantom", *heads)
+    everything: dict[str, list[tuple[Coverage, CoverageErrors]]] = {}
+    for name in names:
+        found, errors, _ = found_and_true(name, PHANTOMS[name], folder)
+        everything.setdefault(found.layout.kind, []).append((found, errors))
+        total, inside = found.total, _inside(found, errors)
+        estimated = f"{total.share:.1%} ({total.low:.0%} to {total.high:.0%})"
+        cells = [_of(values) for values in (inside[1:], errors.right, errors.found)]
+        measuring.print_row(name, f"{errors.share:.1%}", estimated, f"{_points(found, errors):+.1f}", *cells)
+    for kind, parts in everything.items():
+        points = [abs(_points(*part)) for part in parts]
+        held = [_inside(*part) for part in parts]
+        lists = [
+            [one[1:] for one in held],
+            [errors.right for _, errors in parts],
+            [errors.found for _, errors in parts],
+        ]
+        cells = [_of([*chain(*values)]) for values in lists]
+        error = f"{np.median(points):.1f} median, {max(points):.1f} most"
+        measuring.print_row(f"all: {kind}", "", f"{_of([one[0] for one in held])} inside", error, *cells)
+
+
+def _points(found: Coverage, errors: CoverageErrors) -> float:
+    return 100 * (found.total.share - errors.share)
+
+
+def _inside(found: Coverage, errors: CoverageErrors) -> list[bool]:
+    """Return whether the true share is in the interval: of the whole, then of each segment."""
+    shares = zip([found.total, *found.segments], [errors.share, *errors.segments], strict=True)
+    return [bool(part.low <= true <= part.high) for part, true in shares]
+
+
+def _of(values: list[bool]) -> str:
+    return f"{sum(values)} of {len(values)}"
+
+
+def main() -> None:
+    """Print the table, or the weights."""
+    parser = measuring.options_of(__doc__, out=True)
+    parser.add_argument("--only", nargs="+", choices=PHANTOMS, default=list(PHANTOMS), metavar="NAME")
+    parser.add_argument("--fit", action="store_true", help="print the regression's weights")
+    options = parser.parse_args()
+    with measuring.folder_or_scratch(options.out) as folder:
+        folder.mkdir(parents=True, exist_ok=True)
+        if options.fit:
+            print(np.round(fitted_weights(folder), 3).tolist())
+        else:
+            print_table(options.only, folder)
+
+
+if __name__ == "__main__":
+    main()

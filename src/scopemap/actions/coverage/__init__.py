@@ -1,0 +1,1 @@
+"""Which share of the tissue was never seen, and where."""

@@ -1,0 +1,48 @@
+"""`scopemap coverage`: which share of the tissue was never seen, and where."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scopemap.cli import options
+from scopemap.cli.figures import print_json
+
+
+def coverage(
+    run: Annotated[Path, typer.Argument(metavar="RESULT", help="Folder of a run, or of a submap, result/maps/1.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where map and figures go; default: RESULT/coverage.")
+    ] = None,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Estimate which share of the tissue no frame saw, with an interval of 90 %, and list where.
+
+    Writes coverage.json, map.csv and map.png. An estimate, calibrated on synthetic colons; not for decisions about a
+    patient.
+    """
+    folder = out or run / "coverage"
+    files = {name: folder / name for name in ("coverage.json", "map.csv", "map.png")}
+    for file in files.values():
+        options.check_output(file, (file.suffix,), overwrite)
+    from scopemap.actions.coverage.coverage import coverage as covered
+    from scopemap.errors import reporting
+    from scopemap.io.json_numbers import without_nan
+
+    found = covered(run)
+    with reporting(f"cannot write to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(without_nan(found.facts), indent=2) + "\n"
+        files["coverage.json"].write_text(text, encoding="utf-8")
+    found.map.write(files["map.csv"])
+    found.draw(files["map.png"])
+    if as_json:
+        print_json(found.facts | {"out": str(folder)})
+    elif not quiet:
+        typer.echo(str(found))
+        typer.echo(f"{folder}: {', '.join(files)}")
