@@ -19,6 +19,7 @@ from scopemap_bench.phantom.motion import (
     breathing,
     contractions,
     cut,
+    examined_again,
     grasp,
     lumen_path,
     poke,
@@ -75,6 +76,8 @@ def prepare(spec: PhantomSpec) -> Phantom:
     """Return the phantom of `spec`: path read or generated, scene built around it, exposure set by the first frame."""
     poses = camera_path(spec)
     volume, appearance = build_scene(spec, poses)
+    if spec.examination:
+        poses = examined_again(poses, spec.examination, spec.seed)
     for event in _events(spec, "contact"):
         poses = touching(poses, event.first, event.last, lambda point: float(volume.values_at(point[None])[0][0]))
     phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None)

@@ -56,6 +56,7 @@ class PhantomSpec:
     than usual, and with `loop` ends in exactly its first pose.
     route : of a generated path. wander: forward in a lumen, to and fro over a cavity; sideways: by 22 mm, a third of
     the distance to a cavity's floor; withdrawal: 52 mm straight back. These two are as long in any number of frames.
+    examination : 0: the first one; another number: the same scene seen again, on another path beside the first one's.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often. events : see `Event`.
     noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
     texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo. gloss : of wet highlights, 1 =
@@ -76,6 +77,7 @@ class PhantomSpec:
     seed: int = 0
     path_file: Path | None = None
     route: RouteName = "wander"
+    examination: int = 0
     deform: bool = False
     loop: bool = False
     speed: int = 1
