@@ -21,6 +21,7 @@ from scopemap.report.measured_surface import drawn, measure_errors, measured_dep
 
 _REFERENCE_ROW, _FIRST_ROW = 3, 9
 """Of the drawn numbers: 0 to 2 are what all share, then three for each point."""
+_LEAST_REFERENCE_PX = 10
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,12 @@ class Measure:
     low: float
     high: float
     unit: str
+
+    @classmethod
+    def of(cls, what: str, value: float, relative: np.ndarray, unit: str, sizes: dict[str, Any]) -> Measure:
+        """Return a measure by its value and draws (D,) of what it may be over that; sizes : from `measure_errors`."""
+        low, high = np.percentile(relative, [sizes["tail_percent"], 100 - sizes["tail_percent"]])
+        return cls(what, float(value), float(value * min(low, 1.0)), float(value * max(high, 1.0)), unit)
 
     def __str__(self) -> str:
         if not np.isfinite(self.value):
@@ -81,36 +88,72 @@ def measure(
     if reference is None and reference_mm is not None:
         raise SettingsError("a length of the reference without its two points: give both")
     run = read_exported(folder)
-    if not run.scale_known and reference is None:
-        raise InputError(
-            f"{folder}: {run.scale}; give two points as a reference: measures are then multiples of their distance, "
-            "and millimetres where that is given, too"
-        )
+    scale = known_scale(run, None if reference is None else Known(frame, reference, reference_mm))
     pose, mesh = _pose(run, frame), measured_mesh(run, frame)
     picked, errors = _picked(run, mesh, frame, pose, pixels), _drawn(run)
-    unit, divisor, draws = "mm", 1.0, errors.scale
-    if reference is not None:
-        known = _picked(run, mesh, frame, pose, reference)
-        divisor = _straight(np.stack([point.position for point in known.points]))
-        if divisor <= 0:
-            raise InputError("the reference's two points are the same")
-        draws = 1 / _relative(run, known, errors, _straight, _REFERENCE_ROW)
-        unit = "times the reference" if reference_mm is None else "mm"
-        divisor /= reference_mm or 1.0
     if len(pixels) > 2:
         area = area_inside(mesh, pixels, run.camera, pose)
         if area <= 0:
             raise InputError(f"no surface is seen inside the polygon of frame {frame}")
-        relative = _relative(run, picked, errors, _flat_area, _FIRST_ROW) * draws**2
-        unit = {"mm": "mm2"}.get(unit, "times the reference's square")
-        return [_measure("area", area / divisor**2, relative, unit, errors.sizes["tail_percent"])]
-    relative = _relative(run, picked, errors, _straight, _FIRST_ROW) * draws
+        relative = _relative(run, picked, errors, _flat_area, _FIRST_ROW) * scale.draws**2
+        return [Measure.of("area", area / scale.divisor**2, relative, scale.square, scale.sizes)]
+    relative = _relative(run, picked, errors, _straight, _FIRST_ROW) * scale.draws
     straight = _straight(np.stack([point.position for point in picked.points]))
     along = path_length(mesh, *picked.points)
     found = {"straight": straight, "along the surface": along}
-    return [
-        _measure(what, value / divisor, relative, unit, errors.sizes["tail_percent"]) for what, value in found.items()
-    ]
+    return [Measure.of(what, value / scale.divisor, relative, scale.unit, scale.sizes) for what, value in found.items()]
+
+
+@dataclass(frozen=True)
+class Known:
+    """A reference: two pixels (2, 2) of a frame, and their straight distance, mm; None: it is the unit."""
+
+    frame: int
+    pixels: np.ndarray
+    length_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class KnownScale:
+    """The scale of a run's millimetres: what lengths are divided by, (D,) draws of its error, unit and its square.
+
+    focal, depth : (D,) draws of the focal length, and of what is common to depth, over their values. words : what the scale rests on. sizes : of the errors, from
+    `measure_errors`.
+    """
+
+    divisor: float
+    draws: np.ndarray
+    focal: np.ndarray
+    depth: np.ndarray
+    unit: str
+    square: str
+    words: str
+    sizes: dict[str, Any]
+
+
+def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
+    """Return the scale that a run knows, or that of a reference. Raises `InputError` where neither gives one."""
+    errors = _drawn(run)
+    if known is None:
+        if not run.scale_known:
+            raise InputError(
+                f"{run.path}: {run.scale}; give two points as a reference: measures are then multiples of their "
+                "distance, and millimetres where that is given, too"
+            )
+        alike = np.ones_like(errors.scale)
+        return KnownScale(1.0, errors.scale, errors.focal, alike, "mm", "mm2", run.scale, errors.sizes)
+    if (far_px := float(np.linalg.norm(known.pixels[1] - known.pixels[0]))) < _LEAST_REFERENCE_PX:
+        raise InputError(f"the reference is {far_px:.1f} px long: {_LEAST_REFERENCE_PX} px are needed")
+    picked = _picked(run, measured_mesh(run, known.frame), known.frame, _pose(run, known.frame), known.pixels)
+    length = _straight(np.stack([point.position for point in picked.points]))
+    draws = 1 / _relative(run, picked, errors, _straight, _REFERENCE_ROW)
+    if known.length_mm is None:
+        unit, words = "times the reference", f"two points of frame {known.frame}, whose distance in mm is not known"
+    else:
+        unit, words = "mm", f"two points of frame {known.frame}, taken to be {known.length_mm:g} mm apart"
+    square = {"mm": "mm2"}.get(unit, "times the reference's square")
+    alike = np.exp(picked.depth_error.mean() * errors.depth / np.sqrt(2))
+    return KnownScale(length / (known.length_mm or 1.0), draws, errors.focal, alike, unit, square, words, errors.sizes)
 
 
 def _pose(run: ExportedRun, frame: int) -> np.ndarray:
@@ -182,8 +225,3 @@ def _flat_area(points: np.ndarray) -> Any:
     """Return the area of polygons (..., N, 3), projected to where it is largest."""
     from_first = points - points[..., :1, :]
     return 0.5 * np.linalg.norm(np.cross(from_first[..., :-1, :], from_first[..., 1:, :]).sum(axis=-2), axis=-1)
-
-
-def _measure(what: str, value: float, relative: np.ndarray, unit: str, tail_percent: float) -> Measure:
-    low, high = np.percentile(relative, [tail_percent, 100 - tail_percent])
-    return Measure(what, float(value), float(value * min(low, 1.0)), float(value * max(high, 1.0)), unit)

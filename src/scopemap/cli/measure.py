@@ -1,48 +1,108 @@
-"""`scopemap measure`: distances and areas on the surface of a run."""
+"""`scopemap measure`: distances and areas on the surface of a run, and the sizes of a lesion."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from scopemap.cli.options import AsJson
 
+if TYPE_CHECKING:
+    from scopemap.actions.measure import Known, Measure
+
 
 def measure(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a submap, result/maps/1.")],
-    frame: Annotated[int, typer.Option(help="Number of the frame that the pixels are of.")],
-    points: Annotated[str, typer.Option(help='Pixels "x,y x,y": two for a distance, more for the area inside.')],
+    frame: Annotated[int | None, typer.Option(help="Number of the frame that the pixels, or the mask, are of.")] = None,
+    points: Annotated[str, typer.Option(help='Pixels "x,y x,y": two for a distance, more for the area inside.')] = "",
+    lesion: Annotated[
+        str,
+        typer.Option(
+            metavar="MASKS",
+            help='Folder of masks numbered as frames; or of --frame one mask or an outline "x,y x,y x,y".',
+        ),
+    ] = "",
+    second: Annotated[float | None, typer.Option(help="Time of the frame, s, instead of its number.")] = None,
     reference: Annotated[
         str, typer.Option(help='Two pixels "x,y x,y" of the same frame, whose distance is known.')
     ] = "",
+    reference_mask: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Mask of an instrument's shaft, as wide as known, instead.")
+    ] = None,
+    reference_frame: Annotated[int | None, typer.Option(help="Frame of the reference, with --lesion.")] = None,
     reference_mm: Annotated[
         float | None, typer.Option(min=1e-6, help="Their distance, mm; without it, measures are multiples of it.")
     ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Draw the lesion's outline in the frames that count.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure on the surface between pixels of a frame, with intervals of 95 %.
+    """Measure on the surface between pixels of a frame, or a lesion in all frames, with intervals of 95 %.
 
     Where the run's scale is unknown, a reference is needed.
     """
-    pixels, known = _pixels(points, "--points"), _pixels(reference, "--reference") if reference else None
-    if len(pixels) < 2:
+    if bool(points) == bool(lesion):
+        raise typer.BadParameter("give either --points or --lesion")
+    pixels = _pixels(points, "--points") if points else []
+    if points and len(pixels) < 2:
         raise typer.BadParameter("at least two pixels are needed", param_hint="--points")
+    if points and (frame is None or second is not None or reference_mask or pictures or reference_frame is not None):
+        raise typer.BadParameter("--points needs --frame, and takes of the others --reference and --reference-mm alone")
+    known = _pixels(reference, "--reference") if reference else None
     if known is not None and len(known) != 2:
         raise typer.BadParameter("two pixels are needed", param_hint="--reference")
+    if known is not None and reference_mask is not None:
+        raise typer.BadParameter("give either --reference or --reference-mask")
     import numpy as np
 
+    from scopemap.actions import lesion as lesions
     from scopemap.actions import measure as measuring
 
-    unit = None if known is None else np.array(known)
-    found = measuring.measure(run, frame, np.array(pixels), unit, reference_mm)
-    if as_json:
-        facts = [vars(one) | {"value": one.value if np.isfinite(one.value) else None} for one in found]
-        typer.echo(json.dumps(facts, indent=2))
-    else:
-        typer.echo("\n".join(map(str, found)))
+    if points:
+        assert frame is not None
+        unit = None if known is None else np.array(known)
+        found = measuring.measure(run, frame, np.array(pixels), unit, reference_mm)
+        _show(found, [_facts(one) for one in found], as_json)
+        return
+    frame = lesions.frame_at(run, second) if second is not None else frame
+    masks: Path | np.ndarray = Path(lesion)
+    if not Path(lesion).exists():
+        masks = np.array(_pixels(lesion, "--lesion"))
+    if not (isinstance(masks, Path) and masks.is_dir()) and frame is None:
+        raise typer.BadParameter("one mask, or an outline, needs --frame or --second", param_hint="--lesion")
+    of_folder = isinstance(masks, Path) and masks.is_dir()
+    given: Known | None = None
+    at = reference_frame if reference_frame is not None else frame
+    if known is not None or reference_mask is not None:
+        if at is None:
+            raise typer.BadParameter("a reference needs --reference-frame", param_hint="--reference")
+        ends = lesions.shaft_width(run, reference_mask) if reference_mask is not None else np.array(known)
+        given = measuring.Known(at, ends, reference_mm)
+    measured = lesions.measure_lesion(run, lesions.Lesion(masks, None if of_folder else frame), given)
+    if pictures is not None:
+        lesions.write_outlines(run, measured.masks, pictures)
+    facts = {
+        "measures": [_facts(one) for one in measured.measures],
+        "scale": measured.scale,
+        "frames": list(measured.masks),
+    }
+    _show(measured.measures, facts, as_json)
+    if not as_json:
+        typer.echo(f"from {len(measured.masks)} frames; scale: {measured.scale}")
+
+
+def _facts(one: Measure) -> dict[str, Any]:
+    import numpy as np
+
+    return vars(one) | {"value": one.value if np.isfinite(one.value) else None}
+
+
+def _show(found: list[Measure], facts: Any, as_json: bool) -> None:
+    typer.echo(json.dumps(facts, indent=2) if as_json else "\n".join(map(str, found)))
 
 
 def _pixels(text: str, option: str) -> list[list[float]]:

@@ -31,6 +31,9 @@ def phantom(
             "push, rebound, poke, peristalsis, grasp, cut"
         ),
     ] = "",
+    polyps: Annotated[
+        str, typer.Option(help="KIND:MM@FRAME,... where that frame sees the wall: sessile, pedunculated, flat")
+    ] = "",
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="route, fov_deg, noise, texture, shutter, ..."),
@@ -40,7 +43,7 @@ def phantom(
 ) -> None:
     """Render synthetic endoscopy with true poses, depth and mesh, in the C3VD layout."""
     # Imported here, so that --help does not wait for the kernels.
-    from scopemap_bench.phantom.spec import PhantomSpec, parse_events
+    from scopemap_bench.phantom.spec import PhantomSpec, parse_events, parse_polyps
     from scopemap_bench.phantom.writer import write_phantom
 
     width, height = parse_size(size)
@@ -54,6 +57,7 @@ def phantom(
         deform=deform,
         loop=loop,
         events=parse_events(events),
+        polyps=parse_polyps(polyps),
     ).with_settings(parse_settings(settings or []))
     with count_progress("rendering", "rendered", silent=quiet or as_json) as progress:
         write_phantom(spec, folder, progress)

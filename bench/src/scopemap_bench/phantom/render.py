@@ -29,6 +29,7 @@ from scopemap_bench.phantom.motion import (
     touching,
     turned,
 )
+from scopemap_bench.phantom.polyps import Polyps, grow
 from scopemap_bench.phantom.scenes import Tint, colon_volume, laparoscopy_volume, tube_volume
 from scopemap_bench.phantom.shading import (
     Appearance,
@@ -61,7 +62,7 @@ _PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 @dataclass(frozen=True)
 class Phantom:
     """A scene and the path (N, 4, 4) through it, camera to world, mm; `exposure`: of all frames, of each (N,), or None:
-    own.
+    own. `polyps` : those that are in `volume`.
     """
 
     spec: PhantomSpec
@@ -70,6 +71,7 @@ class Phantom:
     poses: np.ndarray
     motion: TissueMotion
     exposure: float | np.ndarray | None
+    polyps: Polyps | None = None
 
 
 def prepare(spec: PhantomSpec) -> Phantom:
@@ -80,7 +82,10 @@ def prepare(spec: PhantomSpec) -> Phantom:
         poses = examined_again(poses, spec.examination, spec.seed)
     for event in _events(spec, "contact"):
         poses = touching(poses, event.first, event.last, lambda point: float(volume.values_at(point[None])[0][0]))
-    phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None)
+    polyps = None
+    if spec.polyps:
+        volume, polyps = grow(volume, spec.polyps, poses, spec.camera, spec.seed)
+    phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None, polyps)
     if not spec.auto_exposure:
         return replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
     return replace(phantom, exposure=_lagging_exposure(phantom)) if spec.exposure_lag_frames > 0 else phantom
@@ -191,6 +196,8 @@ def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers
     rest, footprint = surface.rest_mm, surface.distance_mm / np.float32(camera.central.fx)
     albedo, ripple = look.albedo(rest, footprint), look.ripple(rest, footprint)
     albedo[in_wound(displacement.slits, rest)] *= _WOUND_RGB
+    if phantom.polyps is not None:
+        albedo = albedo * phantom.polyps.tint(rest)
     radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
     for tool in _tools(phantom, time):
         radiance, surface = insert(tool, radiance, surface, camera)

@@ -17,6 +17,7 @@ from scopemap.errors import SettingsError
 
 SceneName = Literal["colon", "laparoscopy", "abdominal_wall", "tube"]
 RouteName = Literal["wander", "sideways", "withdrawal"]
+PolypName = Literal["sessile", "pedunculated", "flat"]
 EventName = Literal[
     "black", "blur", "smoke", "veil", "fluid", "instrument", "turn", "contact",
     "push", "rebound", "poke", "peristalsis", "grasp", "cut",
@@ -45,6 +46,19 @@ class Event:
 
 
 @dataclass(frozen=True)
+class Polyp:
+    """A polyp so wide on the wall, where frame `frame` sees it well.
+
+    sessile : half an ellipsoid. pedunculated : a head on a stalk. flat : a disc 1.5 mm high. Across, each is 0.8 times
+    as wide.
+    """
+
+    kind: PolypName
+    diameter_mm: float
+    frame: int
+
+
+@dataclass(frozen=True)
 class PhantomSpec:
     """Parameters of a phantom.
 
@@ -58,6 +72,7 @@ class PhantomSpec:
     the distance to a cavity's floor; withdrawal: 52 mm straight back. These two are as long in any number of frames.
     examination : 0: the first one; another number: the same scene seen again, on another path beside the first one's.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often. events : see `Event`.
+    polyps : see `Polyp`; their true sizes and masks are written, too.
     noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
     texture : strength of mottling and vessels, 1 = mild as in C3VD, 0 = uniform albedo. gloss : of wet highlights, 1 =
     clinic.
@@ -82,6 +97,7 @@ class PhantomSpec:
     loop: bool = False
     speed: int = 1
     events: tuple[Event, ...] = ()
+    polyps: tuple[Polyp, ...] = ()
     breath_mm: float = 2.0
     breath_frames: float = 120.0
     noise: float = 0.004
@@ -117,6 +133,9 @@ class PhantomSpec:
             or not (self.loop or self.path_file),
             "depth_scale_mm must be positive": self.depth_scale_mm > 0,
             "a phantom has one cut at most": sum(event.kind == "cut" for event in self.events) <= 1,
+            "polyps must be 2 to 25 mm wide, pedunculated ones 14 at most": all(
+                2 <= one.diameter_mm <= (14 if one.kind == "pedunculated" else 25) for one in self.polyps
+            ),
             "a turn does not go with loop": not (self.loop and any(event.kind == "turn" for event in self.events)),
             "loop needs a generated path of at least 3 frames, not a path file": not self.loop
             or (self.path_file is None and (self.frames is None or self.frames >= 3)),
@@ -136,7 +155,7 @@ class PhantomSpec:
 
     def with_settings(self, settings: dict[str, Any]) -> PhantomSpec:
         """Return a copy with settings given as values or text, such as {"fov_deg": "70"}; raises `SettingsError`."""
-        types = {name: kind for name, kind in get_type_hints(type(self)).items() if name != "events"}
+        types = {name: kind for name, kind in get_type_hints(type(self)).items() if name not in ("events", "polyps")}
         values = {}
         for name, value in settings.items():
             if name not in types:
@@ -160,3 +179,16 @@ def parse_events(text: str) -> tuple[Event, ...]:
             raise SettingsError(f"the event '{part}' ends before it begins: write {kind}:{last}-{first}")
         events.append(Event(kind, first, last))  # type: ignore[arg-type]
     return tuple(events)
+
+
+def parse_polyps(text: str) -> tuple[Polyp, ...]:
+    """Return the polyps of a text such as "sessile:8@30,flat:12.5@60"; raises `SettingsError`."""
+    polyps, kinds = [], get_args(PolypName)
+    for part in filter(None, (piece.strip() for piece in text.split(","))):
+        match = re.fullmatch(rf"({'|'.join(kinds)}):(\d+(?:\.\d+)?)@(\d+)", part)
+        if not match:
+            raise SettingsError(
+                f"cannot read the polyp '{part}': expected KIND:MM@FRAME, KIND one of {', '.join(kinds)}"
+            )
+        polyps.append(Polyp(match[1], float(match[2]), int(match[3])))  # type: ignore[arg-type]
+    return tuple(polyps)

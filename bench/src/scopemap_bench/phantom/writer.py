@@ -1,10 +1,11 @@
 """Write a phantom as a C3VD folder, with a calibration file and the true surface beside the frames.
 
 0000_color.png  0000_depth.tiff  pose.txt  camera.yaml  mesh_truth.ply  [mesh_truth/0000.ply]  displacement_truth.npz
-phantom.json
+[lesions/truth.json  lesions/1/0000.png]  phantom.json
 
 `displacement_truth.npz` follows material points: `positions_mm` (frames, points, 3) float32, world mm, where points of
-the tissue that was seen, the same ones in all frames, are in each.
+the tissue that was seen, the same ones in all frames, are in each. `lesions/N` has the masks, 255, of the polyp N in
+the frames that see it; `truth.json` the sizes of each at rest, mm and mm2, over its whole surface.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.errors import InputError
 from scopemap.fusion.mesh import marching_cubes
+from scopemap.geometry.lesion_shape import extents
 from scopemap.io.decoding import write_encoded
 from scopemap_bench.phantom.march import Volume
 from scopemap_bench.phantom.render import Phantom, prepare, render_frame
@@ -40,9 +43,12 @@ _OWN_FILES = (
     "mesh_truth.ply",
     "mesh_truth/*.ply",
     DISPLACEMENT,
+    "lesions/truth.json",
+    "lesions/*/*.png",
 )
 _FOLLOWED_POINTS = 1000
 _NEWTON_STEPS = 4
+_BESIDE_MM = 2.0
 _SEEN_MARGIN_VOXELS, _RIM_VOXELS = 2, 4
 
 
@@ -61,12 +67,16 @@ def seen_surface(volume: Volume, seen: np.ndarray) -> trimesh.Trimesh:
     if not where.any() or values[where].min() > 0 or values[where].max() < 0:
         raise InputError("no tissue is in sight of the camera path: nothing to make a true mesh of")
     vertices, faces = marching_cubes(values, where[1:, 1:, 1:])
-    points = vertices * volume.voxel_mm + volume.origin_mm
+    points = _onto_surface(volume, vertices * volume.voxel_mm + volume.origin_mm)
+    return trimesh.Trimesh(points, faces, process=False)
+
+
+def _onto_surface(volume: Volume, points: np.ndarray) -> np.ndarray:
     for _ in range(_NEWTON_STEPS):
         value, gradient = volume.values_at(points)
         shift = -(value / (gradient**2).sum(1))[:, None] * gradient
         points = points + np.clip(np.nan_to_num(shift), -0.5 * volume.voxel_mm, 0.5 * volume.voxel_mm)
-    return trimesh.Trimesh(points, faces, process=False)
+    return points
 
 
 def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int], None] | None = None) -> None:
@@ -94,8 +104,14 @@ def write_phantom(spec: PhantomSpec, folder: Path, progress: Callable[[int, int]
             rgb = rgb if coding is None else coding(rgb)
             write_encoded(folder / f"{index:04d}_color.png", rgb[..., ::-1])
             write_encoded(folder / f"{index:04d}_depth.tiff", encode_depth(surface.depth_mm, spec.depth_scale_mm))
+            if phantom.polyps is not None:
+                _write_masks(phantom.polyps.labels(surface.rest_mm), folder / "lesions", index)
             if progress is not None:
                 progress(index + 1, len(phantom.poses))
+        if phantom.polyps is not None:
+            lesions = [_true_lesion(phantom, number) for number in range(len(spec.polyps))]
+            (folder / "lesions").mkdir(exist_ok=True)
+            (folder / "lesions" / "truth.json").write_text(json.dumps(lesions, indent=2) + "\n", encoding="utf-8")
         mesh = seen_surface(phantom.volume, seen)
         # Nothing is stretched across a slit, at no time: meshes of all frames have the same faces.
         parted = crossed(phantom.motion.at(len(phantom.poses)).slits, np.asarray(mesh.vertices), mesh.faces)
@@ -126,6 +142,42 @@ def _write_meshes(phantom: Phantom, mesh: trimesh.Trimesh, folder: Path) -> None
         for index in range(len(phantom.poses)):
             moved = phantom.motion.at(index).move(np.asarray(mesh.vertices))
             trimesh.Trimesh(moved, mesh.faces, process=False).export(folder / "mesh_truth" / f"{index:04d}.ply")
+
+
+def _write_masks(labels: np.ndarray, folder: Path, index: int) -> None:
+    for number in np.unique(labels[labels > 0]):
+        (folder / str(number)).mkdir(parents=True, exist_ok=True)
+        write_encoded(folder / str(number) / f"{index:04d}.png", np.where(labels == number, 255, 0).astype(np.uint8))
+
+
+def _true_lesion(phantom: Phantom, number: int) -> dict[str, object]:
+    """Return the sizes of a polyp at rest: its extents, area, height over the wall."""
+    polyps = phantom.polyps
+    assert polyps is not None
+    one = polyps.grown[number]
+    fine = [_finely(volume, one.point_mm, one.reach_mm + _BESIDE_MM) for volume in (phantom.volume, polyps.wall)]
+    points, wall = (np.asarray(mesh.vertices) for mesh in fine)
+    own = polyps.labels(points) == number + 1
+    lesion = points[own]
+    largest, cross = extents(lesion)
+    return {
+        "kind": one.polyp.kind,
+        "diameter_mm": largest,
+        "cross_diameter_mm": cross,
+        "area_mm2": float(fine[0].area_faces[own[fine[0].faces].mean(axis=1) > 0.5].sum()),
+        "height_mm": float(cKDTree(wall).query(lesion)[0].max()),
+        "middle_mm": one.point_mm.tolist(),
+    }
+
+
+def _finely(volume: Volume, middle_mm: np.ndarray, radius_mm: float) -> trimesh.Trimesh:
+    """Return the surface in a cube, of triangles a quarter of a voxel wide."""
+    low = np.floor((middle_mm - radius_mm - volume.origin_mm) / volume.voxel_mm).astype(int).clip(0)
+    high = np.ceil((middle_mm + radius_mm - volume.origin_mm) / volume.voxel_mm).astype(int) + 1
+    block = np.zeros(volume.coefficients.shape, bool)
+    block[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = True
+    mesh = seen_surface(volume, block).subdivide().subdivide()
+    return trimesh.Trimesh(_onto_surface(volume, np.asarray(mesh.vertices)), mesh.faces, process=False)
 
 
 def _followed(phantom: Phantom, rest_mm: np.ndarray) -> np.ndarray:

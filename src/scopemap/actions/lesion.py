@@ -1,0 +1,264 @@
+"""Sizes of a lesion that masks show in frames of a run: diameters, area, height, each from all frames together.
+
+One mask is carried to the other frames by the surface: its vertices get the mask's value where its frame sees them,
+and each frame sees their rendering, unless something is in front. Frames weigh by how well they see the lesion. Their
+errors have much in common, for depth errs alike in all of them: what is common stays in the interval however many there
+are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+from scipy import ndimage
+
+from scopemap.actions.export.exported_run import ExportedRun, read_exported, write_image
+from scopemap.actions.measure import Known, KnownScale, Measure, known_scale
+from scopemap.cameras.formats.reading import read_calibration
+from scopemap.cameras.rectification import Rectifier
+from scopemap.errors import InputError
+from scopemap.geometry.lesion_shape import LesionView, view_shape
+from scopemap.geometry.rendering import render_mesh, vertex_colours
+from scopemap.geometry.se3 import inverse, transform
+from scopemap.io.decoding import by_number, read_decoded
+from scopemap.report.measured_surface import drawn
+
+_FIGURES = {
+    "diameter": ("largest diameter", 1, 0.07),
+    "cross": ("diameter across it", 1, 0.12),
+    "along": ("along the surface", 1, 0.12),
+    "area": ("area that is seen", 2, 0.12),
+}
+"""Name, power of the unit, and the standard deviation, as a share of a length, that all frames have in common.
+
+It is by phantoms (docs/measure.md): local errors of depth, and that lesions are not round.
+"""
+_LOWER, _HIGHER = 0.1, 0.5
+"""A height is too large by no more than this share of the diameter, too small by no more than that: depth is smooth."""
+_OUTLINE_PX, _COMMON, _LEAST_FACING = 0.7, 0.5, 0.1
+_EDGE_PX, _LEAST_PX, _MOST_FRAMES = 2, 60, 60
+_IN_FRONT, _LEAST_LEFT = 0.1, 0.8
+_FIRST_ROW = 30  # of the drawn numbers, after those of the scale
+_OUTLINE_BGR = (0, 255, 255)
+
+
+@dataclass(frozen=True)
+class Lesion:
+    """Where a lesion is: `masks`, a folder of pictures numbered as frames, or one picture, or corners (N, 2), px.
+
+    frame : that a picture or corners are of; None for a folder. A pixel belongs to the lesion where it is not 0.
+    """
+
+    masks: Path | np.ndarray
+    frame: int | None = None
+
+
+@dataclass(frozen=True)
+class MeasuredLesion:
+    """What was measured of a lesion, what its scale rests on, and its masks (H, W) bool in the frames that count."""
+
+    measures: list[Measure]
+    scale: str
+    masks: dict[int, np.ndarray]
+
+
+def measure_lesion(folder: Path, lesion: Lesion, known: Known | None = None) -> MeasuredLesion:
+    """Return the sizes of a lesion on the surface of a run.
+
+    known : what gives the scale; needed where the run does not know it. Raises `InputError` where it is missing, where
+    masks do not fit, and where no frame sees the whole lesion.
+    """
+    run = read_exported(folder)
+    scale = known_scale(run, known)
+    given = _given_masks(run, lesion)
+    masks = given if lesion.frame is None else carried_masks(run, lesion.frame, given[lesion.frame])
+    views = {index: view for index, mask in masks.items() if (view := _view(run, index, mask)) is not None}
+    if not views:
+        raise InputError(
+            f"no frame of {folder} sees the whole lesion with its depth: it is cut off, smaller than {_LEAST_PX} "
+            "pixels, or its depth is unknown"
+        )
+    found = []
+    for row, (figure, (name, power, common)) in enumerate(_FIGURES.items(), start=_FIRST_ROW):
+        value, sigma = _combined(views, masks, figure, common)
+        own = np.exp(sigma * drawn(row, 1, scale.sizes["draws"])[0])
+        draws = (own * scale.draws * scale.depth / scale.focal) ** power
+        unit = scale.unit if power == 1 else scale.square
+        found.append(Measure.of(name, value / scale.divisor**power, draws, unit, scale.sizes))
+    found.append(_height(views, found[0], scale))
+    return MeasuredLesion(found, scale.words, {index: masks[index] for index in views})
+
+
+def _given_masks(run: ExportedRun, lesion: Lesion) -> dict[int, np.ndarray]:
+    """Return the masks (H, W) bool as they were given, by the number of the frame."""
+    camera, indices = run.camera, set(run.trajectory.indices.tolist())
+    if lesion.frame is not None:
+        if lesion.frame not in indices:
+            raise InputError(f"frame {lesion.frame}, of which the lesion's mask is, has no pose in {run.path}")
+        if isinstance(lesion.masks, Path):
+            return {lesion.frame: _read_mask(run, lesion.masks)}
+        mask = np.zeros((camera.height, camera.width), np.uint8)
+        cv2.fillPoly(mask, [np.rint(lesion.masks).astype(np.int32)], 1)
+        return {lesion.frame: mask > 0}
+    assert isinstance(lesion.masks, Path)
+    files = by_number(file for file in lesion.masks.iterdir() if not file.name.startswith("."))
+    masks = {index: _read_mask(run, file) for index, file in files.items() if index in indices}
+    if not masks:
+        raise InputError(f"no mask in {lesion.masks} has the number of a frame of the result {run.path}")
+    return masks
+
+
+def _read_mask(run: ExportedRun, file: Path) -> np.ndarray:
+    """Return a mask (H, W) bool of the rectified picture; one of the input's picture is rectified."""
+    picture, camera = read_decoded(file), run.camera
+    if picture is None:
+        raise InputError(f"cannot read the mask {file}: it is no image, or damaged")
+    mask = (picture if picture.ndim == 2 else picture[..., :3].max(-1)) > 127
+    height, width = mask.shape
+    if (width, height) == (camera.width, camera.height):
+        return mask
+    source = run.source_camera_file
+    if source is None or (calibration := read_calibration(source, (width, height), "scale")).camera.width != width:
+        raise InputError(
+            f"the mask {file} has {width}x{height} px, the frames of the run {camera.width}x{camera.height}"
+        )
+    return Rectifier(calibration.camera, camera).nearest(mask.astype(np.uint8)) > 0
+
+
+def frame_at(folder: Path, second: float) -> int:
+    """Return the number of the frame with a pose that is nearest to a time, s."""
+    trajectory = read_exported(folder).trajectory
+    return int(trajectory.indices[np.abs(trajectory.times_s - second).argmin()])
+
+
+def shaft_width(folder: Path, file: Path) -> np.ndarray:
+    """Return two pixels (2, 2) as far apart as an instrument's shaft is wide, beside its tip, from a mask of it.
+
+    The tip is the end of the mask that is farther from the picture's border.
+    """
+    mask = _read_mask(read_exported(folder), file)
+    pixels = np.argwhere(mask)[:, ::-1].astype(float)
+    if len(pixels) < _LEAST_PX:
+        raise InputError(f"the mask {file} shows no shaft: it has {len(pixels)} pixels")
+    middle = pixels.mean(axis=0)
+    along, across = np.linalg.svd(pixels - middle, full_matrices=False)[2]
+    place = (pixels - middle) @ along
+    ends = middle + np.outer([place.min(), place.max()], along)
+    from_border = np.minimum(ends, [mask.shape[1], mask.shape[0]] - ends).min(axis=1)
+    along, place = (along, place) if from_border[1] >= from_border[0] else (-along, -place)
+    width = len(pixels) / np.ptp(place)
+    part = np.abs(place - (place.max() - width)) < 0.5 * width
+    width = part.sum() / np.ptp(place[part])
+    centre = middle + along * place[part].mean() + across * ((pixels - middle)[part] @ across).mean()
+    return centre + np.outer([-0.5, 0.5], width * across)
+
+
+def carried_masks(run: ExportedRun, frame: int, mask: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the masks (H, W) bool of what a mask of one frame shows, in all frames that see it, by number."""
+    poses = dict(zip(run.trajectory.indices.tolist(), run.trajectory.T_world_camera, strict=True))
+    surface = _marked(run, frame, mask, poses[frame])
+    middle = np.asarray(surface.vertices)[vertex_colours(surface)[:, 0] > 127].mean(axis=0)
+    pixels = {n: run.camera.project(transform(inverse(pose), middle[None]))[0] for n, pose in poses.items()}
+    size = np.array([run.camera.width, run.camera.height])
+    near = [n for n, pixel in pixels.items() if n != frame and np.isfinite(pixel).all() and (pixel >= 0).all()]
+    near = [n for n in near if (pixels[n] < size).all()]
+    masks = {frame: mask}
+    for index in near[:: -(-len(near) // _MOST_FRAMES) or 1]:
+        seen = render_mesh(_at(run, surface, index), run.camera, poses[index])
+        depth_mm = run.depth.read(index)
+        if depth_mm is None:
+            continue
+        there = seen.rgb[..., 0] > 127
+        clear = there & ~(depth_mm < (1 - _IN_FRONT) * seen.depth_mm)
+        if there.any() and clear.sum() >= _LEAST_LEFT * there.sum():
+            masks[index] = _largest_part(there)
+    return dict(sorted(masks.items()))
+
+
+def _largest_part(mask: np.ndarray) -> np.ndarray:
+    """Return the largest connected part of a mask (H, W) bool: beside a gap of the surface lies what is behind."""
+    _, parts, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    return np.asarray(parts == 1 + facts[1:, cv2.CC_STAT_AREA].argmax())
+
+
+def _at(run: ExportedRun, mesh: trimesh.Trimesh, index: int) -> trimesh.Trimesh:
+    return mesh if run.states is None else run.states.moved(mesh, index)
+
+
+def _marked(run: ExportedRun, frame: int, mask: np.ndarray, pose: np.ndarray) -> trimesh.Trimesh:
+    """Return the surface, its vertices white where a frame sees them inside a mask, black elsewhere."""
+    mesh = run.mesh
+    seen = render_mesh(_at(run, mesh, frame), run.camera, pose).depth_mm
+    points = transform(inverse(pose), np.asarray(_at(run, mesh, frame).vertices))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = run.camera.project(points).astype(np.float32)
+    u, v = np.nan_to_num(pixels, nan=-9).clip(-9, 1e4).T
+    level = ndimage.map_coordinates(mask.astype(np.float32), [v, u], order=1)
+    there = ndimage.map_coordinates(seen, [v, u], order=0, cval=np.nan)
+    level[~(points[:, 2] < (1 + _IN_FRONT / 2) * there) | (points[:, 2] <= 0)] = 0
+    if not (level > 0.5).any():
+        raise InputError(f"no surface where frame {frame} shows the lesion: a mask there can be carried nowhere")
+    colours = np.repeat(np.rint(255 * level).astype(np.uint8)[:, None], 3, axis=1)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+
+
+def _view(run: ExportedRun, index: int, mask: np.ndarray) -> LesionView | None:
+    """Return the sizes of a lesion in a frame; None where it is cut off, too small, or its depth unknown."""
+    depth_mm = run.depth.read(index)
+    inner = mask[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX]
+    if depth_mm is None or inner.sum() < mask.sum() or mask.sum() < _LEAST_PX:
+        return None
+    return view_shape(mask, depth_mm, run.camera)
+
+
+def _combined(
+    views: dict[int, LesionView], masks: dict[int, np.ndarray], figure: str, common: float
+) -> tuple[float, float]:
+    """Return a figure by all frames, and its relative standard deviation (of a length) without that of the scale."""
+    power = _FIGURES[figure][1]
+    values = np.array([getattr(view, figure) for view in views.values()])
+    width_px = np.array([2 * np.sqrt(masks[index].sum() / np.pi) for index in views])
+    outline = np.sqrt(2) * _OUTLINE_PX / width_px
+    weights = _facing(views) ** 2 / (outline**2 + np.array([view.sigma for view in views.values()]) ** 2)
+    value = _weighted_median(values, weights)
+    spread = 1.48 * _weighted_median(np.abs(np.log(values / value)), weights) / power
+    effective = weights.sum() ** 2 / (weights**2).sum()
+    own = spread**2 * (_COMMON + (1 - _COMMON) / effective)
+    return value, float(np.sqrt(own + np.average(outline**2, weights=weights) + common**2))
+
+
+def _height(views: dict[int, LesionView], diameter: Measure, scale: KnownScale) -> Measure:
+    """Return the height by all frames that know it, 0 where none does; its interval is by the diameter."""
+    values = np.array([view.height for view in views.values()])
+    known = np.isfinite(values)
+    value = _weighted_median(values[known], _facing(views)[known] ** 2) / scale.divisor if known.any() else 0.0
+    value = max(value, 0.0)
+    low, high = max(value - _LOWER * diameter.high, 0.0), value + _HIGHER * diameter.high
+    return Measure("height", value, low, high, diameter.unit)
+
+
+def _facing(views: dict[int, LesionView]) -> np.ndarray:
+    """Return the cosines (N,) at which views see the wall, at least 0.1, also where it is unknown."""
+    return np.nan_to_num([view.facing for view in views.values()]).clip(_LEAST_FACING, 1)
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) - 0.5 * weights[order]
+    return float(np.interp(0.5 * weights.sum(), share, values[order]))
+
+
+def write_outlines(run: Path, masks: dict[int, np.ndarray], folder: Path) -> None:
+    """Write the frames' pictures that a run kept with the outlines of masks (H, W) bool on them, as JPEG."""
+    exported = read_exported(run)
+    for index, mask in masks.items():
+        picture = read_decoded(exported.picture_file(index))
+        if picture is not None:
+            size = picture.shape[1::-1]
+            shown = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+            outlines = cv2.findContours(shown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+            write_image(folder / f"{index:06d}.jpg", cv2.drawContours(picture.copy(), outlines, -1, _OUTLINE_BGR, 1))
