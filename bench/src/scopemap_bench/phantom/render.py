@@ -78,13 +78,13 @@ def prepare(spec: PhantomSpec) -> Phantom:
     """Return the phantom of `spec`: path read or generated, scene built around it, exposure set by the first frame."""
     poses = camera_path(spec)
     volume, appearance = build_scene(spec, poses)
-    if spec.examination:
-        poses = examined_again(poses, spec.examination, spec.seed)
     for event in _events(spec, "contact"):
         poses = touching(poses, event.first, event.last, lambda point: float(volume.values_at(point[None])[0][0]))
     polyps = None
     if spec.polyps:
         volume, polyps = grow(volume, spec.polyps, poses, spec.camera, spec.seed)
+    if spec.examination:
+        poses = examined_again(poses, spec.examination, spec.seed)
     phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None, polyps)
     if not spec.auto_exposure:
         return replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))
