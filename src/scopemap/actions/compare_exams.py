@@ -38,7 +38,7 @@ _FARTHEST = 1.5  # of the median depth: farther away depth and colours tell litt
 _ON_SURFACE = 0.02  # of depth: a vertex is not hidden
 _LEAST_VIEWS = 4
 _LEAST_SIGMAS, _LEAST_AREA_SHARE = 8.0, 0.01  # of a change; its area, of the squared median depth
-_SHOWN_VIEWS = 8
+_SHOWN_VIEWS, _SAME_VIEW = 8, 0.8  # how far apart they are: distance over depth, and angle between the views
 _APART = 0.08  # of depth, from the other surface: only one of them saw it
 
 
@@ -90,7 +90,7 @@ class ExamComparison:
 
 
 class _Exam:
-    """A result: keyframes with their poses, and its surface."""
+    """A result: poses of its keyframes, of the frames that it kept a picture of, and its surface."""
 
     def __init__(self, folder: Path) -> None:
         self.run = RunFolder(folder).checked()
@@ -102,13 +102,14 @@ class _Exam:
         poses = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
         known = sorted(poses.keys() & (set(tracked["keyframe"].tolist()) or poses.keys()))
         self.poses = {index: poses[index] for index in known}
+        self.shown = {index: poses[index] for index in self.run.pictured if index in poses} or self.poses
         medians = [np.nanmedian(depth) for index in known if (depth := self.run.depth.read(index)) is not None]
         self.depth_mm = float(np.median(medians))
 
     def best_view(self, place_mm: np.ndarray) -> int:
-        """Return the number of the keyframe in whose middle a place (3,) is, nearest and not hidden; -1: none."""
+        """Return the number of the shown frame in whose middle a place (3,) is, near and not hidden; -1: none."""
         camera, best = self.run.camera, (-1, 0.0)
-        for index, pose in self.poses.items():
+        for index, pose in self.shown.items():
             point, depth_mm = transform(inverse(pose), place_mm[None])[0], self.run.depth.read(index)
             if depth_mm is None or point[2] <= 0:
                 continue
@@ -146,20 +147,20 @@ def compare_exams(
     apart_mm = _APART * one.depth_mm
     only = [float((tree[1 - n].query(tree[n].data)[0] > apart_mm).mean()) for n in (0, 1)]
     residual = float(np.median(distance)) / one.depth_mm
-    views = _views(one, other, S.inverse())
+    views = _views(one, other, S)
     return ExamComparison(S, residual, located / len(other.poses), moved, changes, views, sigmas, *only)
 
 
-def _views(one: _Exam, other: _Exam, S_second_first: Similarity) -> list[tuple[int, int]]:
-    """Return some keyframes of the first, and those of the second that show best what is in the middle of them."""
+def _views(one: _Exam, other: _Exam, S: Similarity) -> list[tuple[int, int]]:
+    """Return some shown frames of the first, each with that of the second whose pose is nearest, if it is near."""
+    number, poses = [*other.shown], S.transform_poses(np.array([*other.shown.values()]))
     found = []
-    for index in [*one.poses][:: -(-len(one.poses) // _SHOWN_VIEWS)]:
-        depth_mm, camera = one.run.depth.read(index), one.run.camera
-        row, column = camera.height // 2, camera.width // 2
-        if depth_mm is not None and np.isfinite(depth_mm[row, column]):
-            place = transform(one.poses[index], (camera.rays[row, column] * depth_mm[row, column])[None])[0]
-            found.append((index, other.best_view(S_second_first.transform_points(place))))
-    return [pair for pair in found if pair[1] >= 0]
+    for index in [*one.shown][:: -(-len(one.shown) // _SHOWN_VIEWS)]:
+        T = inverse(one.shown[index]) @ poses
+        apart = np.linalg.norm(T[:, :3, 3], axis=1) / one.depth_mm + np.arccos(np.clip(T[:, 2, 2], -1, 1))
+        if apart.min() < _SAME_VIEW:
+            found.append((index, number[int(apart.argmin())]))
+    return found
 
 
 def _paired(places: PlaceMap, other: _Exam, folder: Path, source: Path | None) -> tuple[PairedPoints, int]:
