@@ -20,7 +20,7 @@ from scopemap.actions.export.exported_run import ExportedRun, read_exported, wri
 from scopemap.actions.measure import Known, KnownScale, Measure, known_scale
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.rectification import Rectifier
-from scopemap.errors import InputError
+from scopemap.errors import InputError, SettingsError
 from scopemap.geometry.lesion_shape import LesionView, view_shape
 from scopemap.geometry.rendering import render_mesh, vertex_colours
 from scopemap.geometry.se3 import inverse, transform
@@ -31,7 +31,7 @@ _FIGURES = {
     "diameter": ("largest diameter", 1, 0.07),
     "cross": ("diameter across it", 1, 0.12),
     "along": ("along the surface", 1, 0.12),
-    "area": ("area that is seen", 2, 0.12),
+    "area": ("area", 2, 0.12),
 }
 """Name, power of the unit, and the standard deviation, as a share of a length, that all frames have in common.
 
@@ -50,7 +50,7 @@ _OUTLINE_BGR = (0, 255, 255)
 class Lesion:
     """Where a lesion is: `masks`, a folder of pictures numbered as frames, or one picture, or corners (N, 2), px.
 
-    frame : that a picture or corners are of; None for a folder. A pixel belongs to the lesion where it is not 0.
+    frame : that a picture or corners are of; of no matter for a folder. Pixels above 127 are the lesion's.
     """
 
     masks: Path | np.ndarray
@@ -75,7 +75,7 @@ def measure_lesion(folder: Path, lesion: Lesion, known: Known | None = None) -> 
     run = read_exported(folder)
     scale = known_scale(run, known)
     given = _given_masks(run, lesion)
-    masks = given if lesion.frame is None else carried_masks(run, lesion.frame, given[lesion.frame])
+    masks = given if _is_folder(lesion) else carried_masks(run, *given.popitem())
     views = {index: view for index, mask in masks.items() if (view := _view(run, index, mask)) is not None}
     if not views:
         raise InputError(
@@ -86,30 +86,36 @@ def measure_lesion(folder: Path, lesion: Lesion, known: Known | None = None) -> 
     for row, (figure, (name, power, common)) in enumerate(_FIGURES.items(), start=_FIRST_ROW):
         value, sigma = _combined(views, masks, figure, common)
         own = np.exp(sigma * drawn(row, 1, scale.sizes["draws"])[0])
-        draws = (own * scale.draws * scale.depth / scale.focal) ** power
+        draws = (own * scale.from_views) ** power
         unit = scale.unit if power == 1 else scale.square
         found.append(Measure.of(name, value / scale.divisor**power, draws, unit, scale.sizes))
     found.append(_height(views, found[0], scale))
     return MeasuredLesion(found, scale.words, {index: masks[index] for index in views})
 
 
+def _is_folder(lesion: Lesion) -> bool:
+    return isinstance(lesion.masks, Path) and lesion.masks.is_dir()
+
+
 def _given_masks(run: ExportedRun, lesion: Lesion) -> dict[int, np.ndarray]:
     """Return the masks (H, W) bool as they were given, by the number of the frame."""
-    camera, indices = run.camera, set(run.trajectory.indices.tolist())
-    if lesion.frame is not None:
-        if lesion.frame not in indices:
-            raise InputError(f"frame {lesion.frame}, of which the lesion's mask is, has no pose in {run.path}")
-        if isinstance(lesion.masks, Path):
-            return {lesion.frame: _read_mask(run, lesion.masks)}
-        mask = np.zeros((camera.height, camera.width), np.uint8)
-        cv2.fillPoly(mask, [np.rint(lesion.masks).astype(np.int32)], 1)
-        return {lesion.frame: mask > 0}
-    assert isinstance(lesion.masks, Path)
-    files = by_number(file for file in lesion.masks.iterdir() if not file.name.startswith("."))
-    masks = {index: _read_mask(run, file) for index, file in files.items() if index in indices}
-    if not masks:
-        raise InputError(f"no mask in {lesion.masks} has the number of a frame of the result {run.path}")
-    return masks
+    tracked = set(run.trajectory.indices.tolist())
+    if isinstance(lesion.masks, Path) and _is_folder(lesion):
+        files = by_number(file for file in lesion.masks.iterdir() if not file.name.startswith("."))
+        masks = {index: _read_mask(run, file) for index, file in files.items() if index in tracked}
+        if not masks:
+            raise InputError(f"no mask in {lesion.masks} has the number of a frame of the result {run.path}")
+        return masks
+    if lesion.frame is None:
+        raise SettingsError("one mask of a lesion, or corners, without the frame that they are of: give both")
+    if lesion.frame not in tracked:
+        raise InputError(f"frame {lesion.frame}, of which the lesion's mask is, has no pose in {run.path}")
+    if isinstance(lesion.masks, Path):
+        return {lesion.frame: _read_mask(run, lesion.masks)}
+    if len(lesion.masks) < 3:
+        raise SettingsError(f"the outline of a lesion has {len(lesion.masks)} corners: three or more are needed")
+    mask = np.zeros((run.camera.height, run.camera.width), np.uint8)
+    return {lesion.frame: cv2.fillPoly(mask, [np.rint(lesion.masks).astype(np.int32)], 1) > 0}
 
 
 def _read_mask(run: ExportedRun, file: Path) -> np.ndarray:
@@ -122,10 +128,11 @@ def _read_mask(run: ExportedRun, file: Path) -> np.ndarray:
     if (width, height) == (camera.width, camera.height):
         return mask
     source = run.source_camera_file
-    if source is None or (calibration := read_calibration(source, (width, height), "scale")).camera.width != width:
+    if source is None:
         raise InputError(
             f"the mask {file} has {width}x{height} px, the frames of the run {camera.width}x{camera.height}"
         )
+    calibration = read_calibration(source, (width, height), "scale")
     return Rectifier(calibration.camera, camera).nearest(mask.astype(np.uint8)) > 0
 
 
@@ -223,12 +230,13 @@ def _combined(
     values = np.array([getattr(view, figure) for view in views.values()])
     width_px = np.array([2 * np.sqrt(masks[index].sum() / np.pi) for index in views])
     outline = np.sqrt(2) * _OUTLINE_PX / width_px
-    weights = _facing(views) ** 2 / (outline**2 + np.array([view.sigma for view in views.values()]) ** 2)
+    apart = np.array([view.sigma for view in views.values()])
+    weights = _facing(views) ** 2 / (outline**2 + apart**2 + common**2)
     value = _weighted_median(values, weights)
     spread = 1.48 * _weighted_median(np.abs(np.log(values / value)), weights) / power
     effective = weights.sum() ** 2 / (weights**2).sum()
     own = spread**2 * (_COMMON + (1 - _COMMON) / effective)
-    return value, float(np.sqrt(own + np.average(outline**2, weights=weights) + common**2))
+    return value, float(np.sqrt(own + np.average(outline**2 + apart**2, weights=weights) + common**2))
 
 
 def _height(views: dict[int, LesionView], diameter: Measure, scale: KnownScale) -> Measure:

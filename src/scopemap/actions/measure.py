@@ -115,20 +115,23 @@ class Known:
 
 @dataclass(frozen=True)
 class KnownScale:
-    """The scale of a run's millimetres: what lengths are divided by, (D,) draws of its error, unit and its square.
+    """The scale of a run's millimetres: what lengths are divided by, draws (D,) of its error, and the unit.
 
-    focal, depth : (D,) draws of the focal length, and of what is common to depth, over their values. words : what the scale rests on. sizes : of the errors, from
-    `measure_errors`.
+    from_views : draws (D,) for lengths from many frames: they err by the focal length, and not by one frame's depth.
+    words : what the scale rests on. sizes : of the errors, from `measure_errors`.
     """
 
     divisor: float
     draws: np.ndarray
-    focal: np.ndarray
-    depth: np.ndarray
+    from_views: np.ndarray
     unit: str
-    square: str
     words: str
     sizes: dict[str, Any]
+
+    @property
+    def square(self) -> str:
+        """The unit of areas."""
+        return {"mm": "mm2"}.get(self.unit, "times the reference's square")
 
 
 def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
@@ -140,8 +143,7 @@ def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
                 f"{run.path}: {run.scale}; give two points as a reference: measures are then multiples of their "
                 "distance, and millimetres where that is given, too"
             )
-        alike = np.ones_like(errors.scale)
-        return KnownScale(1.0, errors.scale, errors.focal, alike, "mm", "mm2", run.scale, errors.sizes)
+        return KnownScale(1.0, errors.scale, errors.scale / errors.focal, "mm", run.scale, errors.sizes)
     if (far_px := float(np.linalg.norm(known.pixels[1] - known.pixels[0]))) < _LEAST_REFERENCE_PX:
         raise InputError(f"the reference is {far_px:.1f} px long: {_LEAST_REFERENCE_PX} px are needed")
     picked = _picked(run, measured_mesh(run, known.frame), known.frame, _pose(run, known.frame), known.pixels)
@@ -151,9 +153,8 @@ def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
         unit, words = "times the reference", f"two points of frame {known.frame}, whose distance in mm is not known"
     else:
         unit, words = "mm", f"two points of frame {known.frame}, taken to be {known.length_mm:g} mm apart"
-    square = {"mm": "mm2"}.get(unit, "times the reference's square")
-    alike = np.exp(picked.depth_error.mean() * errors.depth / np.sqrt(2))
-    return KnownScale(length / (known.length_mm or 1.0), draws, errors.focal, alike, unit, square, words, errors.sizes)
+    from_views = draws * np.exp(picked.depth_error.mean() * errors.depth / np.sqrt(2)) / errors.focal
+    return KnownScale(length / (known.length_mm or 1.0), draws, from_views, unit, words, errors.sizes)
 
 
 def _pose(run: ExportedRun, frame: int) -> np.ndarray:

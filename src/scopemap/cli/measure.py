@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +12,7 @@ import typer
 from scopemap.cli.options import AsJson
 
 if TYPE_CHECKING:
-    from scopemap.actions.measure import Known, Measure
+    from scopemap.actions.measure import Measure
 
 
 def measure(
@@ -47,58 +48,46 @@ def measure(
     """
     if bool(points) == bool(lesion):
         raise typer.BadParameter("give either --points or --lesion")
+    if reference and reference_mask is not None:
+        raise typer.BadParameter("give either --reference or --reference-mask")
+    if points and (frame is None or second is not None or reference_mask or pictures or reference_frame is not None):
+        raise typer.BadParameter("--points needs --frame, and of the others takes --reference and --reference-mm alone")
     pixels = _pixels(points, "--points") if points else []
     if points and len(pixels) < 2:
         raise typer.BadParameter("at least two pixels are needed", param_hint="--points")
-    if points and (frame is None or second is not None or reference_mask or pictures or reference_frame is not None):
-        raise typer.BadParameter("--points needs --frame, and takes of the others --reference and --reference-mm alone")
-    known = _pixels(reference, "--reference") if reference else None
-    if known is not None and len(known) != 2:
+    ends = _pixels(reference, "--reference") if reference else None
+    if ends is not None and len(ends) != 2:
         raise typer.BadParameter("two pixels are needed", param_hint="--reference")
-    if known is not None and reference_mask is not None:
-        raise typer.BadParameter("give either --reference or --reference-mask")
     import numpy as np
 
     from scopemap.actions import lesion as lesions
     from scopemap.actions import measure as measuring
 
-    if points:
-        assert frame is not None
-        unit = None if known is None else np.array(known)
-        found = measuring.measure(run, frame, np.array(pixels), unit, reference_mm)
+    if frame is not None and points:
+        known = None if ends is None else np.array(ends)
+        found = measuring.measure(run, frame, np.array(pixels), known, reference_mm)
         _show(found, [_facts(one) for one in found], as_json)
         return
-    frame = lesions.frame_at(run, second) if second is not None else frame
-    masks: Path | np.ndarray = Path(lesion)
-    if not Path(lesion).exists():
-        masks = np.array(_pixels(lesion, "--lesion"))
-    if not (isinstance(masks, Path) and masks.is_dir()) and frame is None:
-        raise typer.BadParameter("one mask, or an outline, needs --frame or --second", param_hint="--lesion")
-    of_folder = isinstance(masks, Path) and masks.is_dir()
-    given: Known | None = None
-    at = reference_frame if reference_frame is not None else frame
-    if known is not None or reference_mask is not None:
-        if at is None:
-            raise typer.BadParameter("a reference needs --reference-frame", param_hint="--reference")
-        ends = lesions.shaft_width(run, reference_mask) if reference_mask is not None else np.array(known)
-        given = measuring.Known(at, ends, reference_mm)
-    measured = lesions.measure_lesion(run, lesions.Lesion(masks, None if of_folder else frame), given)
+    frame = frame if second is None else lesions.frame_at(run, second)
+    what = lesions.Lesion(Path(lesion) if Path(lesion).exists() else np.array(_pixels(lesion, "--lesion")), frame)
+    given = None
+    if ends is not None or reference_mask is not None or reference_mm is not None:
+        pair = lesions.shaft_width(run, reference_mask) if reference_mask is not None else ends
+        at = frame if reference_frame is None else reference_frame
+        if at is None or pair is None:
+            raise typer.BadParameter("a reference needs its points or mask, and its frame", param_hint="--reference")
+        given = measuring.Known(at, np.array(pair), reference_mm)
+    measured = lesions.measure_lesion(run, what, given)
     if pictures is not None:
         lesions.write_outlines(run, measured.masks, pictures)
-    facts = {
-        "measures": [_facts(one) for one in measured.measures],
-        "scale": measured.scale,
-        "frames": list(measured.masks),
-    }
-    _show(measured.measures, facts, as_json)
+    facts = [_facts(one) for one in measured.measures]
+    _show(measured.measures, {"measures": facts, "scale": measured.scale, "frames": list(measured.masks)}, as_json)
     if not as_json:
-        typer.echo(f"from {len(measured.masks)} frames; scale: {measured.scale}")
+        typer.echo(f"from {len(measured.masks)} frames; the scale rests on {measured.scale}")
 
 
 def _facts(one: Measure) -> dict[str, Any]:
-    import numpy as np
-
-    return vars(one) | {"value": one.value if np.isfinite(one.value) else None}
+    return vars(one) | {"value": one.value if math.isfinite(one.value) else None}
 
 
 def _show(found: list[Measure], facts: Any, as_json: bool) -> None:

@@ -11,23 +11,22 @@ from scipy.spatial.distance import pdist, squareform
 
 from scopemap.cameras.camera import PinholeCamera
 
-_SMOOTH_PX, _PROFILE = 1.0, 12
-_RIM_PX, _RIM_SHARE = 2.5, 0.5
+_SMOOTH_PX, _RIM_PX, _RIM_SHARE = 1.0, 2.5, 0.5
 _RING = (0.15, 0.6)  # the wall beside a lesion: from so far outside its outline to so far, over its radius
 _GAP_PX, _LEAST_RING_PX, _OUTLIER = 2.0, 30, 2.5
 _LEAST_KNOWN, _LEAST_PX = 0.7, 12
-# A lesion's largest diameter over the largest across the line of sight, and its standard deviation, as a share; that of
-# the diameter by depth, and what it grows by with the depth that is in it over what is not; by phantoms.
-_OVER_ACROSS, _ROUND_ERROR, _DEPTH_ERROR, _SLANT_ERROR = 1.0, 0.1, 0.06, 0.3
+# Standard deviations, as shares, by phantoms: of a lesion's diameter by that across the line of sight; of it by depth,
+# and what that grows by with the depth between its ends over what is across.
+_ROUND_ERROR, _DEPTH_ERROR, _SLANT_ERROR = 0.1, 0.06, 0.2
 
 
 @dataclass(frozen=True)
 class LesionView:
     """A lesion as a view shows it, mm and mm2; NaN: unknown.
 
-    diameter, cross : the largest, and the largest across it. along : on the surface between the ends of the diameter.
-    area : of what is seen. height : of its top over the plane of the wall beside it. facing : cosine at which that
-    plane is seen. sigma : standard deviation of the diameter, as a share.
+    diameter, cross : the largest, and the largest across it. height : of its top over the plane of the wall beside it.
+    along, area : over a cap with this outline and height. facing : cosine at which that plane is seen. sigma : standard
+    deviation of the diameter, as a share, by how much its two estimates differ.
     """
 
     diameter: float
@@ -71,18 +70,18 @@ def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) ->
         return None
     slant = _slant(points[first], points[last])
     weights = np.array([_DEPTH_ERROR**2 + (_SLANT_ERROR * slant) ** 2, _ROUND_ERROR**2]) ** -1
-    diameter = float(np.exp(np.average(np.log([largest, _OVER_ACROSS * flat]), weights=weights)))
-    along = _length(smooth, pixels[first], pixels[last], camera) / largest
+    both = np.log([largest, flat])
+    diameter = float(np.exp(np.average(both, weights=weights)))
+    cross = min(extents(points)[1], diameter)
     height, facing = _height(mask, depth_mm, camera, points)
-    return LesionView(
-        diameter,
-        min(extents(points)[1], diameter),
-        diameter * max(along, 1.0),
-        _area(smooth, camera),
-        height,
-        facing,
-        float(weights.sum() ** -0.5),
-    )
+    rise = max(float(np.nan_to_num(height)), 1e-3 * diameter)
+    radius = (diameter**2 / 4 + rise**2) / (2 * rise)
+    along = 2 * radius * float(np.arctan2(diameter / 2, radius - rise))
+    # Over the ellipse that is as long and wide, in the picture.
+    length, width = extents(np.column_stack([pixels, np.zeros(len(pixels))]))
+    base = diameter * cross * mask.sum() / (length * width)
+    apart = float(np.sqrt(np.average((both - np.log(diameter)) ** 2, weights=weights)))
+    return LesionView(diameter, cross, along, float(base + np.pi * rise**2), height, facing, apart)
 
 
 def _slant(first: np.ndarray, last: np.ndarray) -> float:
@@ -92,43 +91,27 @@ def _slant(first: np.ndarray, last: np.ndarray) -> float:
     return along / max(float(np.linalg.norm(last - first - ((last - first) @ sight) * sight)), 1e-9)
 
 
-def _length(depth_mm: np.ndarray, start: np.ndarray, end: np.ndarray, camera: PinholeCamera) -> float:
-    """Return the length, mm, of the surface between two pixels (2,), where the view shows a straight line."""
-    line = np.linspace(start, end, _PROFILE)
-    height, width = depth_mm.shape
-    column, row = np.rint(line).astype(int).T
-    depths = depth_mm[row.clip(0, height - 1), column.clip(0, width - 1)]
-    seen = np.isfinite(depths)
-    depths = np.interp(np.arange(_PROFILE), np.flatnonzero(seen), depths[seen])
-    return float(np.linalg.norm(np.diff(camera.unproject(line) * depths[:, None], axis=0), axis=1).sum())
-
-
 def _smoothed(mask: np.ndarray, depth_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return depth (H, W) of a mask's pixels, smoothed, NaN outside; and which pixels are beside the outline.
 
-    There depth runs into that of what is behind: it is replaced by that of the nearest pixel farther inside.
+    There depth runs into that of what is behind: it is off the plane of what is farther inside as the nearest pixel of
+    that is.
     """
     within = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
     outline = mask & (within <= min(_RIM_PX, _RIM_SHARE * float(within.max())))
     inner = mask & np.isfinite(depth_mm) & ~outline
     inner = inner if inner.any() else mask & np.isfinite(depth_mm)
-    labels = cv2.distanceTransformWithLabels((~inner).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[
-        1
-    ]
-    inverse = np.zeros(labels.max() + 1)
-    inverse[labels[inner]] = 1 / depth_mm[inner]
+    # A plane has a linear inverse depth.
+    v, u = np.indices(mask.shape)
+    linear = np.stack([np.ones(mask.shape), u, v], axis=-1)
+    plane = linear @ np.linalg.lstsq(linear[inner], 1 / depth_mm[inner])[0]
+    outside = (~inner).astype(np.uint8)
+    labels = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    off = np.zeros(labels.max() + 1)
+    off[labels[inner]] = 1 / depth_mm[inner] - plane[inner]
     inside = mask.astype(np.float64)
-    total, weight = (cv2.GaussianBlur(x, (0, 0), _SMOOTH_PX) for x in (inverse[labels] * inside, inside))
+    total, weight = (cv2.GaussianBlur(x, (0, 0), _SMOOTH_PX) for x in ((plane + off[labels]) * inside, inside))
     return np.where(mask, weight / np.maximum(total, 1e-12), np.nan), outline if outline.any() else mask
-
-
-def _area(depth_mm: np.ndarray, camera: PinholeCamera) -> float:
-    """Return the area of the cells between four pixels with depth (H, W), times pixels over cells."""
-    points = camera.rays * depth_mm[..., None]
-    one, other = points[1:, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, 1:]
-    area = np.linalg.norm(np.cross(one, other), axis=-1) / 2
-    cells = np.isfinite(area)
-    return float(area[cells].sum() * np.isfinite(depth_mm).sum() / max(int(cells.sum()), 1))
 
 
 def _height(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera, points: np.ndarray) -> tuple[float, float]:

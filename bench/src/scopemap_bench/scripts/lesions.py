@@ -6,7 +6,6 @@ Colons of 48 frames with four polyps each, of 3 to 18 mm by the logarithm, run w
 its masks in all frames, and by the mask of one frame, which is carried to the others. The scale is that of two points
 of the wall beside it, 5 to 15 mm apart in truth and across the view, in one frame that sees it whole. Seeds of the
 constants: 201 to 205.
-Truth is of the whole surface, but for the area: of what the frame of the carried mask sees.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from scopemap.actions.lesion import Lesion, measure_lesion
 from scopemap.actions.measure import Known, Measure
 from scopemap.errors import InputError
 from scopemap.frame import Frame
-from scopemap.geometry.lesion_shape import view_shape
 from scopemap_bench.scripts import measuring
 
 SEEDS, FRAMES, AT = (301, 302, 303, 304), 48, (8, 20, 32, 44)
@@ -31,7 +29,12 @@ KINDS, LARGEST_MM = ("sessile", "flat", "pedunculated"), (18.0, 18.0, 10.0)
 LEAST_PX, EDGE_PX, BESIDE, TRIES = 150, 3, 1.5, 2000
 REFERENCE_MM, SAME_DEPTH, LEAST_REFERENCE_PX, LEVEL = (5.0, 15.0), 1.25, 20, 0.3
 SMOOTH_PX, BREAK = 7, 1.1
-TRUTHS = {"largest diameter": "diameter_mm", "diameter across it": "cross_diameter_mm", "height": "height_mm"}
+TRUTHS = {
+    "largest diameter": "diameter_mm",
+    "diameter across it": "cross_diameter_mm",
+    "area": "area_mm2",
+    "height": "height_mm",
+}
 
 
 class Result(NamedTuple):
@@ -99,9 +102,9 @@ def reference_beside(frame: Frame, depth_mm: np.ndarray, mask: np.ndarray, rando
     return None
 
 
-def results_of(found: list[Measure], truth: dict[str, float], seen_mm2: float) -> dict[str, Result]:
+def results_of(found: list[Measure], truth: dict[str, float]) -> dict[str, Result]:
     """Return the figures that have a truth, by their names."""
-    true = {name: truth[key] for name, key in TRUTHS.items()} | {"area that is seen": seen_mm2}
+    true = {name: truth[key] for name, key in TRUTHS.items()}
     return {one.what: Result(true[one.what], one.value, one.low, one.high) for one in found if one.what in true}
 
 
@@ -121,10 +124,8 @@ def measured(source: Path, run: Path) -> list[tuple[str, dict[str, dict[str, Res
         if known is None:
             measuring.print_row(name, f"{truth['diameter_mm']:.1f}", "not seen well", "")
             continue
-        seen = view_shape(masks[chosen], views[chosen][1], views[chosen][0].camera)
-        seen_mm2 = float("nan") if seen is None else seen.area
         ways = {"all masks": Lesion(folder), "one mask": Lesion(folder / f"{chosen:04d}.png", chosen)}
-        found = {way: results_of(_measure(run, lesion, known), truth, seen_mm2) for way, lesion in ways.items()}
+        found = {way: results_of(_measure(run, lesion, known), truth) for way, lesion in ways.items()}
         refused = _refused(run, ways["all masks"])
         cells = [_cell(results.get("largest diameter")) for results in found.values()]
         measuring.print_row(name, f"{truth['diameter_mm']:.1f}", *cells, "refused" if refused else "NOT REFUSED")
@@ -168,7 +169,7 @@ def main() -> None:
             rows += measured(source, measuring.run_once(source, out / f"{seed}-run"))
     print()
     measuring.print_head("figure", "masks", "polyps", "median error", "intervals hold", "median half interval")
-    for what in (*TRUTHS, "area that is seen"):
+    for what in TRUTHS:
         for way in ("all masks", "one mask"):
             every = [found[way][what] for _, found in rows if what in found[way]]
             errors, halves = [abs(one.error) for one in every], [one.half for one in every]

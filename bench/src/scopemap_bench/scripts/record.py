@@ -1,4 +1,4 @@
-"""The eight tables of bench/results/: made at one commit, and checked for being older than the code.
+"""The nine tables of bench/results/: made at one commit, and checked for being older than the code.
 
     python -m scopemap_bench.scripts.record --all --data FOLDER       make all; the commit must be whole
     python -m scopemap_bench.scripts.record NAME ... --data FOLDER    make some
@@ -36,6 +36,7 @@ TABLES: dict[str, tuple[str, str]] = {
     "methods": (f"{PLAN} real-and-phantom --data DATA --out OUT/methods", "methods/tables/overview.md"),
     "ablations": (f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations", "ablations/tables/overview.md"),
     "verdicts": (f"{SCRIPT}.verdicts --data DATA --out OUT/verdicts", ""),
+    "lesions": (f"{SCRIPT}.lesions --out OUT/lesions", ""),
     "long-runs": (
         f"{SCRIPT}.long_runs --frames 300 1200 --live DATA/endoscopy/video/laparoscopy_rvim.mp4 --minutes 0.5"
         f" && {SCRIPT}.robustness --kills 16 --failures 6 --videos 6",
