@@ -37,6 +37,7 @@ _BLOB_SHARE = 0.012  # of the median depth: standard deviation of the mean of a 
 _FARTHEST = 1.5  # of the median depth: farther away depth and colours tell little
 _ON_SURFACE = 0.02  # of depth: a vertex is not hidden
 _LEAST_VIEWS = 4
+_LEAST_SPREADS = 0.002, 0.005  # of ln depth and redness, in most places: rounding
 _LEAST_SIGMAS, _LEAST_AREA_SHARE = 8.0, 0.01  # of a change; its area, of the squared median depth
 _SHOWN_VIEWS, _SAME_VIEW = 8, 0.8  # how far apart they are: distance over depth, and angle between the views
 _APART = 0.08  # of depth, from the other surface: only one of them saw it
@@ -74,8 +75,9 @@ class ExamComparison:
 
     S_first_second : of all pairs. residual : median distance of pairs after it, over the median depth. located : which
     share of the keyframes of the second was found. second : its surface in the world of the first. changes : the
-    surest first. views : numbers of frames of both that show the same places. sigmas : (V,) float32 of the first surface's vertices, how sure a change is; NaN: not compared.
-    only_first, only_second : shares of the surfaces' vertices that are far from the other one.
+    surest first. views : numbers of frames of both that show the same places. sigmas : (V,) float32 of the first
+    surface's vertices, how sure a change is; NaN: not compared. only_first, only_second : shares of the surfaces'
+    vertices that are far from the other one.
     """
 
     S_first_second: Similarity
@@ -265,9 +267,9 @@ def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> tup
     sigmas = np.full((2, len(compared)), np.nan, np.float32)
     if not compared.any():
         return [], sigmas[0]
-    for row, values in enumerate((found.nearer, found.redness)):
+    for row, (values, least) in enumerate(zip((found.nearer, found.redness), _LEAST_SPREADS, strict=True)):
         spread = 1.4826 * np.median(np.abs(values[compared] - np.median(values[compared])))
-        sigmas[row, compared] = (values[compared] - np.median(values[compared])) / max(spread, 1e-9)
+        sigmas[row, compared] = (values[compared] - np.median(values[compared])) / max(spread, least)
     sure = np.nan_to_num(np.abs(sigmas).max(0))
     mesh = one.run.mesh
     changed = sure > _LEAST_SIGMAS

@@ -25,7 +25,7 @@ def compare_exams(
     """Bring two examinations of the same place together: matched views, what changed, what only one of them saw."""
     from scopemap.actions.compare_exams import compare_exams as compare
     from scopemap.io.run_folder import RunFolder
-    from scopemap.report.exams_page import PAGE, facts_of, summary, write_comparison
+    from scopemap.actions.exams_page import PAGE, facts_of, summary, write_comparison
 
     found = compare(first, second, source, second_input)
     write_comparison(found, first, second, out)

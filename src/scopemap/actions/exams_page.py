@@ -21,7 +21,7 @@ from scopemap.report.sheet import picture_grid, rgb_of
 
 PAGE, TABLE, CHANGES, VIEWS = "compare.html", "changes.json", "changes.png", "views.png"
 _CELL_PX, _RING, _MOST = (420, 330), "#ffd000", 12
-_STYLE = "body{font:15px/1.4 system-ui,sans-serif;margin:16px;max-width:920px}img{max-width:100%}td,th{padding:2px 12px 2px 0}"
+_STYLE = "body{font:15px/1.4 system-ui,sans-serif;margin:16px;max-width:920px}img{max-width:100%}td,th{padding:2px 9px}"
 _NO_DEVICE = "Research software, not a medical device."
 _HEADS = "<th></th><th>what</th><th>area, {0}²</th><th>nearer by, {0}</th><th>redness</th><th>sigmas</th>"
 
