@@ -156,13 +156,14 @@ def compare_exams(
 def _views(one: _Exam, other: _Exam, S: Similarity) -> list[tuple[int, int]]:
     """Return some shown frames of the first, each with that of the second whose pose is nearest, if it is near."""
     number, poses = [*other.shown], S.transform_poses(np.array([*other.shown.values()]))
-    found = []
+    nearest: dict[int, tuple[float, int]] = {}
     for index in [*one.shown][:: -(-len(one.shown) // _SHOWN_VIEWS)]:
         T = inverse(one.shown[index]) @ poses
         apart = np.linalg.norm(T[:, :3, 3], axis=1) / one.depth_mm + np.arccos(np.clip(T[:, 2, 2], -1, 1))
-        if apart.min() < _SAME_VIEW:
-            found.append((index, number[int(apart.argmin())]))
-    return found
+        there = int(apart.argmin())
+        if apart[there] < nearest.get(there, (_SAME_VIEW, 0))[0]:
+            nearest[there] = float(apart[there]), index
+    return sorted((index, number[there]) for there, (_, index) in nearest.items())
 
 
 def _paired(places: PlaceMap, other: _Exam, folder: Path, source: Path | None) -> tuple[PairedPoints, int]:

@@ -24,8 +24,8 @@ def compare_exams(
 ) -> None:
     """Bring two examinations of the same place together: matched views, what changed, what only one of them saw."""
     from scopemap.actions.compare_exams import compare_exams as compare
-    from scopemap.io.run_folder import RunFolder
     from scopemap.actions.exams_page import PAGE, facts_of, summary, write_comparison
+    from scopemap.io.run_folder import RunFolder
 
     found = compare(first, second, source, second_input)
     write_comparison(found, first, second, out)
