@@ -170,12 +170,12 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 350: stereo; 420: checksums; 340: measuring; 115: networks; 1570: what moves; 260: locate; 505: lesions.
-    "core": (lambda: _total(MODULES), 33_880),
-    "core, net": (lambda: _net(MODULES), 20_890),
-    "bench": (lambda: _total(BENCH_MODULES), 13_505),  # 445: polyps; 235: two runs; 195: verdicts; 980: peers, tissue
+    # 875: stereo, checksums, measuring; 1570: what moves; 260: locate; 505: lesions; 800: coverage; 450: exams.
+    "core": (lambda: _total(MODULES), 35_365),
+    "core, net": (lambda: _net(MODULES), 21_825),
+    "bench": (lambda: _total(BENCH_MODULES), 13_850),  # 445: polyps; 235: two runs; 195: verdicts; 980: peers, tissue
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 33_960),  # those of all of these; 230: a network at rest; 30: merging by the graph
+    "tests": (lambda: _total(TESTS), 34_350),  # those of all of these; 230: a network at rest; 30: merging by the graph
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 101),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 14_675),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

@@ -41,7 +41,7 @@ COMMANDS = (
     *("export run --to colmap --out colmap", "export run --to glb --out a.glb", "export run --to mcap --out a.mcap"),
     *("export run --to dicom --out a.dcm", "calibrate board --board 9x6 --square-mm 3 --model pinhole"),
     "measure run --frame 2 --points '60,60 90,90' --reference '60,60 90,60'",
-    *("locate run tiny --out located.csv", "coverage run --out covered"),
+    *("locate run tiny --out located.csv", "coverage run --out covered", "compare-exams run run --out both"),
     *(
         "phantom made --frames 3 --size 160x128",
         "compare run --truth tiny --out compared",

@@ -42,6 +42,7 @@ class LocatedFrame:
     status : "found", or "not found". map : number of the submap, 0 for the result; -1 where it is not found.
     keyframe : number of the result's frame that has most in common with it, or -1. inliers : matched features that
     agree with the pose. T_world_camera : (4, 4), mm of the result, in the world of that submap; NaN where not found.
+    points_mm, pixels : (inliers, 3) of that world and (inliers, 2) of the frame, what was matched.
     """
 
     index: int
@@ -51,6 +52,8 @@ class LocatedFrame:
     keyframe: int = -1
     inliers: int = 0
     T_world_camera: np.ndarray = field(default_factory=lambda: np.full((4, 4), np.nan))
+    points_mm: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    pixels: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 class _Place(NamedTuple):
@@ -110,9 +113,12 @@ class PlaceMap:
         spread = best.pixels.std(0) / [frame.camera.width, frame.camera.height]
         if len(best.pixels) < _LEAST_INLIERS or spread.min() < _LEAST_SPREAD:
             return missing
-        pose, inliers = _by_all(frame, best, [match for match in found if _agree(match, best, frame)])
-        place = best.place
-        return LocatedFrame(frame.index, frame.time_s, "found", place.map, place.number, inliers, pose)
+        agreeing = [match for match in found if _agree(match, best, frame)]
+        points_mm, pixels = (np.concatenate([match[n] for match in agreeing]) for n in (2, 3))
+        pose, place = _by_all(frame, best, points_mm, pixels), best.place
+        return LocatedFrame(
+            frame.index, frame.time_s, "found", place.map, place.number, len(pixels), pose, points_mm, pixels
+        )
 
     def _matches(self, frame: Frame) -> list[_Match]:
         """Return the poses by the most similar keyframes."""
@@ -190,11 +196,8 @@ def _agree(match: _Match, best: _Match, frame: Frame) -> bool:
     return bool(near and rotation_angle_rad(T[:3, :3]) <= _AGREE_RAD)
 
 
-def _by_all(frame: Frame, best: _Match, agreeing: list[_Match]) -> tuple[np.ndarray, int]:
-    """Return the pose (4, 4) by the matches of all keyframes that agree, and the number of these matches."""
-    points_mm = transform(inverse(best.T_world_camera), np.concatenate([match.points_mm for match in agreeing]))
-    pixels = np.concatenate([match.pixels for match in agreeing])
-    matches = Correspondences2D3D(points_mm, pixels, 1.0, best.place.number)
+def _by_all(frame: Frame, best: _Match, points_mm: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4) by all matches: points (N, 3), world, and pixels (N, 2)."""
+    matches = Correspondences2D3D(transform(inverse(best.T_world_camera), points_mm), pixels, 1.0, best.place.number)
     T = pose_from_correspondences(matches, frame.camera, np.eye(4), _DEPTH_SIGMA)
-    pose = best.T_world_camera if T is None else best.T_world_camera @ inverse(T)
-    return pose, len(pixels)
+    return best.T_world_camera if T is None else best.T_world_camera @ inverse(T)

@@ -13,6 +13,7 @@ import typer
 from scopemap.cli import models
 from scopemap.cli.batch import batch
 from scopemap.cli.calibrate import calibrate
+from scopemap.cli.compare_exams import compare_exams
 from scopemap.cli.coverage import coverage
 from scopemap.cli.demo import demo
 from scopemap.cli.evaluate import evaluate
@@ -36,23 +37,12 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _OWN = (
-    run,
-    batch,
-    live,
-    view,
-    report,
-    demo,
-    inspect,
-    evaluate,
-    export,
-    measure,
-    coverage,
-    locate,
-    verify,
-    calibrate,
-    models.app,
+    *(run, batch, live, view, report, demo, inspect, evaluate, export, measure, coverage, locate),
+    *(compare_exams, verify, calibrate, models.app),
 )
-_COMMANDS = {getattr(command, "__name__", "models"): command for command in _OWN} | dict(plugins("scopemap.commands"))
+_COMMANDS = {getattr(command, "__name__", "models").replace("_", "-"): command for command in _OWN} | dict(
+    plugins("scopemap.commands")
+)
 for name, command in _COMMANDS.items():
     if isinstance(command, typer.Typer):
         app.add_typer(command, name=name)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.geometry.se3 import mean_near, se3, so3_exp
 from scopemap_bench.phantom.slit import UNCUT, cut_until, opened, slit
 from scopemap_bench.phantom.slit import in_grid as slits_in_grid
 from scopemap_bench.phantom.slit import stretch as stretch_of
@@ -27,6 +27,9 @@ _RING_MM, _RING_WIDTH_MM, _RING_LENGTH_MM, _RING_FRAMES = 2.5, 90.0, 70.0, 60.0
 _PULL_MM, _PULL_WIDTH_MM = 8.0, 12.0
 # A pull and a cut are in proportion to the distance where it is smaller than this.
 _FULL_FROM_MM = 50.0
+# Another examination's path beside the first one's.
+_ASIDE_MM, _ASIDE_SWAY_MM = 2.5, (2.5, 2.5, 2.0)
+_ASIDE_DEG, _ASIDE_SWAY_DEG = np.array([5.0, 5.0, 20.0]), (5.0, 5.0, 8.0)
 # Shares of a grasp's time at which the instrument takes hold, has pulled, and lets go.
 _HOLDS, _PULLED, _LETS_GO = 0.25, 0.5, 0.75
 
@@ -92,6 +95,20 @@ def touching(poses: np.ndarray, first: int, last: int, space_mm: Callable[[np.nd
         poses[index, :3, 3] += share * reach * towards
         poses[index, :3, :3] = poses[index, :3, :3] @ turn
     return poses
+
+
+def examined_again(poses: np.ndarray, number: int, seed: int) -> np.ndarray:
+    """Return another path (N, 4, 4) along poses (N, 4, 4): up to 5 mm beside it, turned, and at another pace."""
+    rng = np.random.default_rng((seed, 9, number))
+    share = np.linspace(0, 1, len(poses))
+    pace = np.interp(share, np.linspace(0, 1, 6), np.concatenate([[0.0], np.sort(rng.uniform(0, 1, 4)), [1.0]]))
+    time = 0.5 * (share + pace) * (len(poses) - 1)
+    before = np.minimum(time.astype(int), len(poses) - 2)
+    along = np.array([mean_near(poses[k], [poses[k + 1]], [t - k]) for k, t in zip(before, time, strict=True)])
+    aside_mm = rng.uniform(-_ASIDE_MM, _ASIDE_MM, 3) + _sway(len(poses), False, rng, _ASIDE_SWAY_MM)
+    turn_deg = rng.uniform(-_ASIDE_DEG, _ASIDE_DEG, 3) + _sway(len(poses), False, rng, _ASIDE_SWAY_DEG)
+    aside = [se3(so3_exp(w), t) for w, t in zip(np.radians(turn_deg), aside_mm, strict=True)]
+    return np.asarray(along @ np.array(aside))
 
 
 def _phase(frames: int) -> np.ndarray:

@@ -19,6 +19,7 @@ from scopemap_bench.phantom.motion import (
     breathing,
     contractions,
     cut,
+    examined_again,
     grasp,
     lumen_path,
     poke,
@@ -82,6 +83,8 @@ def prepare(spec: PhantomSpec) -> Phantom:
     polyps = None
     if spec.polyps:
         volume, polyps = grow(volume, spec.polyps, poses, spec.camera, spec.seed)
+    if spec.examination:
+        poses = examined_again(poses, spec.examination, spec.seed)
     phantom = Phantom(spec, volume, appearance, poses, _motion(spec, poses, volume), None, polyps)
     if not spec.auto_exposure:
         return replace(phantom, exposure=exposure_for(light(phantom, 0)[0]))

@@ -71,6 +71,7 @@ class PhantomSpec:
     route : of a generated path. wander: forward in a lumen, to and fro over a cavity; sideways: by 22 mm, a third of
     the distance to a cavity's floor; withdrawal: 52 mm straight back. These two are as long in any number of frames.
     fold_mm : how far the folds of a colon rise from its wall, at most; behind deep ones more is hidden.
+    examination : 0: the first one; another number: the same scene seen again, on another path beside the first one's.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often. events : see `Event`.
     polyps : see `Polyp`; their true sizes and masks are written, too.
     noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
@@ -93,6 +94,7 @@ class PhantomSpec:
     path_file: Path | None = None
     route: RouteName = "wander"
     fold_mm: float = 6.0
+    examination: int = 0
     deform: bool = False
     loop: bool = False
     speed: int = 1

@@ -23,10 +23,13 @@ from scopemap_bench.scripts import measuring
 PHANTOM_FRAMES = 150
 
 
-def errors(run: Path, source: Path, table: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of the located frames, mm and degrees, by the truth that comes with the source of both."""
-    truth = read_trajectory(source)
-    similarity = match(read_trajectory(run), truth, "sim3").similarity
+def errors(run: Path, source: Path, table: Path, video: Path | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of the located frames, mm and degrees, by the truth that comes with the map's source.
+
+    video : whose frames they are, with a truth of the same world; None: the map's source.
+    """
+    similarity = match(read_trajectory(run), read_trajectory(source), "sim3").similarity
+    truth = read_trajectory(video or source)
     true_pose = dict(zip(truth.indices.tolist(), truth.T_world_camera, strict=True))
     mm, deg = [], []
     with table.open(encoding="utf-8") as file:

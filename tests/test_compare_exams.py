@@ -1,0 +1,131 @@
+"""Two examinations of a plane that is seen in closed form: a spot and a bump are new; the second is of another size."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from drawn_run import Shown, drawn_result
+from front_door import call, refused
+from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, pose, see
+
+from scopemap.actions.compare_exams import ExamComparison, compare_exams
+from scopemap.frame import Frame
+from scopemap.geometry.align import Similarity
+from scopemap.geometry.se3 import so3_exp
+from scopemap.io.depth_maps import DepthWriter
+from scopemap.report.frame_pictures import FramePictures
+from scopemap.trajectory.frame_table import FrameTable
+
+CAMERA_FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+ANOTHER_WORLD = Similarity(1.3, so3_exp(np.array([0.2, -0.5, 0.9])), np.array([30.0, -8.0, 4.0]))
+SPOT_MM, BUMP_MM, RADIUS_MM, RISE_MM = np.array([8.0, 4.0]), np.array([-8.0, -5.0]), 4.0, 2.5
+
+
+def surface(seed: int, half_mm: float, changed: bool) -> trimesh.Trimesh:
+    """The plane with noise; changed: with a red spot, and a bump towards the camera."""
+    count, rng = round(4 * half_mm) + 1, np.random.default_rng(seed)
+    side = np.linspace(-half_mm, half_mm, count)
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+    xy = np.stack([x, y], -1)
+    spot, bump = (np.linalg.norm(xy - middle, axis=1) < RADIUS_MM for middle in (SPOT_MM, BUMP_MM))
+    z = PLANE_MM + rng.normal(0, 0.05, len(xy)) - changed * RISE_MM * bump
+    colours = np.clip(rng.normal([180, 120, 100], 3, (len(xy), 3)), 0, 255)
+    colours[spot & changed, 1:] *= 0.6
+    corner = np.arange(count * (count - 1)).reshape(-1, count)[:, :-1].ravel()
+    faces = [np.stack([corner, corner + 1, corner + count + k], -1) for k in (0,)]
+    faces += [np.stack([corner + 1, corner + count + 1, corner + count], -1)]
+    return trimesh.Trimesh(
+        np.column_stack([xy, z]), np.concatenate(faces), vertex_colors=colours.astype(np.uint8), process=False
+    )
+
+
+def examined(folder: Path, poses: list[np.ndarray], mesh: trimesh.Trimesh, world: Similarity) -> Path:
+    """A run that saw the plane from poses, in another world."""
+    kept, write, rows = FramePictures(), DepthWriter(folder), []
+    for index, T in enumerate(poses):
+        view = see(T)
+        frame = Frame(index, index / 25, view.rgb, CAMERA, EVERYWHERE, np.float32(world.scale) * view.depth_mm, T)
+        write(frame)
+        kept.observe(Shown(frame))
+        T_own = world.transform_poses(T[None])[0]
+        rows.append({"index": index, "time_s": index / 25, "keyframe": index, "status": "ok", "T_world_camera": T_own})
+    kept.save(folder)
+    mesh.vertices = world.transform_points(np.asarray(mesh.vertices))
+    facts = drawn_result(camera=CAMERA_FACTS | {"source": "calibration file camera.yaml"})
+    table = FrameTable.of(iter(rows))
+    replace(facts, camera=CAMERA, source_camera=CAMERA, mesh=mesh, others=[], frames=table).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("exams")
+    first = [pose(at_mm=(x, 0.0, 0.0)) for x in np.linspace(-10, 10, 6)]
+    second = [pose(at_mm=(x, 2.0, 3.0), turn_rad=(0.03, 0.0, 0.3)) for x in np.linspace(9, -11, 6)]
+    return (
+        examined(folder / "first", first, surface(1, 60.0, False), Similarity.identity()),
+        examined(folder / "second", second, surface(2, 45.0, True), ANOTHER_WORLD),
+    )
+
+
+@pytest.fixture(scope="module")
+def found(runs: tuple[Path, Path]) -> ExamComparison:
+    return compare_exams(*runs)
+
+
+def test_the_second_is_brought_to_the_first(found: ExamComparison) -> None:
+    wanted = ANOTHER_WORLD.inverse()
+    assert found.located == 1
+    assert found.S_first_second.scale == pytest.approx(wanted.scale, rel=0.01)
+    assert np.median(np.abs(np.asarray(found.second.vertices)[:, 2] - PLANE_MM)) < 0.5
+    assert len(found.views) == 6
+    assert all(one + other == 5 for one, other in found.views[1:-1])  # it came from the other side
+
+
+def test_a_spot_and_a_bump_are_the_changes(found: ExamComparison) -> None:
+    by_what = {change.what: change for change in found.changes}
+    assert set(by_what) == {"colour", "shape"}
+    spot, bump = by_what["colour"], by_what["shape"]
+    for change, middle in ((spot, SPOT_MM), (bump, BUMP_MM)):
+        assert np.linalg.norm(change.place_mm - [*middle, PLANE_MM]) < 1.0
+        assert change.area_mm2 == pytest.approx(np.pi * RADIUS_MM**2, rel=0.5)
+        assert min(change.frames) >= 0
+    assert spot.redness == pytest.approx(-np.log(0.6), abs=0.15)
+    assert bump.rise_mm == pytest.approx(RISE_MM, abs=0.6)
+
+
+def test_what_only_one_saw(found: ExamComparison) -> None:
+    # Of a plane of 120 mm the other covers 90 mm, and 4 mm around it are near.
+    assert found.only_first == pytest.approx(1 - (98 / 120) ** 2, abs=0.03)
+    assert found.only_second == 0
+
+
+def test_the_same_examination_has_no_change(runs: tuple[Path, Path]) -> None:
+    same = compare_exams(runs[0], runs[0])
+    assert same.changes == []
+    assert same.S_first_second.scale == pytest.approx(1, abs=1e-3)
+
+
+def test_the_command_writes_a_page(runs: tuple[Path, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert call("compare-exams", *runs, "--out", tmp_path / "out") == 0
+    assert "2 places changed" in capfd.readouterr().out
+    facts = json.loads((tmp_path / "out" / "changes.json").read_text())
+    assert len(facts["changes"]) == 2
+    assert "area_unit2" in facts["changes"][0]  # its scale is not known
+    page = (tmp_path / "out" / "compare.html").read_text()
+    assert page.count("<tr>") == 3
+    for name in ("changes.png", "views.png", "second.ply"):
+        assert (tmp_path / "out" / name).stat().st_size > 1000
+    assert "no finished run" in refused(capfd, "compare-exams", runs[0], tmp_path, "--out", tmp_path / "b")
+
+
+def test_other_places_cannot_be_compared(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    far = [pose(at_mm=(x, 90.0, 0.0)) for x in np.linspace(-10, 10, 6)]
+    other = examined(tmp_path / "far", far, surface(3, 30.0, False), Similarity.identity())
+    with pytest.raises(Exception, match="cannot be compared: 0 of 6 keyframes"):
+        compare_exams(runs[0], other)
