@@ -49,7 +49,7 @@ def test_settings_that_are_named_exist(document: Path) -> None:
 
 def test_the_readme_names_every_command() -> None:
     command = typer.main.get_command(app)
-    named = set(re.findall(r"(?:`|^ {4}|&& )scopemap ([a-z]+)", _text("README.md"), flags=re.MULTILINE))
+    named = set(re.findall(r"(?:`|^ {4}|&& )scopemap ([a-z-]+)", _text("README.md"), flags=re.MULTILINE))
     assert named == set(command.commands)  # type: ignore[attr-defined]
 
 
