@@ -205,6 +205,9 @@ def test_the_command_writes_figures_map_and_picture(holed: Path, capfd: pytest.C
     said = capfd.readouterr().out
     assert "3 o'clock" in said
     assert "scale unknown" in said
+    colours = trimesh.load(holed / "coverage" / "coverage.ply", process=False).visual.face_colors
+    share = (colours[:, 0] > 150) & (colours[:, 1] < 60)
+    assert 0 < share.mean() < 0.5  # the hole is red
     facts = json.loads((holed / "coverage" / "coverage.json").read_text())
     assert set(facts) == {"kind", "unit", "along_unit", "scale", "total", "segments", "blind_spots"}
     assert (facts["kind"], facts["unit"], len(facts["blind_spots"]) > 0) == ("lumen", "unit", True)

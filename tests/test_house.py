@@ -170,9 +170,9 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 875: stereo, checksums, measuring; 1570: what moves; 260: locate; 505: lesions; 800: coverage; 450: exams.
-    "core": (lambda: _total(MODULES), 35_365),
-    "core, net": (lambda: _net(MODULES), 21_825),
+    # 875: stereo, checksums, measuring; 1570: what moves; 260: locate; 505: lesions; 810: coverage; 450: exams.
+    "core": (lambda: _total(MODULES), 35_375),
+    "core, net": (lambda: _net(MODULES), 21_835),
     "bench": (lambda: _total(BENCH_MODULES), 13_850),  # 445: polyps; 235: two runs; 195: verdicts; 980: peers, tissue
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
     "tests": (lambda: _total(TESTS), 34_350),  # those of all of these; 230: a network at rest; 30: merging by the graph

@@ -23,11 +23,11 @@ def coverage(
 ) -> None:
     """Estimate which share of the tissue no frame saw, with an interval of 90 %, and list where.
 
-    Writes coverage.json, map.csv and map.png. An estimate, calibrated on synthetic colons; not for decisions about a
-    patient.
+    Writes coverage.json, map.csv, map.png and coverage.ply. An estimate, calibrated on synthetic colons; not for
+    decisions about a patient.
     """
     folder = out or run / "coverage"
-    files = {name: folder / name for name in ("coverage.json", "map.csv", "map.png")}
+    files = {name: folder / name for name in ("coverage.json", "map.csv", "map.png", "coverage.ply")}
     for file in files.values():
         options.check_output(file, (file.suffix,), overwrite)
     from scopemap.actions.coverage.coverage import coverage as covered
@@ -41,6 +41,7 @@ def coverage(
         files["coverage.json"].write_text(text, encoding="utf-8")
     found.map.write(files["map.csv"])
     found.draw(files["map.png"])
+    found.write_surface(files["coverage.ply"])
     if as_json:
         print_json(found.facts | {"out": str(folder)})
     elif not quiet:

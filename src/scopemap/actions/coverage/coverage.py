@@ -22,7 +22,8 @@ from scopemap.actions.coverage.unseen import Views, features, unseen_probability
 from scopemap.errors import InputError, reporting
 from scopemap.fusion.watertight import SEEN_CELLS, closed_space
 from scopemap.io.run_folder import RunFolder
-from scopemap.report.coverage_picture import draw_coverage
+from scopemap.report.coverage_picture import COLOURS, draw_coverage
+from scopemap.report.sheet import rgb_of
 from scopemap.report.verdict import verdict
 from scopemap.trajectory.frame_table import FrameTable
 
@@ -40,6 +41,7 @@ _SMOOTHING_BINS = 0.7
 _SEGMENT_RADII, _SEGMENT_DEG = 2.0, 20.0
 _LEAST_SPOT_RADII = 0.25  # square root of the smallest area listed
 _SHOWN = 10
+_OUTSIDE_GREY = 190
 _ALL_ROUND = 0.35  # length of the mean direction below which a blind spot is all round
 
 
@@ -160,6 +162,15 @@ class Coverage:
         ends = self.total.start, self.total.end
         title = f"not seen: {_percent(self.total)}, estimated"
         draw_coverage(self.map.classes, self.map.frames, ends, label, spots, title, file)
+
+    def write_surface(self, file: Path) -> None:
+        """Write the closed surface in the map's colours, grey outside of what was examined, as PLY; `InputError`."""
+        seen, _, hidden = map(rgb_of, COLOURS.values())
+        colours = np.full((len(self.unseen), 3), _OUTSIDE_GREY, np.uint8)
+        colours[self.unseen <= BLIND], colours[self.unseen > BLIND] = seen, hidden
+        faces = trimesh.Trimesh(self.surface.vertices, self.surface.faces, face_colors=colours, process=False)
+        with reporting(f"cannot write {file}"):
+            file.write_bytes(faces.export(file_type="ply"))
 
 
 def coverage(folder: Path) -> Coverage:
