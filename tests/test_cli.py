@@ -247,6 +247,6 @@ COMMANDS = dict(_commands(typer.main.get_command(app)))
 
 def test_help_names_the_commands_and_version_the_version(capfd: Capture) -> None:
     assert call("--help") == 0
-    assert {name.split()[0] for name in COMMANDS} <= set(re.findall(r"[a-z]+", capfd.readouterr().out))
+    assert {name.split()[0] for name in COMMANDS} <= set(re.findall(r"[a-z-]+", capfd.readouterr().out))
     done = subprocess.run([sys.executable, "-m", "scopemap", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"scopemap {__version__}\n"
