@@ -119,6 +119,7 @@ def test_the_command_writes_a_page(runs: tuple[Path, Path], tmp_path: Path, capf
     assert "area_unit2" in facts["changes"][0]  # its scale is not known
     page = (tmp_path / "out" / "compare.html").read_text()
     assert page.count("<tr>") == 3
+    assert "Above 0 the wall is nearer" in page
     for name in ("changes.png", "views.png", "second.ply"):
         assert (tmp_path / "out" / name).stat().st_size > 1000
     assert "no finished run" in refused(capfd, "compare-exams", runs[0], tmp_path, "--out", tmp_path / "b")

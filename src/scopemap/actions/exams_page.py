@@ -22,6 +22,7 @@ from scopemap.report.sheet import picture_grid, rgb_of
 PAGE, TABLE, CHANGES, VIEWS = "compare.html", "changes.json", "changes.png", "views.png"
 _CELL_PX, _RING, _MOST = (420, 330), "#ffd000", 12
 _STYLE = "body{font:15px/1.4 system-ui,sans-serif;margin:16px;max-width:920px}img{max-width:100%}td,th{padding:2px 9px}"
+_LEGEND = "Above 0 the wall is nearer to the camera, and redder, in the second. Sigmas say how sure a change is."
 _NO_DEVICE = "Research software, not a medical device."
 _HEADS = "<th></th><th>what</th><th>area, {0}²</th><th>nearer by, {0}</th><th>redness</th><th>sigmas</th>"
 
@@ -68,7 +69,7 @@ def write_comparison(found: ExamComparison, first: Path, second: Path, out: Path
         picture_grid(views, _CELL_PX).save(out / VIEWS)
     rows = "".join(_row(change, number, unit) for number, change in enumerate(found.changes, 1))
     head = f"<tr>{_HEADS.format(unit)}</tr>"
-    changed = f"<table>{head}{rows}</table><img src={CHANGES} alt='The places that changed'>" if rows else ""
+    changed = f"<table>{head}{rows}</table><p>{_LEGEND}</p><img src={CHANGES} alt='Changes'>" if rows else ""
     names, lines = (html.escape(folder.name) for folder in (first, second)), summary(found, runs[0].scale)
     head = "<!doctype html><meta charset=utf-8><title>{0} and {1}</title><h1>{0} (first) and {1} (second)</h1>"
     parts = [
