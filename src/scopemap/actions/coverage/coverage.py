@@ -170,7 +170,7 @@ class Coverage:
         colours[self.unseen <= BLIND], colours[self.unseen > BLIND] = seen, hidden
         faces = trimesh.Trimesh(self.surface.vertices, self.surface.faces, face_colors=colours, process=False)
         with reporting(f"cannot write {file}"):
-            file.write_bytes(faces.export(file_type="ply"))
+            faces.export(file)
 
 
 def coverage(folder: Path) -> Coverage:
