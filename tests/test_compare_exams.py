@@ -14,6 +14,7 @@ from front_door import call, refused
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, pose, see
 
 from scopemap.actions.compare_exams import ExamComparison, compare_exams
+from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import so3_exp
@@ -37,8 +38,7 @@ def surface(seed: int, half_mm: float, changed: bool) -> trimesh.Trimesh:
     colours = np.clip(rng.normal([180, 120, 100], 3, (len(xy), 3)), 0, 255)
     colours[spot & changed, 1:] *= 0.6
     corner = np.arange(count * (count - 1)).reshape(-1, count)[:, :-1].ravel()
-    faces = [np.stack([corner, corner + 1, corner + count + k], -1) for k in (0,)]
-    faces += [np.stack([corner + 1, corner + count + 1, corner + count], -1)]
+    faces = [np.stack([corner + k, corner + 1 + k * count, corner + count], -1) for k in (0, 1)]
     return trimesh.Trimesh(
         np.column_stack([xy, z]), np.concatenate(faces), vertex_colors=colours.astype(np.uint8), process=False
     )
@@ -57,8 +57,9 @@ def examined(folder: Path, poses: list[np.ndarray], mesh: trimesh.Trimesh, world
     kept.save(folder)
     mesh.vertices = world.transform_points(np.asarray(mesh.vertices))
     facts = drawn_result(camera=CAMERA_FACTS | {"source": "calibration file camera.yaml"})
-    table = FrameTable.of(iter(rows))
-    replace(facts, camera=CAMERA, source_camera=CAMERA, mesh=mesh, others=[], frames=table).save(folder)
+    replace(facts, camera=CAMERA, source_camera=CAMERA, mesh=mesh, others=[], frames=FrameTable.of(iter(rows))).save(
+        folder
+    )
     return folder
 
 
@@ -122,11 +123,12 @@ def test_the_command_writes_a_page(runs: tuple[Path, Path], tmp_path: Path, capf
     assert "Above 0 the wall is nearer" in page
     for name in ("changes.png", "views.png", "second.ply"):
         assert (tmp_path / "out" / name).stat().st_size > 1000
+    assert "exists" in refused(capfd, "compare-exams", *runs, "--out", tmp_path / "out")
     assert "no finished run" in refused(capfd, "compare-exams", runs[0], tmp_path, "--out", tmp_path / "b")
 
 
 def test_other_places_cannot_be_compared(runs: tuple[Path, Path], tmp_path: Path) -> None:
     far = [pose(at_mm=(x, 90.0, 0.0)) for x in np.linspace(-10, 10, 6)]
     other = examined(tmp_path / "far", far, surface(3, 30.0, False), Similarity.identity())
-    with pytest.raises(Exception, match="cannot be compared: 0 of 6 keyframes"):
+    with pytest.raises(InputError, match="cannot be compared: 0 of 6 keyframes"):
         compare_exams(runs[0], other)

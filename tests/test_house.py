@@ -175,7 +175,7 @@ CEILINGS = {
     "core, net": (lambda: _net(MODULES), 21_835),
     "bench": (lambda: _total(BENCH_MODULES), 13_850),  # 445: polyps; 235: two runs; 195: verdicts; 980: peers, tissue
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 34_350),  # those of all of these; 230: a network at rest; 30: merging by the graph
+    "tests": (lambda: _total(TESTS), 34_355),  # those of all of these; 230: a network at rest; 30: merging by the graph
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 101),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 14_675),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

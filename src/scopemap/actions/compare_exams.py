@@ -43,7 +43,7 @@ _SHOWN_VIEWS, _SAME_VIEW = 8, 0.8  # how far apart they are: distance over depth
 _APART = 0.08  # of depth, from the other surface: only one of them saw it
 
 
-class PairedPoints(NamedTuple):
+class Correspondences3D(NamedTuple):
     """Points of two surfaces that show the same place, (N, 3) mm, each in its own world."""
 
     first: np.ndarray
@@ -75,9 +75,8 @@ class ExamComparison:
 
     S_first_second : of all pairs. residual : median distance of pairs after it, over the median depth. located : which
     share of the keyframes of the second was found. second : its surface in the world of the first. changes : the
-    surest first. views : numbers of frames of both that show the same places. sigmas : (V,) float32 of the first
-    surface's vertices, how sure a change is; NaN: not compared. only_first, only_second : shares of the surfaces'
-    vertices that are far from the other one.
+    surest first. views : numbers of frames of both that show the same places. only_first,
+    only_second : shares of the surfaces' vertices that are far from the other one.
     """
 
     S_first_second: Similarity
@@ -86,7 +85,6 @@ class ExamComparison:
     second: trimesh.Trimesh
     changes: list[Change]
     views: list[tuple[int, int]]
-    sigmas: np.ndarray
     only_first: float
     only_second: float
 
@@ -133,24 +131,21 @@ def compare_exams(
     folder holds no finished run with depth and surface, an input is gone, or the second is not found in the first.
     """
     one, other = _Exam(first), _Exam(second)
-    pairs, located = _paired(PlaceMap(first, first_source), other, second, second_source)
+    pairs, located = _correspondences(PlaceMap(first, first_source), other, second, second_source)
     apart = f"{located} of {len(other.poses)} keyframes of {second} were found in the map of {first}"
     if len(pairs.first) < _LEAST_PAIRS:
         raise InputError(f"the examinations cannot be compared: {apart}")
     try:
-        S, distance = _fitted(pairs)
+        S, distance = _robust_similarity(pairs)
     except AlignmentError as error:
         raise InputError(f"the examinations cannot be compared: {apart}; {error}") from None
     moved = other.run.mesh.copy()
     moved.vertices = S.transform_points(np.asarray(moved.vertices))
-    difference = _differences(one, other.run.mesh, pairs)
-    changes, sigmas = _changes(one, other, S, difference)
+    changes = _changes(one, other, S, _differences(one, other.run.mesh, pairs))
     tree = [cKDTree(np.asarray(mesh.vertices)) for mesh in (one.run.mesh, moved)]
-    apart_mm = _APART * one.depth_mm
-    only = [float((tree[1 - n].query(tree[n].data)[0] > apart_mm).mean()) for n in (0, 1)]
+    only = [float((tree[1 - n].query(tree[n].data)[0] > _APART * one.depth_mm).mean()) for n in (0, 1)]
     residual = float(np.median(distance)) / one.depth_mm
-    views = _views(one, other, S)
-    return ExamComparison(S, residual, located / len(other.poses), moved, changes, views, sigmas, *only)
+    return ExamComparison(S, residual, located / len(other.poses), moved, changes, _views(one, other, S), *only)
 
 
 def _views(one: _Exam, other: _Exam, S: Similarity) -> list[tuple[int, int]]:
@@ -166,7 +161,9 @@ def _views(one: _Exam, other: _Exam, S: Similarity) -> list[tuple[int, int]]:
     return sorted((index, number[there]) for there, (_, index) in nearest.items())
 
 
-def _paired(places: PlaceMap, other: _Exam, folder: Path, source: Path | None) -> tuple[PairedPoints, int]:
+def _correspondences(
+    places: PlaceMap, other: _Exam, folder: Path, source: Path | None
+) -> tuple[Correspondences3D, int]:
     """Return the pairs by the keyframes of the second that are located in the main map, and how many these are."""
     first, second, located = [np.zeros((0, 3))], [np.zeros((0, 3))], 0
     for frame in frames_again(folder, set(other.poses), source):
@@ -179,10 +176,10 @@ def _paired(places: PlaceMap, other: _Exam, folder: Path, source: Path | None) -
         points = transform(other.poses[frame.index], frame.camera.unproject(found.pixels) * z[:, None])
         first.append(found.points_mm[np.isfinite(z)])
         second.append(points[np.isfinite(z)])
-    return PairedPoints(np.concatenate(first), np.concatenate(second)), located
+    return Correspondences3D(np.concatenate(first), np.concatenate(second)), located
 
 
-def _fitted(pairs: PairedPoints) -> tuple[Similarity, np.ndarray]:
+def _robust_similarity(pairs: Correspondences3D) -> tuple[Similarity, np.ndarray]:
     """Return the similarity of most pairs, and the distance (N,) of all after it."""
     kept = np.ones(len(pairs.first), bool)
     for _ in range(_FITS):
@@ -204,7 +201,7 @@ class _Difference(NamedTuple):
     depth_mm: np.ndarray
 
 
-def _differences(one: _Exam, second: trimesh.Trimesh, pairs: PairedPoints) -> _Difference:
+def _differences(one: _Exam, second: trimesh.Trimesh, pairs: Correspondences3D) -> _Difference:
     """Return how the second surface differs from the first one in the views of the first one's keyframes."""
     mesh = one.run.mesh
     views, total = np.zeros(len(mesh.vertices), int), np.zeros((3, len(mesh.vertices)))
@@ -213,12 +210,12 @@ def _differences(one: _Exam, second: trimesh.Trimesh, pairs: PairedPoints) -> _D
         if len(in_sight) < _LEAST_PAIRS:
             continue
         try:
-            S, _ = _fitted(PairedPoints(pairs.first[in_sight], pairs.second[in_sight]))
+            S, _ = _robust_similarity(Correspondences3D(pairs.first[in_sight], pairs.second[in_sight]))
         except AlignmentError:
             continue
-        brought = second.copy()
-        brought.vertices = S.transform_points(np.asarray(second.vertices))
-        own, there = (render_mesh(surface, one.run.camera, pose) for surface in (mesh, brought))
+        aligned = second.copy()
+        aligned.vertices = S.transform_points(np.asarray(second.vertices))
+        own, there = (render_mesh(surface, one.run.camera, pose) for surface in (mesh, aligned))
         with np.errstate(invalid="ignore"):
             nearer = np.log(own.depth_mm / there.depth_mm)
             same = (np.abs(nearer) < _HIDDEN) & (own.depth_mm < _FARTHEST * one.depth_mm)
@@ -226,7 +223,7 @@ def _differences(one: _Exam, second: trimesh.Trimesh, pairs: PairedPoints) -> _D
             continue
         width_px = _BLOB_SHARE * one.depth_mm * one.run.camera.fx / float(np.median(own.depth_mm[same]))
         both = nearer, _redness(there.rgb) - _redness(own.rgb)
-        shown = [_beside_around(values, same, width_px) for values in both]
+        shown = [_local_difference(values, same, width_px) for values in both]
         seen, (column, row), z_mm = _pixels(one.run.camera, pose, np.asarray(mesh.vertices))
         fine = same[row, column] & (np.abs(own.depth_mm[row, column] / z_mm - 1) < _ON_SURFACE)
         views[seen[fine]] += 1
@@ -251,8 +248,8 @@ def _redness(rgb: np.ndarray) -> np.ndarray:
     return np.asarray(levels[..., 0] - levels[..., 1])
 
 
-def _beside_around(values: np.ndarray, known: np.ndarray, width_px: float) -> np.ndarray:
-    """Return the mean of values (H, W) over a place, less that of what is around it; 0 where nothing is known."""
+def _local_difference(values: np.ndarray, known: np.ndarray, width_px: float) -> np.ndarray:
+    """Return a band-pass of values (H, W): the mean over a place less that around it; 0 where nothing is known."""
 
     def mean(values: np.ndarray, sigma_px: float) -> np.ndarray:
         weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma_px)
@@ -262,12 +259,12 @@ def _beside_around(values: np.ndarray, known: np.ndarray, width_px: float) -> np
     return mean(values - mean(values, _AROUND_SHARE * values.shape[1]), width_px)
 
 
-def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> tuple[list[Change], np.ndarray]:
-    """Return the changes, surest first, and how sure each vertex is one, in standard deviations of most vertices."""
+def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> list[Change]:
+    """Return the changes, surest first."""
     compared = found.views >= _LEAST_VIEWS
     sigmas = np.full((2, len(compared)), np.nan, np.float32)
     if not compared.any():
-        return [], sigmas[0]
+        return []
     for row, (values, least) in enumerate(zip((found.nearer, found.redness), _LEAST_SPREADS, strict=True)):
         spread = 1.4826 * np.median(np.abs(values[compared] - np.median(values[compared])))
         sigmas[row, compared] = (values[compared] - np.median(values[compared])) / max(spread, least)
@@ -292,4 +289,4 @@ def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> tup
         means = float((found.nearer * found.depth_mm)[peak]), float(found.redness[peak])
         facts = float(area[own].sum()), *means, float(sure[peak]), int(found.views[own].max())
         changes.append(Change(what, place, *facts, frames))
-    return sorted(changes, key=lambda change: -change.sigmas), np.abs(sigmas).max(0)
+    return sorted(changes, key=lambda change: -change.sigmas)

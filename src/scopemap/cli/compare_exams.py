@@ -19,10 +19,12 @@ def compare_exams(
     second_input: Annotated[
         Path | None, typer.Option("--second-input", metavar="INPUT", help="Where the second one's input is now.")
     ] = None,
+    overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Bring two examinations of the same place together: matched views, what changed, what only one of them saw."""
+    options.check_output(out / "compare.html", (".html",), overwrite)
     from scopemap.actions.compare_exams import compare_exams as compare
     from scopemap.actions.exams_page import PAGE, facts_of, summary, write_comparison
     from scopemap.io.run_folder import RunFolder

@@ -23,8 +23,8 @@ def coverage(
 ) -> None:
     """Estimate which share of the tissue no frame saw, with an interval of 90 %, and list where.
 
-    Writes coverage.json, map.csv, map.png and coverage.ply. An estimate, calibrated on synthetic colons; not for
-    decisions about a patient.
+    Writes coverage.json, map.csv, map.png and coverage.ply. Calibrated on synthetic colons; not for decisions
+    about a patient.
     """
     folder = out or run / "coverage"
     files = {name: folder / name for name in ("coverage.json", "map.csv", "map.png", "coverage.ply")}

@@ -98,4 +98,5 @@ def _pixels(text: str, option: str) -> list[list[float]]:
     try:
         return [[float(x), float(y)] for x, y in (word.split(",") for word in text.split())]
     except ValueError:
-        raise typer.BadParameter(f'"{text}" is not "x,y x,y ..."', param_hint=option) from None
+        no_file = ", and there is no such file" if option == "--lesion" else ""
+        raise typer.BadParameter(f'"{text}" is not "x,y x,y ..."{no_file}', param_hint=option) from None
