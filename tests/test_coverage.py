@@ -121,8 +121,9 @@ def test_the_views_of_a_wall_are_those_of_geometry(whole: Path) -> None:
     assert views.cosine[ring].min() > 0.4
     assert views.cosine[ring].max() < 0.7
     assert (views.jump[ring] < 0.3).all()
-    known = features(run.mesh, views, np.ones(len(middle), bool), 10.0)
-    assert known.shape == (len(middle), 5)
+    layout = Cavity(np.zeros(3), np.eye(3), 10.0)
+    known = features(run.mesh, views, np.ones(len(middle), bool), layout)
+    assert known.shape == (len(middle), 6)
     assert known[ring, 4] == pytest.approx(views.distance_mm[ring] / 10)
 
 
@@ -184,9 +185,9 @@ def bowl() -> trimesh.Trimesh:
 
 
 def in_bowls_hole(points_mm: np.ndarray) -> np.ndarray:
-    """Which points are within 5.5 mm of the direction of 13 degrees at 6 o'clock, which is y."""
+    """Which points are within 7.5 mm of the direction of 13 degrees at 6 o'clock, which is y."""
     turn = np.radians(13)
-    return np.linalg.norm(points_mm - 30 * np.array([0, np.sin(turn), np.cos(turn)]), axis=1) < 5.5
+    return np.linalg.norm(points_mm - 30 * np.array([0, np.sin(turn), np.cos(turn)]), axis=1) < 7.5
 
 
 def test_a_hole_in_a_bowl_is_found_in_its_direction(tmp_path: Path) -> None:
@@ -194,9 +195,9 @@ def test_a_hole_in_a_bowl_is_found_in_its_direction(tmp_path: Path) -> None:
     found = coverage(write_run(tmp_path / "run", without(bowl(), in_bowls_hole), sideways))
     assert isinstance(found.layout, Cavity)
     spot = min(found.spots, key=lambda one: abs(one.along - 13))
-    assert spot.along == pytest.approx(13, abs=3)
+    assert spot.along == pytest.approx(13, abs=5)
     assert spot.clock == pytest.approx(6, abs=0.5)
-    assert spot.area == pytest.approx(np.pi * 5.5**2, rel=0.5)
+    assert 0.3 < spot.area / (np.pi * 7.5**2) < 1
     assert "from the mean direction of view" in str(found)
 
 

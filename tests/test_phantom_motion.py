@@ -12,7 +12,7 @@ from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.decoding import read_decoded
 from scopemap_bench.phantom.instrument import instrument
-from scopemap_bench.phantom.motion import Grasp, Push, contractions
+from scopemap_bench.phantom.motion import Grasp, Push, TissueMotion, contractions, insufflated
 from scopemap_bench.phantom.render import Phantom, prepare, render_frame
 from scopemap_bench.phantom.shading import veil
 from scopemap_bench.phantom.slit import in_wound
@@ -142,3 +142,11 @@ def test_a_veil_hides_what_is_far_more_than_what_is_near_and_clears() -> None:
 def test_only_one_cut_is_possible() -> None:
     with pytest.raises(SettingsError, match="one cut at most"):
         PhantomSpec(events=parse_events("cut:1-2,cut:5-6"))
+
+
+def test_insufflated_tissue_is_wider_across_the_view_alone() -> None:
+    turn = np.linspace(0, 2 * np.pi, 9)
+    ring_mm = np.column_stack([15 * np.cos(turn), 15 * np.sin(turn), np.full(9, 40.0)])
+    moved = TissueMotion((), insufflated(0.05, np.eye(4))).at(3.0).move(ring_mm)
+    assert np.linalg.norm(moved[:, :2], axis=1) / 15 == pytest.approx(1.05, abs=0.004)
+    assert moved[:, 2] == pytest.approx(40)

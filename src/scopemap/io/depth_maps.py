@@ -74,7 +74,7 @@ class DepthWriter:
             with reporting(f"cannot write to {self._preview_folder}"):
                 self._preview_folder.mkdir(exist_ok=True)
             # Level 0 is unknown, 1 the far end of the colours.
-            colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_TURBO)
+            colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
             colours[0] = 0
             unit = np.arange(_LARGEST_UNIT + 2).clip(1)
             level = np.clip(255 - 254 * np.log(unit / near) / np.log(far / near), 1, 255).astype(np.uint8)

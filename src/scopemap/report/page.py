@@ -110,7 +110,7 @@ def serve_view(folder: Path | str, port: int = 0) -> LocalServer:
 
 def page_html(runs: list[dict[str, Any]], *, served: bool = False) -> str:
     """Return the page of runs, each from `page_data`; served : by `view`, which takes its measurements."""
-    levels = np.arange(256, dtype=np.uint8)
+    levels = np.arange(256, dtype=np.uint8)[:, None]
     maps = {"turbo": cv2.COLORMAP_TURBO, "ramp": cv2.COLORMAP_VIRIDIS}
     colours = {name: base64_of(cv2.applyColorMap(levels, number)[:, 0, ::-1], "u1") for name, number in maps.items()}
     content = without_nan({"runs": runs, "licences": _LICENCES, "served": served} | colours)

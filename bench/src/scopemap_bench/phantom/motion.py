@@ -25,6 +25,7 @@ _POKE_MM, _POKED_SHARE = 8.0, 0.2
 _RISE_SHARE, _SWINGS, _DAMPING = 1 / 3, 2.0, 6.0
 _RING_MM, _RING_WIDTH_MM, _RING_LENGTH_MM, _RING_FRAMES = 2.5, 90.0, 70.0, 60.0
 _PULL_MM, _PULL_WIDTH_MM = 8.0, 12.0
+_WIDE_LENGTH_MM = 500.0  # of the waves whose slope widens a lumen
 # A pull and a cut are in proportion to the distance where it is smaller than this.
 _FULL_FROM_MM = 50.0
 # Another examination's path beside the first one's.
@@ -317,16 +318,24 @@ Part = Breathing | Push | Contractions | Grasp | Cut
 
 @dataclass(frozen=True)
 class TissueMotion:
-    """All that moves the tissue."""
+    """All that moves the tissue; `always`: what does at any time."""
 
     parts: tuple[Part, ...]
+    always: Displacement = REST
 
     def at(self, time: float) -> Displacement:
         """Return the displacement at a time, in frames."""
-        parts = [REST, *(part.at(time) for part in self.parts)]
+        parts = [self.always, *(part.at(time) for part in self.parts)]
         return Displacement(
             *(np.concatenate([getattr(p, kind) for p in parts]) for kind in ("waves", "bumps", "slits"))
         )
+
+
+def insufflated(share: float, T_world_camera: np.ndarray) -> Displacement:
+    """Return tissue that is wider by a share, across the line of sight of a camera."""
+    sides = 2 * np.pi / _WIDE_LENGTH_MM * T_world_camera[:3, :2].T
+    waves = [np.concatenate([k, share * k / (k @ k), [-k @ T_world_camera[:3, 3]]]) for k in sides]
+    return Displacement(np.array(waves))
 
 
 def push(first: int, last: int, T_world_camera: np.ndarray, distance_mm: float, springs: bool = False) -> Push:

@@ -21,6 +21,7 @@ from scopemap_bench.phantom.motion import (
     cut,
     examined_again,
     grasp,
+    insufflated,
     lumen_path,
     poke,
     push,
@@ -115,7 +116,7 @@ def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotio
                 parts.append(poke(first, last, point, (along - normal) / np.sqrt(2), distance_mm))
             else:
                 parts.append(grasp(first, last, point, (along + normal) / np.sqrt(2), distance_mm))
-    return TissueMotion(tuple(parts))
+    return TissueMotion(tuple(parts), insufflated(spec.insufflation, poses[0]) if spec.insufflation else REST)
 
 
 def _touched(
@@ -168,13 +169,13 @@ def _with_turns(poses: np.ndarray, spec: PhantomSpec) -> np.ndarray:
 def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearance]:
     """Return shape and appearance of the scene of `spec`, built around the poses (N, 4, 4)."""
     if spec.scene == "tube":
-        return tube_volume(poses), Appearance(_TUBE_RGB, 0.0, 0.0, spec.seed)
+        return tube_volume(poses), Appearance(_TUBE_RGB, 0.0, 0.0, spec.seed, 0)
     base: np.ndarray | Tint
     if spec.scene == "colon":
         volume, base = colon_volume(poses, spec.seed, spec.fold_mm), _COLON_RGB
     else:
         volume, base = laparoscopy_volume(poses, spec.seed, _OPEN[spec.scene])
-    return volume, Appearance(base, spec.texture, spec.gloss, spec.seed)
+    return volume, Appearance(base, spec.texture, spec.gloss, spec.seed, spec.seed + 1000 * spec.examination)
 
 
 def light(phantom: Phantom, index: int) -> tuple[np.ndarray, SurfaceBuffers]:

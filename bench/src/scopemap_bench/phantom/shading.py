@@ -47,6 +47,7 @@ _OPTIONS = {"preset": "fast", "tune": "zerolatency"}
 class Appearance:
     """Appearance of tissue: `base`, its colour, linear RGB (3,), or the colours in space; `seed` of its pattern.
 
+    wet_seed : of its fluid.
     texture, gloss : strength of mottling and vessels, and of highlights; 0 = none.
     """
 
@@ -54,6 +55,7 @@ class Appearance:
     texture: float
     gloss: float
     seed: int
+    wet_seed: int
 
     def albedo(self, rest_mm: np.ndarray, footprint_mm: np.ndarray) -> np.ndarray:
         """Return linear RGB (H, W, 3) float32, 0..1, at rest points (H, W, 3) seen by pixels that wide (H, W)."""
@@ -67,12 +69,12 @@ class Appearance:
         """Return the tilt (H, W, 3) float32, about -1..1, of the fluid film; zero without gloss."""
         if self.gloss == 0:
             return np.zeros(rest_mm.shape, np.float32)
-        axes = [noise_at(rest_mm, _RIPPLE_MM, self.seed + 41 + n) for n in range(3)]
+        axes = [noise_at(rest_mm, _RIPPLE_MM, self.wet_seed + 41 + n) for n in range(3)]
         return np.stack(axes, -1) * _visible(_RIPPLE_MM, np.nan_to_num(footprint_mm, nan=1.0))[..., None]
 
     def film(self, rest_mm: np.ndarray) -> np.ndarray:
         """Return the strength (H, W) float32, >= 0, of specular reflection: larger in wet places, never 0."""
-        wetness = 0.5 + 1.6 * noise_at(rest_mm, _PUDDLE_MM, self.seed + 45)
+        wetness = 0.5 + 1.6 * noise_at(rest_mm, _PUDDLE_MM, self.wet_seed + 45)
         return (self.gloss * np.clip(wetness, 0.05, 1.0)).astype(np.float32)
 
     def _mottling(self, points: np.ndarray, footprint: np.ndarray) -> np.ndarray:

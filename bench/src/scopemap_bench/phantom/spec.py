@@ -71,7 +71,9 @@ class PhantomSpec:
     route : of a generated path. wander: forward in a lumen, to and fro over a cavity; sideways: by 22 mm, a third of
     the distance to a cavity's floor; withdrawal: 52 mm straight back. These two are as long in any number of frames.
     fold_mm : how far the folds of a colon rise from its wall, at most; behind deep ones more is hidden.
-    examination : 0: the first one; another number: the same scene seen again, on another path beside the first one's.
+    examination : 0: the first one; another number: the same scene seen again, on another path beside the first
+    one's, with fluid on other places.
+    insufflation : share by which the tissue is wider than its mesh, across the first view.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often. events : see `Event`.
     polyps : see `Polyp`; their true sizes and masks are written, too.
     noise : standard deviation of the sensor's read noise, share of the linear range; 0 also turns shot noise off.
@@ -95,6 +97,7 @@ class PhantomSpec:
     route: RouteName = "wander"
     fold_mm: float = 6.0
     examination: int = 0
+    insufflation: float = 0.0
     deform: bool = False
     loop: bool = False
     speed: int = 1
@@ -123,6 +126,7 @@ class PhantomSpec:
             "speed must be at least 1, and needs a generated path": self.speed == 1
             or (self.speed > 1 and self.path_file is None),
             "fold_mm must be between 0 and 10": 0 <= self.fold_mm <= 10,
+            "insufflation must be between 0 and 0.1": 0 <= self.insufflation <= 0.1,
             "breath_mm must be between 0 and 4": 0 <= self.breath_mm <= 4,
             "breath_frames and fps must be positive": min(self.breath_frames, self.fps) > 0,
             "noise, texture and gloss must not be negative": min(self.noise, self.texture, self.gloss) >= 0,

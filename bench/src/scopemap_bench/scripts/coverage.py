@@ -5,7 +5,7 @@
 
 Phantoms of 50 frames, three times as fast as usual: forward, withdrawn, there and back, with the camera turned away by
 30 degrees on the way, with folds of 9 mm in place of 6 mm, and cavities. None of them was used for choosing constants;
-`--fit` prints the regression's weights from those that were.
+`--fit` prints the regression's weights, and the widths of intervals, from those that were.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from scopemap.actions.coverage.coverage import Coverage, coverage
-from scopemap.actions.coverage.unseen import WEIGHTS
+from scopemap.actions.coverage.coverage import HIDDEN_AREA, Coverage, coverage
 from scopemap_bench.evaluation.coverage import CoverageErrors, coverage_errors, shown_faces, similarity_to_truth
 from scopemap_bench.scripts import measuring
 
 FAST = ("--frames", 50, "--set", "speed=3")
-BACK, DEEP = ("--set", "route=withdrawal"), ("--set", "fold_mm=9")
+BACK, DEEP, SHALLOW = ("--set", "route=withdrawal"), ("--set", "fold_mm=9"), ("--set", "fold_mm=4")
 TURNS, TURNS_BACK = ("--events", "turn:14-20,turn:34-40"), ("--events", "turn:18-24,turn:34-40")
 CAVITY = ("--scene", "laparoscopy")
 PHANTOMS: dict[str, tuple[object, ...]] = {
@@ -36,12 +35,16 @@ PHANTOMS: dict[str, tuple[object, ...]] = {
     **{f"deep-{seed}": (*FAST, *DEEP) for seed in (80, 81, 82)},
     **{f"laparoscopy-{seed}": (*FAST, *CAVITY) for seed in (83, 84)},
 }
-FITTED: dict[str, tuple[object, ...]] = {
-    **{f"fitted-{seed}": ("--frames", 150) for seed in (51, 53)},
-    **{f"fitted-{seed}": ("--frames", 150, *BACK) for seed in (52, 54)},
-    "fitted-55": ("--frames", 150, *DEEP),
-    "fitted-57": (*FAST, *TURNS),
-}
+_SLOW, _NARROW, _WIDE = ("--frames", 150), ("--set", "fov_deg=70"), ("--set", "fov_deg=110")
+_FITTED_WORDS: list[tuple[object, ...]] = [
+    *(FAST, FAST, (*FAST, *_NARROW), (*FAST, *_WIDE), _SLOW, (*_SLOW, *BACK), (*_SLOW, *DEEP), (*FAST, *BACK)),
+    *((*FAST, *BACK), (*FAST, *BACK, *_NARROW), (*FAST, *TURNS), (*FAST, *TURNS), (*FAST, *BACK, *TURNS_BACK)),
+    *((*FAST, *DEEP), (*FAST, *DEEP), (*FAST, *DEEP, *_WIDE), (*FAST, *DEEP, *BACK), (*FAST, *SHALLOW)),
+    *((*FAST, "--loop"), (*FAST, *CAVITY), (*FAST, *CAVITY), (*FAST, *CAVITY, "--set", "fov_deg=60")),
+    *((*FAST, *CAVITY, *TURNS), (*FAST, *CAVITY, *TURNS), ("--frames", 120, *CAVITY), (*FAST, *CAVITY, *_WIDE)),
+    *(("--frames", 30, *CAVITY), (*FAST, "--set", "fold_mm=8"), (*FAST, *BACK, *SHALLOW), (*FAST, *DEEP, *TURNS), FAST),
+]
+FITTED = {f"fitted-{101 + number}": words for number, words in enumerate(_FITTED_WORDS)}
 _EVERY, _STEPS = 12, 12
 
 
@@ -55,19 +58,29 @@ def found_and_true(name: str, words: tuple[object, ...], folder: Path) -> tuple[
     return found, coverage_errors(found, similarity, mesh, shown), ~shown[nearest]
 
 
-def fitted_weights(folder: Path) -> np.ndarray:
-    """Return the weights of the logistic regression, by Newton's method, on every 12th face of the fitted phantoms."""
-    rows, labels = [], []
-    for name, words in FITTED.items():
-        found, _, hidden = found_and_true(name, words, folder)
-        chosen = np.flatnonzero(np.isfinite(found.unseen))[::_EVERY]
-        rows.append(found.features[chosen])
-        labels.append(hidden[chosen])
-    x, y = np.concatenate(rows), np.concatenate(labels)
-    weights = np.zeros(len(WEIGHTS))
+def print_fit(folder: Path) -> None:
+    """Print the weights, and for lumens and cavities the odds ratio that nine in ten keep, each phantom left out."""
+    parts = [found_and_true(name, words, folder) for name, words in FITTED.items()]
+    apart: dict[str, list[float]] = {}
+    for left_out, (found, errors, _) in enumerate(parts):
+        weights, kind = fitted_weights(parts[:left_out] + parts[left_out + 1 :]), found.layout.kind
+        examined = np.isfinite(found.unseen)
+        area, p = found.surface.area_faces[examined], expit(found.features[examined] @ weights)
+        odds = HIDDEN_AREA[kind] * (area @ p) / (area @ (1 - p))
+        apart.setdefault(kind, []).append(abs(np.log(errors.share / (1 - errors.share) / odds)))
+    print(np.round(fitted_weights(parts), 3).tolist())
+    print({kind: round(float(np.exp(np.quantile(own, 0.9))), 1) for kind, own in apart.items()})
+
+
+def fitted_weights(parts: list[tuple[Coverage, CoverageErrors, np.ndarray]]) -> np.ndarray:
+    """Return the weights of the logistic regression, by Newton's method, on every 12th face of phantoms."""
+    chosen = [np.flatnonzero(np.isfinite(found.unseen))[::_EVERY] for found, _, _ in parts]
+    x = np.concatenate([found.features[faces] for (found, _, _), faces in zip(parts, chosen, strict=True)])
+    y = np.concatenate([hidden[faces] for (_, _, hidden), faces in zip(parts, chosen, strict=True)])
+    weights, weak = np.zeros(x.shape[1]), np.eye(x.shape[1])
     for _ in range(_STEPS):
         p = expit(x @ weights)
-        weights += np.linalg.solve((x * (p * (1 - p))[:, None]).T @ x, x.T @ (y - p))
+        weights += np.linalg.solve((x * (p * (1 - p))[:, None]).T @ x + weak, x.T @ (y - p) - weights)
     return weights
 
 
@@ -119,7 +132,7 @@ def main() -> None:
     with measuring.folder_or_scratch(options.out) as folder:
         folder.mkdir(parents=True, exist_ok=True)
         if options.fit:
-            print(np.round(fitted_weights(folder), 3).tolist())
+            print_fit(folder)
         else:
             print_table(options.only, folder)
 

@@ -3,7 +3,8 @@
     python -m scopemap_bench.scripts.examinations [--out FOLDER] [--seeds 72 73 74]
 
 The second examination of a colon goes another way, up to 5 mm beside the first one's, turned by up to 28 degrees, at
-another pace, with automatic exposure and H.264. One polyp stays, one went, one is new. A frame is located rightly
+another pace, with automatic exposure and H.264; its wall is 5 % wider and breathes by 1 mm, fluid is on other places,
+and before the lens of 10 of the 120 frames. One polyp stays, one went, one is new. A frame is located rightly
 within 5 mm and 10 degrees of its true pose, after the Sim(3) of the map's own path to the truth. A change is right
 within a polyp's diameter of the middle of one that went or came; all others are false.
 """
@@ -22,7 +23,8 @@ from scopemap_bench.scripts.locating import errors
 
 FRAMES = 120
 STAYS, WENT, CAME = "sessile:8@30", "sessile:6@90", "sessile:6@65"
-AGAIN = ("--set", "examination=1", "--set", "auto_exposure=true", "--set", "h264_crf=26")
+LIGHT = ("--set", "examination=1", "--set", "auto_exposure=true", "--set", "h264_crf=26")
+TISSUE = ("--set", "insufflation=0.05", "--deform", "--set", "breath_mm=1", "--events", "fluid:50-59")
 RIGHT_MM, RIGHT_DEG = 5.0, 10.0
 
 
@@ -43,7 +45,7 @@ def print_pair(seed: int, folder: Path) -> None:
     """Render both examinations, run them, and print their row."""
     common = ("--frames", FRAMES, "--seed", seed)
     first = measuring.phantom(folder / f"{seed}-first", *common, "--polyps", f"{STAYS},{WENT}")
-    second = measuring.phantom(folder / f"{seed}-second", *common, "--polyps", f"{STAYS},{CAME}", *AGAIN)
+    second = measuring.phantom(folder / f"{seed}-second", *common, "--polyps", f"{STAYS},{CAME}", *LIGHT, *TISSUE)
     runs = [measuring.run_once(source, folder / f"{source.name}-run") for source in (first, second)]
     table = folder / f"{seed}.csv"
     measuring.scopemap("locate", runs[0], second, "--out", table, "--overwrite", "--quiet")

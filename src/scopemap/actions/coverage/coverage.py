@@ -1,7 +1,7 @@
 """The share of the tissue of a result that was never seen, with an interval, and where: a map and blind spots.
 
 The tissue that there should be is the result's surface, closed smoothly where it has gaps (`fusion/watertight.py`),
-with a quarter more area where it was not seen: what a fold hides has more area than the sheet in front of it.
+in a lumen with 1.3 times the area where it was not seen: what a fold hides has more area than the sheet in front of it.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from scopemap.report.sheet import rgb_of
 from scopemap.report.verdict import verdict
 from scopemap.trajectory.frame_table import FrameTable
 
-HIDDEN_AREA = 1.25
+HIDDEN_AREA = {"lumen": 1.3, "cavity": 1.0}
 BLIND = 0.3
 """Share not seen of a bin from which it belongs to a blind spot; the regression is cautious about single faces."""
-ODDS, SEGMENT_ODDS = {"lumen": 1.4, "cavity": 4.0}, {"lumen": 2.2, "cavity": 6.0}
+ODDS, SEGMENT_ODDS = {"lumen": 1.5, "cavity": 5.3}, {"lumen": 2.0, "cavity": 6.0}
 """Factors of the odds of a share at the ends of its interval: of the whole, and of one segment."""
 _NOTHING_HIDDEN = 0.1
 """By so much the low end of a segment is lower still: where wall is seen from afar only, nothing may be hidden."""
@@ -117,7 +117,7 @@ class Coverage:
     unit : of lengths, "mm", or "unit" where the scale is unknown; scale : what is known of it. Places along are
     distances on the centreline of a lumen from the beginning of the examined part, or degrees from a cavity's mean
     direction of view; 12 o'clock is up in the first picture. spots : the largest first. surface : the closed mesh.
-    unseen : (F,) probability that no frame saw a face, by its features (F, 5); NaN outside of what was examined.
+    unseen : (F,) probability that no frame saw a face, by its features (F, 6); NaN outside of what was examined.
     layout : where points are on the map; first : its row that is the map's first.
     """
 
@@ -186,7 +186,7 @@ def coverage(folder: Path) -> Coverage:
     layout = layout_of(space, np.asarray(run.mesh.vertices), tracked["T_world_camera"])
     views = views_of(run, surface)
     present = cKDTree(run.mesh.vertices).query(surface.triangles_center)[0] <= SEEN_CELLS * space.cell_mm
-    known = features(surface, views, present, layout.radius_mm)
+    known = features(surface, views, present, layout)
     row, hours, wall = layout.place(surface.triangles_center, surface.face_normals)
     area = surface.area_faces * (wall | present)
     inside = layout.examined(*(binned(row, hours, weights, layout.rows) for weights in (area, area * present)))
@@ -200,16 +200,17 @@ def coverage(folder: Path) -> Coverage:
     counted = counted[inside[row[counted], column_of(hours[counted])]]
     unseen = np.full(len(area), np.nan)
     unseen[counted] = unseen_probability(known[counted])
-    faces = _Faces(surface.triangles_center[counted], row[counted], hours[counted], area[counted], unseen[counted])
+    parts = area * (1 - unseen), HIDDEN_AREA[layout.kind] * area * unseen
+    faces = _Faces(*(values[counted] for values in (surface.triangles_center, row, hours, area, *parts)))
     chart = _chart(faces, inside, views, counted, layout)
     spots = _spots(chart, faces, tracked, layout)
     every = max(1, round((_SEGMENT_RADII * layout.radius_mm if layout.kind == "lumen" else _SEGMENT_DEG) / layout.step))
     ends = [*range(0, max(len(inside) - every // 2, 1), every), len(inside)]
     odds, step = SEGMENT_ODDS[layout.kind], layout.step
-    parts = [_share(faces, start, end, step, odds, _NOTHING_HIDDEN) for start, end in pairwise(ends)]
+    shares = [_share(faces, start, end, step, odds, _NOTHING_HIDDEN) for start, end in pairwise(ends)]
     total = _share(faces, 0, len(inside), layout.step, ODDS[layout.kind])
     unit = "mm" if run.scale_known else "unit"
-    return Coverage(unit, run.scale, total, parts, spots, chart, surface, unseen, known, layout, first)
+    return Coverage(unit, run.scale, total, shares, spots, chart, surface, unseen, known, layout, first)
 
 
 def _percent(share: Share) -> str:
@@ -221,18 +222,14 @@ def _three_digits(number: float) -> str:
 
 
 class _Faces(NamedTuple):
-    """The faces (N,) that were examined: middle (N, 3), row, clock, area, and probability that no frame saw them."""
+    """The faces (N,) that were examined: middle (N, 3), row, clock, area, and expected areas that frames saw or not."""
 
     middle: np.ndarray
     row: np.ndarray
     hours: np.ndarray
     area: np.ndarray
-    unseen: np.ndarray
-
-    @property
-    def hidden(self) -> np.ndarray:
-        """Expected area (N,) that no frame saw."""
-        return HIDDEN_AREA * self.area * self.unseen
+    seen: np.ndarray
+    hidden: np.ndarray
 
 
 def _checked(folder: Path) -> RunFolder:
@@ -253,7 +250,7 @@ def _share(faces: _Faces, first: int, last: int, step: float, odds: float, lower
     """
     inside = (faces.row >= first) & (faces.row < last)
     hidden = float(faces.hidden[inside].sum())
-    seen = float((faces.area * (1 - faces.unseen))[inside].sum())
+    seen = float(faces.seen[inside].sum())
     low, share, high = (hidden * f / max(hidden * f + seen, 1e-12) for f in (1 / odds, 1.0, odds))
     return Share(first * step, last * step, share, max(low - lower, 0.0), high, hidden + seen)
 
@@ -264,7 +261,7 @@ def _chart(faces: _Faces, inside: np.ndarray, views: Views, counted: np.ndarray,
     def sums(weights: np.ndarray) -> np.ndarray:
         return smoothed(binned(faces.row, faces.hours, weights, len(inside)))
 
-    hidden, seen = sums(faces.hidden), sums(faces.area * (1 - faces.unseen))
+    hidden, seen = sums(faces.hidden), sums(faces.seen)
     shown = faces.area * (views.cosine[counted] > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.where(inside, hidden / (hidden + seen), np.nan)

@@ -14,6 +14,7 @@ import trimesh
 from scipy.sparse import coo_matrix, eye_array
 from scipy.special import expit
 
+from scopemap.actions.coverage.layout import Layout
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.io.run_folder import RunFolder
 
@@ -21,8 +22,9 @@ MOST_FRAMES = 200
 _SAME_DEPTH = 0.05
 _JUMP_RAD, _JUMPS = 1 / 32, (0.01, 2.0)
 _MOST_RADII, _SMOOTHING_STEPS = 8.0, 30
-# Of a constant, the cosine, the logarithm of the jump, the surface's presence, and the distance in radii.
-WEIGHTS = np.array([3.633, -4.096, 0.72, -0.306, -0.311])
+# Of a constant, the cosine, the logarithm of the jump, the surface's presence, the distance in radii, and of wall that
+# is seen in a cavity, where folds hide less.
+WEIGHTS = np.array([2.165, -5.401, 0.102, -0.571, -0.147, -1.902])
 
 
 @dataclass(frozen=True)
@@ -83,15 +85,16 @@ def _depth_range(depth_mm: np.ndarray, focal_px: float) -> np.ndarray:
     return np.asarray((high - low) * (_JUMP_RAD * focal_px / size))
 
 
-def features(surface: trimesh.Trimesh, views: Views, present: np.ndarray, radius_mm: float) -> np.ndarray:
-    """Return what the regression is of, (F, 5): the first three but the constant are means over a face's surroundings.
+def features(surface: trimesh.Trimesh, views: Views, present: np.ndarray, layout: Layout) -> np.ndarray:
+    """Return what the regression is of, (F, 6): the first three but the constant are means over a face's surroundings.
 
-    present : (F,) bool, whether the run's own surface is there. radius_mm : unit of distances.
+    present : (F,) bool, whether the run's own surface is there. layout : its radius is the unit of distances.
     """
     jump = np.log(np.clip(views.jump, *_JUMPS))
     around = _smoothed(surface, np.column_stack([views.cosine, jump, present]))
-    radii = np.minimum(views.distance_mm / radius_mm, _MOST_RADII)
-    return np.column_stack([np.ones(len(radii)), around, radii])
+    radii = np.minimum(views.distance_mm / layout.radius_mm, _MOST_RADII)
+    in_cavity = present & (views.share > 0) & (layout.kind == "cavity")
+    return np.column_stack([np.ones(len(radii)), around, radii, in_cavity])
 
 
 def unseen_probability(of: np.ndarray) -> np.ndarray:
