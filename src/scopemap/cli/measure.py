@@ -69,15 +69,12 @@ def measure(
         _show(found, [_facts(one) for one in found], as_json)
         return
     frame = frame if second is None else lesions.frame_at(run, second)
-    what = lesions.Lesion(Path(lesion) if Path(lesion).exists() else np.array(_pixels(lesion, "--lesion")), frame)
-    given = None
-    if ends is not None or reference_mask is not None or reference_mm is not None:
-        pair = lesions.shaft_width(run, reference_mask) if reference_mask is not None else ends
-        at = frame if reference_frame is None else reference_frame
-        if at is None or pair is None:
-            raise typer.BadParameter("a reference needs its points or mask, and its frame", param_hint="--reference")
-        given = measuring.Known(at, np.array(pair), reference_mm)
-    measured = lesions.measure_lesion(run, what, given)
+    masks = Path(lesion) if Path(lesion).exists() else np.array(_pixels(lesion, "--lesion"))
+    pair = lesions.shaft_width(run, reference_mask) if reference_mask is not None else ends
+    given = None if pair is None else np.array(pair)
+    measured = lesions.measure_lesion(
+        run, masks, frame, reference=given, reference_frame=reference_frame, reference_mm=reference_mm
+    )
     if pictures is not None:
         lesions.write_outlines(run, measured.masks, pictures)
     facts = [_facts(one) for one in measured.measures]
