@@ -43,16 +43,21 @@ _OUTLINE_PX, _COMMON, _LEAST_FACING = 0.7, 0.5, 0.1
 _EDGE_PX, _LEAST_PX, _MOST_FRAMES = 2, 60, 60
 _IN_FRONT, _LEAST_LEFT = 0.1, 0.8
 _FIRST_ROW = 30  # of the drawn numbers, after those of the scale
-_OUTLINE_BGR = (0, 255, 255)
+_OUTLINE_BGR, _OUTLINE_POINTS = (0, 255, 255), 60
 
 
 @dataclass(frozen=True)
 class MeasuredLesion:
-    """What was measured of a lesion, what its scale rests on, and its masks (H, W) bool in the frames that count."""
+    """What was measured of a lesion.
+
+    scale : what its sizes rest on. masks : (H, W) bool in the frames that count. outline_mm : (N, 3), on the surface,
+    world, by the one of them that sees it best.
+    """
 
     measures: list[Measure]
     scale: str
     masks: dict[int, np.ndarray]
+    outline_mm: np.ndarray
 
 
 def measure_lesion(
@@ -89,7 +94,21 @@ def measure_lesion(
         unit = scale.unit if power == 1 else scale.square
         found.append(Measure.of(name, value / scale.divisor**power, draws, unit, scale.sizes))
     found.append(_height(views, found[0], scale))
-    return MeasuredLesion(found, scale.words, {index: shown[index] for index in views})
+    counted = {index: shown[index] for index in views}
+    sizes_px = np.array([mask.sum() for mask in counted.values()])
+    best = list(counted)[int((_facing(views) * sizes_px).argmax())]
+    return MeasuredLesion(found, scale.words, counted, _outline(run, best, counted[best]))
+
+
+def _outline(run: ExportedRun, index: int, mask: np.ndarray) -> np.ndarray:
+    """Return points (N, 3) of the surface, world mm, around what a mask (H, W) bool of a frame shows."""
+    contours = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    pixels = max(contours, key=len)[:, 0]
+    pixels = pixels[:: -(-len(pixels) // _OUTLINE_POINTS)]
+    pose = run.trajectory.T_world_camera[run.trajectory.indices == index][0]
+    depth_mm = render_mesh(_at(run, run.mesh, index), run.camera, pose).depth_mm[pixels[:, 1], pixels[:, 0]]
+    known = np.isfinite(depth_mm)
+    return transform(pose, run.camera.unproject(pixels[known]) * depth_mm[known, None])
 
 
 def _known(reference: np.ndarray | None, frame: int | None, length_mm: float | None) -> Known | None:

@@ -26,7 +26,7 @@ _LEAST_REFERENCE_PX = 10
 
 @dataclass(frozen=True)
 class Measure:
-    """What was measured, its value, and the ends of its 95 % interval. unit : mm, mm2, or times the reference.
+    """What was measured, its value, and the ends of its 95 % interval, NaN: unknown. unit : mm, mm2, or the reference.
 
     The value is infinite where the surface has a gap between the points.
     """
@@ -49,7 +49,7 @@ class Measure:
         value, low, high = (
             np.format_float_positional(float(f"{one:.3g}"), trim="-") for one in (self.value, self.low, self.high)
         )
-        return f"{self.what}: {value} {self.unit} ({low} to {high})"
+        return f"{self.what}: {value} {self.unit}" + (f" ({low} to {high})" if np.isfinite(self.low) else "")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scopemap.cli.options import AsJson
+from scopemap.cli.options import AsJson, check_output
 
 if TYPE_CHECKING:
     from scopemap.actions.measure import Measure
@@ -40,6 +40,10 @@ def measure(
     pictures: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Draw the lesion's outline in the frames that count.")
     ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the lesion for 3D Slicer, .mrk.json, or as a DICOM report, .dcm."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure on the surface between pixels of a frame, or a lesion in all frames, with intervals of 95 %.
@@ -50,7 +54,9 @@ def measure(
         raise typer.BadParameter("give either --points or --lesion")
     if reference and reference_mask is not None:
         raise typer.BadParameter("give either --reference or --reference-mask")
-    if points and (frame is None or second is not None or reference_mask or pictures or reference_frame is not None):
+    if points and (
+        frame is None or second is not None or reference_mask or pictures or export or reference_frame is not None
+    ):
         raise typer.BadParameter("--points needs --frame, and of the others takes --reference and --reference-mm alone")
     pixels = _pixels(points, "--points") if points else []
     if points and len(pixels) < 2:
@@ -62,6 +68,11 @@ def measure(
 
     from scopemap.actions import lesion as lesions
     from scopemap.actions import measure as measuring
+    from scopemap.actions.export.findings import FINDING_ENDINGS, write_findings
+    from scopemap.actions.export.markups import Finding
+
+    if export is not None:
+        check_output(export, FINDING_ENDINGS, overwrite=True)
 
     if frame is not None and points:
         known = None if ends is None else np.array(ends)
@@ -75,6 +86,8 @@ def measure(
     measured = lesions.measure_lesion(
         run, masks, frame, reference=given, reference_frame=reference_frame, reference_mm=reference_mm
     )
+    if export is not None:
+        write_findings(run, [Finding("lesion", measured.outline_mm, measured.measures)], measured.scale, export)
     if pictures is not None:
         lesions.write_outlines(run, measured.masks, pictures)
     facts = [_facts(one) for one in measured.measures]

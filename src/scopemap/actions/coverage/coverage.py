@@ -19,6 +19,8 @@ from scipy.spatial import cKDTree
 
 from scopemap.actions.coverage.layout import CLOCK_BINS, Layout, binned, column_of, layout_of
 from scopemap.actions.coverage.unseen import Views, features, unseen_probability, views_of
+from scopemap.actions.export.markups import Finding
+from scopemap.actions.measure import Measure
 from scopemap.errors import InputError, reporting
 from scopemap.fusion.watertight import SEEN_CELLS, closed_space
 from scopemap.io.run_folder import RunFolder
@@ -70,6 +72,11 @@ class BlindSpot:
     position_mm: tuple[float, float, float]
     frame: int
     time_s: float
+
+    def where(self, unit: str) -> str:
+        """Return its place and when the camera was nearest, in words; unit : of places along."""
+        hours = "all round" if self.clock is None else f"{round(self.clock) or 12} o'clock"
+        return f"at {self.along:.0f} {unit}, {hours}; camera nearest at {self.time_s:.1f} s (frame {self.frame})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,11 +156,22 @@ class Coverage:
         lines = [f"not seen: {_percent(self.total)} of {_three_digits(self.total.area)} {area} of {of}; {self.scale}"]
         lines += [f"  {part.start:.0f} to {part.end:.0f} {along}: {_percent(part)}" for part in self.segments]
         lines += [f"blind spots: {len(self.spots)}" + (", the largest:" if self.spots else "")]
-        for number, spot in enumerate(self.spots[:_SHOWN], 1):
-            where = "all round" if spot.clock is None else f"{round(spot.clock) or 12} o'clock"
-            when = f"camera nearest at {spot.time_s:.1f} s (frame {spot.frame})"
-            lines.append(f"  {number}. {_three_digits(spot.area)} {area} at {spot.along:.0f} {along}, {where}; {when}")
+        spots = enumerate(self.spots[:_SHOWN], 1)
+        lines += [f"  {number}. {_three_digits(spot.area)} {area} {spot.where(along)}" for number, spot in spots]
         return "\n".join(lines)
+
+    @property
+    def findings(self) -> list[Finding]:
+        """The blind spots, for `write_findings`."""
+        along, area = self.facts["along_unit"], f"{self.unit}2"
+        return [
+            Finding(
+                f"blind spot {number} {spot.where(along)}",
+                np.array([spot.position_mm]),
+                [Measure("area not seen", spot.area, np.nan, np.nan, area)],
+            )
+            for number, spot in enumerate(self.spots, 1)
+        ]
 
     def draw(self, file: Path) -> None:
         """Draw the map as an image; raises `InputError` where it cannot be written."""
