@@ -21,7 +21,6 @@ from scopemap.report.measured_surface import drawn, measure_errors, measured_dep
 
 _REFERENCE_ROW, _FIRST_ROW = 3, 9
 """Of the drawn numbers: 0 to 2 are what all share, then three for each point."""
-_LEAST_REFERENCE_PX = 10
 
 
 @dataclass(frozen=True)
@@ -144,8 +143,9 @@ def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
                 "distance, and millimetres where that is given, too"
             )
         return KnownScale(1.0, errors.scale, errors.scale / errors.focal, "mm", run.scale, errors.sizes)
-    if (far_px := float(np.linalg.norm(known.pixels[1] - known.pixels[0]))) < _LEAST_REFERENCE_PX:
-        raise InputError(f"the reference is {far_px:.1f} px long: {_LEAST_REFERENCE_PX} px are needed")
+    far_px, least_px = float(np.linalg.norm(known.pixels[1] - known.pixels[0])), errors.sizes["reference_px"]
+    if far_px < least_px:
+        raise InputError(f"the reference is {far_px:.1f} px long: {least_px} px are needed")
     picked = _picked(run, measured_mesh(run, known.frame), known.frame, _pose(run, known.frame), known.pixels)
     length = _straight(np.stack([point.position for point in picked.points]))
     draws = 1 / _relative(run, picked, errors, _straight, _REFERENCE_ROW)

@@ -32,7 +32,10 @@ def coverage(
     Writes coverage.json, map.csv, map.png and coverage.ply. Calibrated on synthetic colons; not for decisions
     about a patient.
     """
-    folder = out or run / "coverage"
+    from scopemap.report.page import PAGE, write_report
+    from scopemap.report.page_data import COVERAGE
+
+    folder = out or run / COVERAGE
     files = {name: folder / name for name in ("coverage.json", "map.csv", "map.png", "coverage.ply")}
     for file in files.values():
         options.check_output(file, (file.suffix,), overwrite)
@@ -53,6 +56,8 @@ def coverage(
     found.write_surface(files["coverage.ply"])
     if export is not None:
         write_findings(run, found.findings, found.scale, export)
+    if out is None and (run / PAGE).is_file():
+        write_report(run)
     if as_json:
         print_json(found.facts | {"out": str(folder)})
     elif not quiet:
