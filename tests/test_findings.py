@@ -12,11 +12,11 @@ from front_door import call, refused
 from test_lesion import RADIUS
 
 from scopemap.actions.export.findings import write_findings
-from scopemap.actions.export.markups import Finding
+from scopemap.actions.export.markups import SurfaceFinding
 from scopemap.actions.measure import Measure
 
 OUTLINE = "30,44 40,48 50,44 40,40"
-SPOT = Finding("blind spot 1", np.array([[1.0, 2, 3]]), [Measure("area not seen", 7.0, np.nan, np.nan, "unit2")])
+SPOT = SurfaceFinding("blind spot 1", np.array([[1.0, 2, 3]]), [Measure("area not seen", 7.0, np.nan, np.nan, "unit2")])
 
 
 @pytest.fixture(scope="module")

@@ -69,7 +69,7 @@ def measure(
     from scopemap.actions import lesion as lesions
     from scopemap.actions import measure as measuring
     from scopemap.actions.export.findings import FINDING_ENDINGS, write_findings
-    from scopemap.actions.export.markups import Finding
+    from scopemap.actions.export.markups import SurfaceFinding
 
     if export is not None:
         check_output(export, FINDING_ENDINGS, overwrite=True)
@@ -87,7 +87,7 @@ def measure(
         run, masks, frame, reference=given, reference_frame=reference_frame, reference_mm=reference_mm
     )
     if export is not None:
-        write_findings(run, [Finding("lesion", measured.outline_mm, measured.measures)], measured.scale, export)
+        write_findings(run, [SurfaceFinding("lesion", measured.outline_mm, measured.measures)], measured.scale, export)
     if pictures is not None:
         lesions.write_outlines(run, measured.masks, pictures)
     facts = [_facts(one) for one in measured.measures]

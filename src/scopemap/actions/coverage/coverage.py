@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from scopemap.actions.coverage.layout import CLOCK_BINS, Layout, binned, column_of, examined_space
 from scopemap.actions.coverage.unseen import Views, features, unseen_probability, views_of
-from scopemap.actions.export.markups import Finding
+from scopemap.actions.export.markups import SurfaceFinding
 from scopemap.actions.measure import Measure
 from scopemap.errors import InputError, reporting
 from scopemap.io.run_folder import RunFolder
@@ -159,11 +159,11 @@ class Coverage:
         return "\n".join(lines)
 
     @property
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[SurfaceFinding]:
         """The blind spots, for `write_findings`."""
         along, area = self.facts["along_unit"], f"{self.unit}2"
         return [
-            Finding(
+            SurfaceFinding(
                 f"blind spot {number} {spot.where(along)}",
                 np.array([spot.position_mm]),
                 [Measure("area not seen", spot.area, np.nan, np.nan, area)],

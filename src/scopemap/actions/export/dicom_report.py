@@ -14,7 +14,7 @@ import numpy as np
 
 from scopemap.actions.export.dicom_stl import dicom_stl
 from scopemap.actions.export.exported_run import ExportedRun
-from scopemap.actions.export.markups import Finding
+from scopemap.actions.export.markups import SurfaceFinding
 from scopemap.actions.measure import Measure
 from scopemap.errors import SettingsError
 
@@ -32,7 +32,7 @@ _ENDOSCOPY = ("423827005", "SCT", "Endoscopy")
 _ONLY_RESEARCH = "research software, not a medical device; intervals are of 95 %"
 
 
-def write_dicom_report(run: ExportedRun, findings: list[Finding], about_scale: str, file: Path) -> None:
+def write_dicom_report(run: ExportedRun, findings: list[SurfaceFinding], about_scale: str, file: Path) -> None:
     """Write findings with their sizes and intervals; about_scale : what these, and the points, rest on.
 
     Raises `SettingsError` where highdicom is not installed, `InputError` where the run has no surface.

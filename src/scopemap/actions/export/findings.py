@@ -6,13 +6,13 @@ from pathlib import Path
 
 from scopemap.actions.export.dicom_report import write_dicom_report
 from scopemap.actions.export.exported_run import read_exported
-from scopemap.actions.export.markups import Finding, markups_of, write_markups
+from scopemap.actions.export.markups import SurfaceFinding, markups_of, write_markups
 from scopemap.errors import reporting
 
 FINDING_ENDINGS = (".json", ".dcm")
 
 
-def write_findings(run: Path, findings: list[Finding], scale: str, file: Path) -> None:
+def write_findings(run: Path, findings: list[SurfaceFinding], scale: str, file: Path) -> None:
     """Write findings on the surface of a run as markups (.json), or as a DICOM report (.dcm), which needs highdicom.
 
     scale : what their sizes rest on. Raises `InputError` where the file cannot be written, `SettingsError` where

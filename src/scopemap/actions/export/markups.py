@@ -21,7 +21,7 @@ _SCHEMA = (
 
 
 @dataclass(frozen=True)
-class Finding:
+class SurfaceFinding:
     """Something on the surface of a run: its outline, or its place.
 
     points_mm : (N, 3) around it, or (1, 3), world. sizes : NaN for the ends of an interval that is not known.
@@ -58,7 +58,7 @@ def markup(kind: str, name: str, points_mm: dict[str, np.ndarray], about: str) -
     }
 
 
-def markups_of(findings: list[Finding], about: str) -> list[dict[str, Any]]:
+def markups_of(findings: list[SurfaceFinding], about: str) -> list[dict[str, Any]]:
     """Return a list of the places, and a closed curve of each outline; about : what sizes and points rest on."""
     places = {str(one): one.points_mm[0] for one in findings if len(one.points_mm) == 1}
     found = [markup("Fiducial", "findings", places, about)] if places else []
