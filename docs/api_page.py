@@ -71,8 +71,9 @@ def _of_name(name: str, found: Any) -> str:
 
 
 def _members(of: type) -> Iterator[tuple[str, Any]]:
-    """Yield the public methods and properties of a class, in the order of its source."""
-    for key, member in vars(of).items():
+    """Yield the public methods and properties of a class and of its bases here, in the order of their source."""
+    own = [kind for kind in (of, *of.__bases__) if kind.__module__.startswith("scopemap")]
+    for key, member in (item for kind in own for item in vars(kind).items()):
         plain = member.__func__ if isinstance(member, classmethod | staticmethod) else member
         if not key.startswith("_") and (inspect.isfunction(plain) or isinstance(plain, property | cached_property)):
             yield key, plain

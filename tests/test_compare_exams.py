@@ -19,6 +19,7 @@ from scopemap.frame import Frame
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import so3_exp
 from scopemap.io.depth_maps import DepthWriter
+from scopemap.io.run_folder import RunFolder
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.trajectory.frame_table import FrameTable
 
@@ -100,6 +101,14 @@ def test_a_spot_and_a_bump_are_the_changes(found: ExamComparison) -> None:
     assert bump.rise_mm == pytest.approx(RISE_MM, abs=0.6)
 
 
+def test_the_vertices_say_where_it_changed(runs: tuple[Path, Path], found: ExamComparison) -> None:
+    xy = np.asarray(RunFolder(runs[0]).mesh.vertices)[:, :2]
+    apart = np.min([np.linalg.norm(xy - middle, axis=1) for middle in (SPOT_MM, BUMP_MM)], axis=0)
+    assert (found.compared[apart < 0.4 * RADIUS_MM] == 2).all()
+    assert (found.compared[apart > 2 * RADIUS_MM] < 2).all()
+    assert set(np.unique(found.compared)) == {0, 1, 2}
+
+
 def test_what_only_one_saw(found: ExamComparison) -> None:
     # Of a plane of 120 mm the other covers 90 mm, and 4 mm around it are near.
     assert found.only_first == pytest.approx(1 - (98 / 120) ** 2, abs=0.03)
@@ -113,7 +122,9 @@ def test_the_same_examination_has_no_change(runs: tuple[Path, Path]) -> None:
 
 
 def test_the_command_writes_a_page(runs: tuple[Path, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert call("compare-exams", *runs, "--out", tmp_path / "out") == 0
+    film = tmp_path / "out.mp4"
+    assert call("compare-exams", *runs, "--out", tmp_path / "out", "--video", film) == 0
+    assert film.stat().st_size > 1000
     assert "2 places changed" in capfd.readouterr().out
     facts = json.loads((tmp_path / "out" / "changes.json").read_text())
     assert len(facts["changes"]) == 2

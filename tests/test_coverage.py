@@ -215,7 +215,12 @@ def test_the_command_writes_figures_map_and_picture(holed: Path, capfd: pytest.C
     picture = cv2.imread(str(holed / "coverage" / "map.png"))
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
     assert "exists" in refused(capfd, "coverage", holed)
-    assert call("coverage", holed, "--overwrite", "--json") == 0
+    spots = holed / "spots.mrk.json"
+    assert call("coverage", holed, "--overwrite", "--json", "--export", spots) == 0
+    [points] = json.loads(spots.read_text())["markups"]
+    assert [point["position"] for point in points["controlPoints"]] == [
+        one["position_mm"] for one in facts["blind_spots"]
+    ]
     assert json.loads(capfd.readouterr().out)["total"] == facts["total"]
 
 

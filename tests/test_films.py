@@ -10,8 +10,9 @@ import pytest
 from drawn_run import IN_RESULT, draw_run, wavering
 from front_door import call, refused
 
-from scopemap.actions.fly_through import smoothed_poses
+from scopemap.actions.fly_through import _centreline, _place_and_clock, smoothed_poses
 from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.io.run_folder import RunFolder
 from scopemap.report.films import write_turntable
 
 
@@ -27,7 +28,7 @@ def test_the_surface_is_seen_beside_the_video(tmp_path: Path, capfd: pytest.Capt
     assert call("view", run, "--video", film) == 0
     assert "out.mp4" in capfd.readouterr().out
     pictures, (height, width) = pictures_of(film), (6 * 64, 6 * 80)
-    assert [picture.shape for picture in pictures] == [(height + 30, 2 * width, 3)] * IN_RESULT
+    assert [picture.shape for picture in pictures] == [(height + 54, 2 * width, 3)] * IN_RESULT
     for picture in pictures:
         video, surface = picture[:height, :width], picture[:height, width:]
         assert np.corrcoef(video.ravel(), surface.ravel())[0, 1] > 0.85
@@ -40,6 +41,30 @@ def test_the_surface_is_seen_beside_the_video(tmp_path: Path, capfd: pytest.Capt
     (run / "frames" / "000004.jpg").unlink()
     assert "frame" in refused(capfd, "view", run, "--video", film)
     assert not film.exists()
+
+
+@pytest.mark.parametrize("colours", ["coverage", "confidence"])
+def test_a_painting_shines_through_half_with_a_legend(colours: str, tmp_path: Path) -> None:
+    run, films = draw_run(tmp_path / "run"), [tmp_path / "plain.mp4", tmp_path / "painted.mp4"]
+    assert call("view", run, "--video", films[0]) == 0
+    assert call("view", run, "--video", films[1], "--colours", colours) == 0
+    assert call("view", run, "--colours", colours) == 2
+    (height, width), pair = (6 * 64, 6 * 80), [pictures_of(film)[7] for film in films]
+    plain, painted = ((picture[:height, :width], picture[:height, width:], picture[height + 30 :]) for picture in pair)
+    assert np.abs(plain[0] - painted[0]).mean() < 4  # the video's side
+    assert np.abs(plain[1] - painted[1]).mean() > 20
+    assert np.ptp(painted[2], axis=(0, 1)).min() > 100  # the legend has colours
+
+
+def test_the_clock_is_that_of_the_tube_and_the_place_grows_along_it(tmp_path: Path) -> None:
+    line, first = _centreline(RunFolder(draw_run(tmp_path / "run"))) or pytest.fail("it is a tube")
+    (near, hours), (far, _) = (_place_and_clock(line, first, se3(np.eye(3), np.array([0, 0, z]))) for z in (20.0, 40.0))
+    assert far - near == pytest.approx(20, abs=2 * line.step_mm)
+    # The first camera is upright, and looks along the tube: y is down.
+    right = {"12": [0, -1], "3": [1, 0], "6": [0, 1], "9": [-1, 0]}
+    assert all(hours[hour] == pytest.approx(np.array(way), abs=0.2) for hour, way in right.items())
+    across = se3(so3_exp(np.array([0.0, np.pi / 2, 0.0])), np.array([0.0, 0.0, 30.0]))
+    assert _place_and_clock(line, first, across)[1] == {}
 
 
 def test_a_shaken_path_is_smoothed_and_a_straight_one_stays() -> None:

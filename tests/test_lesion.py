@@ -13,7 +13,7 @@ from drawn_run import CAMERA, FRAMES, draw_run, pose_of, tube
 from front_door import call, refused
 
 from scopemap.actions.export.exported_run import read_exported
-from scopemap.actions.lesion import Lesion, carried_masks, measure_lesion, shaft_width
+from scopemap.actions.lesion import carried_masks, measure_lesion, shaft_width
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.lesion_shape import LesionView, extents, view_shape
 from scopemap.geometry.rendering import render_mesh
@@ -167,7 +167,7 @@ def test_a_patch_of_the_tube(known: Path, tmp_path: Path, capfd: pytest.CaptureF
 
 def test_many_frames_do_not_make_an_interval_vanish(known: Path, tmp_path: Path) -> None:
     def half(frames: range) -> float:
-        one = measure_lesion(known, Lesion(masks_of(tmp_path / str(len(frames)), frames))).measures[0]
+        one = measure_lesion(known, masks_of(tmp_path / str(len(frames)), frames)).measures[0]
         return (one.high - one.low) / 2 / one.value
 
     assert half(range(12)) > 0.8 * half(range(2, 3)) > 0.1
@@ -208,7 +208,8 @@ def test_what_cannot_be_measured_is_refused(known: Path, tmp_path: Path, capfd: 
     assert "is no image" in said("--lesion", tmp_path / "text.png", "--frame", 0)
     assert "no mask" in said("--lesion", masks_of(tmp_path / "late", range(FRAMES - 1, FRAMES)))
     assert "sees the whole lesion" in said("--lesion", "0,0 79,0 79,63 0,63", "--frame", 0)
+    assert "needs its two points" in said("--lesion", outline, "--frame", 0, "--reference-mm", 3)
     for words in (["--frame", 0], ["--lesion", outline, "--points", outline], ["--points", outline]):
         assert call("measure", known, *words) == 2
-    for words in (["--reference-mm", 3], ["--reference", "1,1"], ["--reference", "1,1 2,2", "--reference-mask", "x"]):
+    for words in (["--reference", "1,1"], ["--reference", "1,1 2,2", "--reference-mask", "x"]):
         assert call("measure", known, "--lesion", outline, "--frame", 0, *words) == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shlex
 import shutil
 import time
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of, wavering
+from front_door import call
 
 from scopemap.actions.measure import measure
 from scopemap.errors import InputError
@@ -345,6 +347,22 @@ def test_points_on_the_surface_are_measured_where_a_frame_sees_the_reference_too
     assert opened.complaints == []
 
 
+def test_blind_spots_are_listed_and_shown(browser: Any, tmp_path: Path) -> None:
+    page = write_report(draw_run(tmp_path))[0]
+    assert not Opened(browser, page).page.locator("#coverage").is_visible()
+    assert call("coverage", tmp_path) == 0
+    facts, opened = json.loads((tmp_path / "coverage" / "coverage.json").read_text()), Opened(browser, page)
+    assert opened.text("#coverage-share").startswith(
+        f"Not seen: {100 * facts['total']['share']:.0f} % (90 % interval: "
+    )
+    assert opened.page.locator("#coverage-map").evaluate("image => image.naturalWidth") == 900
+    row, before = facts["blind_spots"][0]["frame"], opened.picture("#scene")
+    opened.page.locator("#spot-list button").first.click()
+    opened.wait("shown", str(row))
+    assert np.abs(opened.picture("#scene") - before).max() > 100  # a cross on the surface
+    assert opened.complaints == []
+
+
 def test_without_a_scale_a_reference_is_the_unit(browser: Any, tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
     # The full page, served, keeps what was measured beside the result.
@@ -355,6 +373,8 @@ def test_without_a_scale_a_reference_is_the_unit(browser: Any, tmp_path: Path) -
         opened.page.locator("#pick-distance").click()
         assert opened.text("#hand-note").startswith("Sizes are unknown: first choose Reference")
         opened.page.locator("#pick-reference").click()
+        click(opened, "#video", (0.3, 0.7), (0.36, 0.64))
+        assert re.search(r"reference is \d\.\d px long: 10 px are needed", opened.text("#hand-note"))
         click(opened, "#video", (0.3, 0.7), (0.4, 0.6))
         opened.page.locator("#pick-distance").click()
         click(opened, "#video", (0.3, 0.4), (0.62, 0.7))

@@ -7,8 +7,10 @@
 >>> result.mesh.export("surface.stl")
 >>> print(evaluate_poses(result.trajectory, read_trajectory("truth.txt"), "sim3")["ate_rmse_mm"])
 
-A result is opened again by `RunFolder("result")`; `Reconstructor` takes frames one at a time. The command line is
-`scopemap`; docs/ has the rest. Phantoms with exact truth: `from scopemap_bench import PhantomSpec, write_phantom`.
+A result is opened again by `RunFolder("result")`; both say what was not seen, how large something is and where another
+video is (`result.coverage()`, `measure`, `measure_lesion`, `locate`). `Reconstructor` takes frames one at a time. The
+command line is `scopemap`; docs/ has the rest. Phantoms with exact truth: `from scopemap_bench import PhantomSpec,
+write_phantom`.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from scopemap.config import Config
 from scopemap.errors import InputError
 from scopemap.fusion.mesh_files import save_mesh, save_mesh_over_time
 from scopemap.io.frame_choice import SkippedFrame
+from scopemap.io.result_actions import ResultActions
 from scopemap.notices import scale_words
 from scopemap.trajectory.frame_table import FrameTable
 from scopemap.trajectory.tissue_states import TissueStates
@@ -40,7 +41,7 @@ class StatedVerdict(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class Reconstruction(ResultActions):
     """The result of a run.
 
     Attributes
@@ -56,6 +57,7 @@ class Reconstruction:
     others : the other submaps, with their own frames, each with its own world and scale, since their relative pose is
         unknown; most frames first, as in maps/1, maps/2, ...
     states : of tissue that moves, and in which `mesh` is; None: it is taken to be at rest.
+    path : the folder that `reconstruct` wrote it to, which knows its depth, too; None: it is in memory alone.
     """
 
     camera: PinholeCamera
@@ -68,6 +70,7 @@ class Reconstruction:
     focal_sigma_px: float | None = None
     others: list[Reconstruction] = field(default_factory=list)
     states: TissueStates | None = None
+    path: Path | None = None
 
     def __repr__(self) -> str:
         if "line" in VIEWS:
@@ -100,6 +103,11 @@ class Reconstruction:
     def submaps(self) -> list[Reconstruction]:
         """Itself, and the other submaps."""
         return [self, *self.others]
+
+    def kept_in(self, folder: Path) -> Reconstruction:
+        """Return this result, whose folder is known now."""
+        others = [other.kept_in(folder / "maps" / str(number)) for number, other in enumerate(self.others, 1)]
+        return replace(self, others=others, path=folder)
 
     def mesh_at(self, index: int) -> trimesh.Trimesh:
         """Return the surface in the state of the frame with this number; `mesh` itself where tissue is at rest."""

@@ -76,7 +76,8 @@ class ExamComparison:
     S_first_second : of all pairs. residual : median distance of pairs after it, over the median depth. located : which
     share of the keyframes of the second was found. second : its surface in the world of the first. changes : the
     surest first. views : numbers of frames of both that show the same places. only_first,
-    only_second : shares of the surfaces' vertices that are far from the other one.
+    only_second : shares of the surfaces' vertices that are far from the other one. compared : (V,) of the vertices of
+    the first, 0 where they were not compared, 1 where nothing changed, 2 where something did.
     """
 
     S_first_second: Similarity
@@ -87,6 +88,7 @@ class ExamComparison:
     views: list[tuple[int, int]]
     only_first: float
     only_second: float
+    compared: np.ndarray
 
 
 class _Exam:
@@ -141,11 +143,12 @@ def compare_exams(
         raise InputError(f"the examinations cannot be compared: {apart}; {error}") from None
     moved = other.run.mesh.copy()
     moved.vertices = S.transform_points(np.asarray(moved.vertices))
-    changes = _changes(one, other, S, _differences(one, other.run.mesh, pairs))
+    changes, compared = _changes(one, other, S, _differences(one, other.run.mesh, pairs))
     tree = [cKDTree(np.asarray(mesh.vertices)) for mesh in (one.run.mesh, moved)]
     only = [float((tree[1 - n].query(tree[n].data)[0] > _APART * one.depth_mm).mean()) for n in (0, 1)]
     residual = float(np.median(distance)) / one.depth_mm
-    return ExamComparison(S, residual, located / len(other.poses), moved, changes, _views(one, other, S), *only)
+    views = _views(one, other, S)
+    return ExamComparison(S, residual, located / len(other.poses), moved, changes, views, only[0], only[1], compared)
 
 
 def _views(one: _Exam, other: _Exam, S: Similarity) -> list[tuple[int, int]]:
@@ -259,12 +262,13 @@ def _local_difference(values: np.ndarray, known: np.ndarray, width_px: float) ->
     return mean(values - mean(values, _AROUND_SHARE * values.shape[1]), width_px)
 
 
-def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> list[Change]:
-    """Return the changes, surest first."""
+def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> tuple[list[Change], np.ndarray]:
+    """Return the changes, surest first, and `compared` of `ExamComparison`."""
     compared = found.views >= _LEAST_VIEWS
+    state = compared.astype(np.uint8)
     sigmas = np.full((2, len(compared)), np.nan, np.float32)
     if not compared.any():
-        return []
+        return [], state
     for row, (values, least) in enumerate(zip((found.nearer, found.redness), _LEAST_SPREADS, strict=True)):
         spread = 1.4826 * np.median(np.abs(values[compared] - np.median(values[compared])))
         sigmas[row, compared] = (values[compared] - np.median(values[compared])) / max(spread, least)
@@ -281,6 +285,7 @@ def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> lis
         own = np.flatnonzero(label == number)
         if area[own].sum() < _LEAST_AREA_SHARE * one.depth_mm**2:
             continue
+        state[own] = 2
         place = np.average(np.asarray(mesh.vertices)[own], axis=0, weights=area[own])
         rows = np.abs(sigmas[:, own]).max(1) > _LEAST_SIGMAS
         what = " and ".join(name for name, is_one in zip(("shape", "colour"), rows, strict=True) if is_one)
@@ -289,4 +294,4 @@ def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> lis
         means = float((found.nearer * found.depth_mm)[peak]), float(found.redness[peak])
         facts = float(area[own].sum()), *means, float(sure[peak]), int(found.views[own].max())
         changes.append(Change(what, place, *facts, frames))
-    return sorted(changes, key=lambda change: -change.sigmas)
+    return sorted(changes, key=lambda change: -change.sigmas), state

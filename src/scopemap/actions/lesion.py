@@ -20,7 +20,7 @@ from scopemap.actions.export.exported_run import ExportedRun, read_exported, wri
 from scopemap.actions.measure import Known, KnownScale, Measure, known_scale
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.rectification import Rectifier
-from scopemap.errors import InputError, SettingsError
+from scopemap.errors import InputError, SettingsError, check_shape
 from scopemap.geometry.lesion_shape import LesionView, view_shape
 from scopemap.geometry.rendering import render_mesh, vertex_colours
 from scopemap.geometry.se3 import inverse, transform
@@ -43,40 +43,44 @@ _OUTLINE_PX, _COMMON, _LEAST_FACING = 0.7, 0.5, 0.1
 _EDGE_PX, _LEAST_PX, _MOST_FRAMES = 2, 60, 60
 _IN_FRONT, _LEAST_LEFT = 0.1, 0.8
 _FIRST_ROW = 30  # of the drawn numbers, after those of the scale
-_OUTLINE_BGR = (0, 255, 255)
-
-
-@dataclass(frozen=True)
-class Lesion:
-    """Where a lesion is: `masks`, a folder of pictures numbered as frames, or one picture, or corners (N, 2), px.
-
-    frame : that a picture or corners are of; of no matter for a folder. Pixels above 127 are the lesion's.
-    """
-
-    masks: Path | np.ndarray
-    frame: int | None = None
+_OUTLINE_BGR, _OUTLINE_POINTS = (0, 255, 255), 60
 
 
 @dataclass(frozen=True)
 class MeasuredLesion:
-    """What was measured of a lesion, what its scale rests on, and its masks (H, W) bool in the frames that count."""
+    """What was measured of a lesion.
+
+    scale : what its sizes rest on. masks : (H, W) bool in the frames that count. outline_mm : (N, 3), on the surface,
+    world, by the one of them that sees it best.
+    """
 
     measures: list[Measure]
     scale: str
     masks: dict[int, np.ndarray]
+    outline_mm: np.ndarray
 
 
-def measure_lesion(folder: Path, lesion: Lesion, known: Known | None = None) -> MeasuredLesion:
+def measure_lesion(
+    folder: Path,
+    masks: Path | np.ndarray,
+    frame: int | None = None,
+    *,
+    reference: np.ndarray | None = None,
+    reference_frame: int | None = None,
+    reference_mm: float | None = None,
+) -> MeasuredLesion:
     """Return the sizes of a lesion on the surface of a run.
 
-    known : what gives the scale; needed where the run does not know it. Raises `InputError` where it is missing, where
-    masks do not fit, and where no frame sees the whole lesion.
+    masks : a folder of pictures numbered as frames, white is lesion; or of one `frame` a picture, a mask (H, W) bool,
+    or the corners (N, 2) of an outline, px. reference : two pixels (2, 2) of `reference_frame`, by default `frame`,
+    whose straight distance is the unit of what is returned, or is `reference_mm`; needed where the run's scale is
+    unknown. Raises `InputError` where it is missing, where masks do not fit, and where no frame sees the whole lesion.
     """
     run = read_exported(folder)
-    scale = known_scale(run, known)
-    given = _given_masks(run, lesion)
-    masks = given if _is_folder(lesion) else carried_masks(run, *given.popitem())
-    views = {index: view for index, mask in masks.items() if (view := _view(run, index, mask)) is not None}
+    scale = known_scale(run, _known(reference, frame if reference_frame is None else reference_frame, reference_mm))
+    of_frames = _masks_of_folder(run, masks) if isinstance(masks, Path) and masks.is_dir() else None
+    shown = carried_masks(run, *_mask_of_frame(run, masks, frame)) if of_frames is None else of_frames
+    views = {index: view for index, mask in shown.items() if (view := _view(run, index, mask)) is not None}
     if not views:
         raise InputError(
             f"no frame of {folder} sees the whole lesion with its depth: it is cut off, smaller than {_LEAST_PX} "
@@ -84,38 +88,62 @@ def measure_lesion(folder: Path, lesion: Lesion, known: Known | None = None) -> 
         )
     found = []
     for row, (figure, (name, power, common)) in enumerate(_FIGURES.items(), start=_FIRST_ROW):
-        value, sigma = _combined(views, masks, figure, common)
+        value, sigma = _combined(views, shown, figure, common)
         own = np.exp(sigma * drawn(row, 1, scale.sizes["draws"])[0])
         draws = (own * scale.from_views) ** power
         unit = scale.unit if power == 1 else scale.square
         found.append(Measure.of(name, value / scale.divisor**power, draws, unit, scale.sizes))
     found.append(_height(views, found[0], scale))
-    return MeasuredLesion(found, scale.words, {index: masks[index] for index in views})
+    counted = {index: shown[index] for index in views}
+    sizes_px = np.array([mask.sum() for mask in counted.values()])
+    best = list(counted)[int((_facing(views) * sizes_px).argmax())]
+    return MeasuredLesion(found, scale.words, counted, _outline(run, best, counted[best]))
 
 
-def _is_folder(lesion: Lesion) -> bool:
-    return isinstance(lesion.masks, Path) and lesion.masks.is_dir()
+def _outline(run: ExportedRun, index: int, mask: np.ndarray) -> np.ndarray:
+    """Return points (N, 3) of the surface, world mm, around what a mask (H, W) bool of a frame shows."""
+    contours = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    pixels = max(contours, key=len)[:, 0]
+    pixels = pixels[:: -(-len(pixels) // _OUTLINE_POINTS)]
+    pose = run.trajectory.T_world_camera[run.trajectory.indices == index][0]
+    depth_mm = render_mesh(_at(run, run.mesh, index), run.camera, pose).depth_mm[pixels[:, 1], pixels[:, 0]]
+    known = np.isfinite(depth_mm)
+    return transform(pose, run.camera.unproject(pixels[known]) * depth_mm[known, None])
 
 
-def _given_masks(run: ExportedRun, lesion: Lesion) -> dict[int, np.ndarray]:
-    """Return the masks (H, W) bool as they were given, by the number of the frame."""
+def _known(reference: np.ndarray | None, frame: int | None, length_mm: float | None) -> Known | None:
+    if reference is None and length_mm is None:
+        return None
+    if reference is None or frame is None:
+        raise SettingsError("a reference needs its two points, or a mask, and its frame: give them")
+    return Known(frame, reference, length_mm)
+
+
+def _masks_of_folder(run: ExportedRun, folder: Path) -> dict[int, np.ndarray]:
+    """Return the masks (H, W) bool of the frames that have a pose, by the number of the frame."""
     tracked = set(run.trajectory.indices.tolist())
-    if isinstance(lesion.masks, Path) and _is_folder(lesion):
-        files = by_number(file for file in lesion.masks.iterdir() if not file.name.startswith("."))
-        masks = {index: _read_mask(run, file) for index, file in files.items() if index in tracked}
-        if not masks:
-            raise InputError(f"no mask in {lesion.masks} has the number of a frame of the result {run.path}")
-        return masks
-    if lesion.frame is None:
+    files = by_number(file for file in folder.iterdir() if not file.name.startswith("."))
+    masks = {index: _read_mask(run, file) for index, file in files.items() if index in tracked}
+    if not masks:
+        raise InputError(f"no mask in {folder} has the number of a frame of the result {run.path}")
+    return masks
+
+
+def _mask_of_frame(run: ExportedRun, mask: Path | np.ndarray, frame: int | None) -> tuple[int, np.ndarray]:
+    """Return a frame's number and its mask (H, W) bool, by a picture, a mask, or corners (N, 2)."""
+    if frame is None:
         raise SettingsError("one mask of a lesion, or corners, without the frame that they are of: give both")
-    if lesion.frame not in tracked:
-        raise InputError(f"frame {lesion.frame}, of which the lesion's mask is, has no pose in {run.path}")
-    if isinstance(lesion.masks, Path):
-        return {lesion.frame: _read_mask(run, lesion.masks)}
-    if len(lesion.masks) < 3:
-        raise SettingsError(f"the outline of a lesion has {len(lesion.masks)} corners: three or more are needed")
-    mask = np.zeros((run.camera.height, run.camera.width), np.uint8)
-    return {lesion.frame: cv2.fillPoly(mask, [np.rint(lesion.masks).astype(np.int32)], 1) > 0}
+    if frame not in run.trajectory.indices:
+        raise InputError(f"frame {frame}, of which the lesion's mask is, has no pose in {run.path}")
+    if isinstance(mask, Path):
+        return frame, _read_mask(run, mask)
+    size = run.camera.height, run.camera.width
+    if mask.dtype == bool:
+        check_shape("mask", mask, size)
+        return frame, mask
+    if len(mask) < 3:
+        raise SettingsError(f"the outline of a lesion has {len(mask)} corners: three or more are needed")
+    return frame, cv2.fillPoly(np.zeros(size, np.uint8), [np.rint(mask).astype(np.int32)], 1) > 0
 
 
 def _read_mask(run: ExportedRun, file: Path) -> np.ndarray:

@@ -157,11 +157,13 @@ def open_other(
     return open_sequence(path, camera=kept, dataset=dataset, frames=frames, settings=resized)
 
 
-def locate(folder: Path, sequence: FrameSequence, source: Path | None = None) -> Iterator[LocatedFrame]:
+def locate(folder: Path, sequence: FrameSequence | Path | str, source: Path | None = None) -> Iterator[LocatedFrame]:
     """Yield where each frame of a sequence is in the map of the result in a folder; raises as `PlaceMap` does.
 
-    Frames are masked by the result's settings. source : where the result's own input is now; else it is looked for.
+    Frames are masked by the result's settings. sequence : or the path of a video, for `open_other`. source : where the
+    result's own input is now; else it is looked for.
     """
+    sequence = open_other(folder, sequence) if isinstance(sequence, Path | str) else sequence
     places, settings = PlaceMap(folder, source), RunFolder(folder).config.mask.model_copy(update={"files": ""})
     mask = Masker(settings, create_masks(settings, sequence.rectifier, sequence.source.masks))
     return (places.locate(mask(frame)) for frame in sequence.frames())

@@ -21,12 +21,11 @@ from scopemap.report.measured_surface import drawn, measure_errors, measured_dep
 
 _REFERENCE_ROW, _FIRST_ROW = 3, 9
 """Of the drawn numbers: 0 to 2 are what all share, then three for each point."""
-_LEAST_REFERENCE_PX = 10
 
 
 @dataclass(frozen=True)
 class Measure:
-    """What was measured, its value, and the ends of its 95 % interval. unit : mm, mm2, or times the reference.
+    """What was measured, its value, and the ends of its 95 % interval, NaN: unknown. unit : mm, mm2, or the reference.
 
     The value is infinite where the surface has a gap between the points.
     """
@@ -49,7 +48,7 @@ class Measure:
         value, low, high = (
             np.format_float_positional(float(f"{one:.3g}"), trim="-") for one in (self.value, self.low, self.high)
         )
-        return f"{self.what}: {value} {self.unit} ({low} to {high})"
+        return f"{self.what}: {value} {self.unit}" + (f" ({low} to {high})" if np.isfinite(self.low) else "")
 
 
 @dataclass(frozen=True)
@@ -144,8 +143,9 @@ def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
                 "distance, and millimetres where that is given, too"
             )
         return KnownScale(1.0, errors.scale, errors.scale / errors.focal, "mm", run.scale, errors.sizes)
-    if (far_px := float(np.linalg.norm(known.pixels[1] - known.pixels[0]))) < _LEAST_REFERENCE_PX:
-        raise InputError(f"the reference is {far_px:.1f} px long: {_LEAST_REFERENCE_PX} px are needed")
+    far_px, least_px = float(np.linalg.norm(known.pixels[1] - known.pixels[0])), errors.sizes["reference_px"]
+    if far_px < least_px:
+        raise InputError(f"the reference is {far_px:.1f} px long: {least_px} px are needed")
     picked = _picked(run, measured_mesh(run, known.frame), known.frame, _pose(run, known.frame), known.pixels)
     length = _straight(np.stack([point.position for point in picked.points]))
     draws = 1 / _relative(run, picked, errors, _straight, _REFERENCE_ROW)

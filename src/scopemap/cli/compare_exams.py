@@ -19,6 +19,10 @@ def compare_exams(
     second_input: Annotated[
         Path | None, typer.Option("--second-input", metavar="INPUT", help="Where the second one's input is now.")
     ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a film along the first one's path, coloured by what changed."),
+    ] = None,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
@@ -27,10 +31,14 @@ def compare_exams(
     options.check_output(out / "compare.html", (".html",), overwrite)
     from scopemap.actions.compare_exams import compare_exams as compare
     from scopemap.actions.exams_page import PAGE, facts_of, summary, write_comparison
+    from scopemap.actions.fly_through import write_fly_through
+    from scopemap.actions.paintings import change_painting
     from scopemap.io.run_folder import RunFolder
 
     found = compare(first, second, source, second_input)
     write_comparison(found, first, second, out)
+    if video is not None:
+        write_fly_through(first, video, source, change_painting(first, found))
     run = RunFolder(first)
     if as_json:
         print_json(facts_of(found, "mm" if run.scale_known else "unit"))

@@ -17,6 +17,12 @@ def coverage(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where map and figures go; default: RESULT/coverage.")
     ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write the blind spots for 3D Slicer, .mrk.json, or as a DICOM report, .dcm."
+        ),
+    ] = None,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
@@ -26,14 +32,20 @@ def coverage(
     Writes coverage.json, map.csv, map.png and coverage.ply. Calibrated on synthetic colons; not for decisions
     about a patient.
     """
-    folder = out or run / "coverage"
+    from scopemap.report.page import PAGE, write_report
+    from scopemap.report.page_data import COVERAGE
+
+    folder = out or run / COVERAGE
     files = {name: folder / name for name in ("coverage.json", "map.csv", "map.png", "coverage.ply")}
     for file in files.values():
         options.check_output(file, (file.suffix,), overwrite)
     from scopemap.actions.coverage.coverage import coverage as covered
+    from scopemap.actions.export.findings import FINDING_ENDINGS, write_findings
     from scopemap.errors import reporting
     from scopemap.io.json_numbers import without_nan
 
+    if export is not None:
+        options.check_output(export, FINDING_ENDINGS, overwrite)
     found = covered(run)
     with reporting(f"cannot write to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -42,6 +54,10 @@ def coverage(
     found.map.write(files["map.csv"])
     found.draw(files["map.png"])
     found.write_surface(files["coverage.ply"])
+    if export is not None:
+        write_findings(run, found.findings, found.scale, export)
+    if out is None and (run / PAGE).is_file():
+        write_report(run)
     if as_json:
         print_json(found.facts | {"out": str(folder)})
     elif not quiet:

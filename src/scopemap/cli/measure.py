@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scopemap.cli.options import AsJson
+from scopemap.cli.options import AsJson, check_output
 
 if TYPE_CHECKING:
     from scopemap.actions.measure import Measure
@@ -40,6 +40,10 @@ def measure(
     pictures: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Draw the lesion's outline in the frames that count.")
     ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the lesion for 3D Slicer, .mrk.json, or as a DICOM report, .dcm."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure on the surface between pixels of a frame, or a lesion in all frames, with intervals of 95 %.
@@ -50,7 +54,9 @@ def measure(
         raise typer.BadParameter("give either --points or --lesion")
     if reference and reference_mask is not None:
         raise typer.BadParameter("give either --reference or --reference-mask")
-    if points and (frame is None or second is not None or reference_mask or pictures or reference_frame is not None):
+    if points and (
+        frame is None or second is not None or reference_mask or pictures or export or reference_frame is not None
+    ):
         raise typer.BadParameter("--points needs --frame, and of the others takes --reference and --reference-mm alone")
     pixels = _pixels(points, "--points") if points else []
     if points and len(pixels) < 2:
@@ -62,6 +68,11 @@ def measure(
 
     from scopemap.actions import lesion as lesions
     from scopemap.actions import measure as measuring
+    from scopemap.actions.export.findings import FINDING_ENDINGS, write_findings
+    from scopemap.actions.export.markups import SurfaceFinding
+
+    if export is not None:
+        check_output(export, FINDING_ENDINGS, overwrite=True)
 
     if frame is not None and points:
         known = None if ends is None else np.array(ends)
@@ -69,15 +80,14 @@ def measure(
         _show(found, [_facts(one) for one in found], as_json)
         return
     frame = frame if second is None else lesions.frame_at(run, second)
-    what = lesions.Lesion(Path(lesion) if Path(lesion).exists() else np.array(_pixels(lesion, "--lesion")), frame)
-    given = None
-    if ends is not None or reference_mask is not None or reference_mm is not None:
-        pair = lesions.shaft_width(run, reference_mask) if reference_mask is not None else ends
-        at = frame if reference_frame is None else reference_frame
-        if at is None or pair is None:
-            raise typer.BadParameter("a reference needs its points or mask, and its frame", param_hint="--reference")
-        given = measuring.Known(at, np.array(pair), reference_mm)
-    measured = lesions.measure_lesion(run, what, given)
+    masks = Path(lesion) if Path(lesion).exists() else np.array(_pixels(lesion, "--lesion"))
+    pair = lesions.shaft_width(run, reference_mask) if reference_mask is not None else ends
+    given = None if pair is None else np.array(pair)
+    measured = lesions.measure_lesion(
+        run, masks, frame, reference=given, reference_frame=reference_frame, reference_mm=reference_mm
+    )
+    if export is not None:
+        write_findings(run, [SurfaceFinding("lesion", measured.outline_mm, measured.measures)], measured.scale, export)
     if pictures is not None:
         lesions.write_outlines(run, measured.masks, pictures)
     facts = [_facts(one) for one in measured.measures]

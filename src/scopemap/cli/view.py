@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -23,6 +23,10 @@ def view(
         Path | None,
         typer.Option(metavar="FILE", help="Write a film of the video beside the surface along the path, and end."),
     ] = None,
+    colours: Annotated[
+        Literal["coverage", "confidence"] | None,
+        typer.Option(help="Colours of --video over the surface: what was not seen, or how sure the surface is."),
+    ] = None,
     source: InputNow = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
@@ -30,14 +34,18 @@ def view(
 
     Nothing is written but measurements.json, where you measure on the page and save.
     """
+    if colours is not None and video is None:
+        raise typer.BadParameter("they are those of --video", param_hint="--colours")
     if turntable is not None or video is not None:
         from scopemap.actions.fly_through import write_fly_through
+        from scopemap.actions.paintings import confidence_painting, coverage_painting
         from scopemap.report.films import write_turntable
 
         if turntable is not None:
             write_turntable(run, turntable)
         if video is not None:
-            write_fly_through(run, video, source)
+            paintings = {"coverage": coverage_painting, "confidence": confidence_painting}
+            write_fly_through(run, video, source, None if colours is None else paintings[colours](run))
         for film in filter(None, (turntable, video)):
             typer.echo(f"{film}: {film.stat().st_size / 1e6:.1f} MB")
         return

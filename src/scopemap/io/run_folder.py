@@ -15,6 +15,7 @@ from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import Config
 from scopemap.errors import InputError, reporting
 from scopemap.io.depth_maps import DepthReader
+from scopemap.io.result_actions import ResultActions
 from scopemap.notices import scale_words
 from scopemap.trajectory.formats.folders import read_frames, submap_folders
 from scopemap.trajectory.frame_table import FrameTable
@@ -24,8 +25,10 @@ _SCALE_NOT_STATED = "scale unknown (the run does not state it): sizes are a gues
 _MOST_PX = 1 << 15
 
 
-class RunFolder:
+class RunFolder(ResultActions):
     """A finished run in its folder `path`, or a submap in `maps/N`; parts are read when asked for, or `InputError`."""
+
+    path: Path
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)

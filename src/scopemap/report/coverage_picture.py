@@ -12,6 +12,7 @@ from scopemap.report.sheet import SOFT, Plot, Sheet, rgb_of
 
 COLOURS = {"seen": "#2a9d8f", "from afar or obliquely only": "#e9c46a", "probably not seen": "#9b2226"}
 """Of the classes 1, 2 and 3; seen is the paler the fewer frames see it."""
+OUTSIDE = "#bebebe"  # of a surface, where it was not examined
 _PALEST = 0.45
 _BOX, _SIZE = (60.0, 46.0, 820.0, 360.0), (900, 500)
 
@@ -48,10 +49,7 @@ def draw_coverage(
         sheet.dots(at, "#ffffff", 9)
         sheet.text((at[0, 0], at[0, 1]), str(number), 12, anchor="mm")
     sheet.headline(headline)
-    for number, (words, colour) in enumerate(COLOURS.items()):
-        x = left + 210 * number
-        sheet.fill((x, _SIZE[1] - 32, 16, 16), colour)
-        sheet.text((x + 22, _SIZE[1] - 31), words, 12)
+    sheet.legend((left, _SIZE[1] - 32), COLOURS, 210)
     sheet.text((left + 630, _SIZE[1] - 31), "paler: by few frames; white: not judged", 11, SOFT)
     with reporting(f"cannot write {file}"):
         sheet.save(file)

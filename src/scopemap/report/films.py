@@ -13,6 +13,7 @@ from scopemap.io.run_folder import RunFolder
 from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.mesh_figures import ESTIMATE_COLOUR, draw_path, mesh_picture, view_of
 from scopemap.report.scale_bar import draw_scale_bar
+from scopemap.report.sheet import Sheet
 from scopemap.report.shown_mesh import simplified
 
 _FRAMES, _FRAMES_PER_S, _PITCH_RAD = 180, 24, -0.35
@@ -62,4 +63,6 @@ def _turning(run: RunFolder, frames: int) -> Iterator[np.ndarray]:
         draw_path(picture, view, poses[:, :3, 3], ESTIMATE_COLOUR)
         if run.scale_known:
             draw_scale_bar(picture, view.camera.fx / (4 * float(radius)), " at its middle")
-        yield picture
+        sheet = Sheet.over(picture)
+        sheet.legend((8, 8), {"camera path, dot: start": ESTIMATE_COLOUR}, 0)
+        yield sheet.rgb

@@ -24,6 +24,8 @@ _OTHERS = {
     "depth": 0.05,
     "draws": 2000,
     "tail_percent": 2.5,
+    # A shorter reference errs by more than a pixel at each end allows.
+    "reference_px": 10,
 }
 
 
@@ -53,7 +55,7 @@ def measured_depth(run: RunFolder, frame: int) -> np.ndarray | None:
 
 
 def measure_errors(run: RunFolder) -> dict[str, Any]:
-    """Return standard deviations: shares of focal length, scale and depth, and of a pixel; and how many are drawn.
+    """Return standard deviations, shares of focal length, scale and depth, and of a pixel; and what else is needed.
 
     Raises `InputError` where provenance.json does not say what it should of camera and scale.
     """

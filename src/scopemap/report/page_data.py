@@ -30,7 +30,7 @@ from scopemap.trajectory.frame_table import NOT_USED
 from scopemap.trajectory.trajectory import Trajectory
 
 _MOST_MAPS = 8
-MEASUREMENTS = "measurements.json"
+MEASUREMENTS, COVERAGE = "measurements.json", "coverage"
 _MOST_BYTES = 7_500_000
 """Of pictures, before base64, which makes them a third longer."""
 _LOOKED_AT = 25
@@ -86,6 +86,7 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
         # Runs that share a page have fewer triangles than `measure` measures on.
         "measuring": share >= 1,
         "measurements": read_measurements(run.path),
+        "coverage": _coverage(run),
         "maps": _maps(run, meshes, camera, pictures),
         "losses": [
             {"row": loss.first, "when": loss.when, "frames": loss.frames, "cause": loss.cause, "advice": loss.advice}
@@ -134,6 +135,40 @@ def read_measurements(folder: Path) -> list[Any]:
         return checked_measurements((folder / MEASUREMENTS).read_bytes())
     except (OSError, ValueError):
         return []
+
+
+def _coverage(run: RunFolder) -> dict[str, Any] | None:
+    """Return what `scopemap coverage` wrote beside the result, and its map as PNG; None: nothing, or it is damaged."""
+    folder = run.path / COVERAGE
+    try:
+        found = _Covered.model_validate_json((folder / "coverage.json").read_bytes())
+        picture = (folder / "map.png").read_bytes()
+    except (OSError, ValidationError):
+        return None
+    return found.model_dump() | {"map": b64encode(picture).decode()}
+
+
+class _NotSeen(BaseModel):
+    share: float
+    low: float
+    high: float
+    area: float
+
+
+class _Spot(BaseModel):
+    area: float
+    along: float
+    clock: float | None
+    position_mm: tuple[float, float, float]
+    frame: int
+    time_s: float
+
+
+class _Covered(BaseModel):
+    kind: str
+    unit: str
+    total: _NotSeen
+    blind_spots: list[_Spot]
 
 
 class _Value(BaseModel):

@@ -85,6 +85,13 @@ class Sheet:
         rows = slice(max(round(top), 0), max(round(top + height), 0))
         self.rgb[rows, max(round(left), 0) : max(round(left + width), 0)] = rgb_of(colour)
 
+    def legend(self, place: tuple[float, float], colours: Mapping[str, str], step_px: float, size: int = 12) -> None:
+        """Draw what colours "#rrggbb" mean, by their words, in a row from a left upper corner."""
+        for number, (words, colour) in enumerate(colours.items()):
+            x, y = place[0] + step_px * number, place[1]
+            self.fill((x, y, size + 4, size + 4), colour)
+            self.text((x + size + 10, y + 1), words, size)
+
     def headline(self, words: str, size: int = 16) -> None:
         """Write a title in the middle of the sheet's top, in as many lines as its width asks for."""
         middle = self.rgb.shape[1] / 2

@@ -123,7 +123,7 @@ def _reconstruct(
             for owner in _kept_with(observers):
                 owner.save(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
-    return result
+    return result if out is None else result.kept_in(out)
 
 
 def _kept_with(observers: tuple[Observer, ...]) -> tuple[Any, ...]:

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from scopemap.actions.inputs import open_truth
-from scopemap.actions.lesion import Lesion, measure_lesion
+from scopemap.actions.lesion import measure_lesion
 from scopemap.actions.measure import Known, Measure
 from scopemap.errors import InputError
 from scopemap.frame import Frame
@@ -124,27 +124,28 @@ def measured(source: Path, run: Path) -> list[tuple[str, dict[str, dict[str, Res
         if known is None:
             measuring.print_row(name, f"{truth['diameter_mm']:.1f}", "not seen well", "")
             continue
-        ways = {"all masks": Lesion(folder), "one mask": Lesion(folder / f"{chosen:04d}.png", chosen)}
-        found = {way: results_of(_measure(run, lesion, known), truth) for way, lesion in ways.items()}
-        refused = _refused(run, ways["all masks"])
+        ways = {"all masks": (folder, None), "one mask": (folder / f"{chosen:04d}.png", chosen)}
+        found = {way: results_of(_measure(run, *lesion, known), truth) for way, lesion in ways.items()}
+        refused = _refused(run, folder)
         cells = [_cell(results.get("largest diameter")) for results in found.values()]
         measuring.print_row(name, f"{truth['diameter_mm']:.1f}", *cells, "refused" if refused else "NOT REFUSED")
         rows.append((name, found))
     return rows
 
 
-def _measure(run: Path, lesion: Lesion, known: Known | None) -> list[Measure]:
+def _measure(run: Path, masks: Path, frame: int | None, known: Known) -> list[Measure]:
+    reference = {"reference": known.pixels, "reference_frame": known.frame, "reference_mm": known.length_mm}
     try:
-        return measure_lesion(run, lesion, known).measures
+        return measure_lesion(run, masks, frame, **reference).measures  # type: ignore[arg-type]
     except InputError as refusal:
         print(refusal)
         return []
 
 
-def _refused(run: Path, lesion: Lesion) -> bool:
+def _refused(run: Path, masks: Path) -> bool:
     """Return whether nothing is said without a reference."""
     try:
-        measure_lesion(run, lesion)
+        measure_lesion(run, masks)
     except InputError:
         return True
     return False

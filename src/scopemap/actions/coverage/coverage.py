@@ -17,12 +17,13 @@ import trimesh
 from scipy.ndimage import gaussian_filter, label
 from scipy.spatial import cKDTree
 
-from scopemap.actions.coverage.layout import CLOCK_BINS, Layout, binned, column_of, layout_of
+from scopemap.actions.coverage.layout import CLOCK_BINS, Layout, binned, column_of, examined_space
 from scopemap.actions.coverage.unseen import Views, features, unseen_probability, views_of
+from scopemap.actions.export.markups import SurfaceFinding
+from scopemap.actions.measure import Measure
 from scopemap.errors import InputError, reporting
-from scopemap.fusion.watertight import SEEN_CELLS, closed_space
 from scopemap.io.run_folder import RunFolder
-from scopemap.report.coverage_picture import COLOURS, draw_coverage
+from scopemap.report.coverage_picture import COLOURS, OUTSIDE, draw_coverage
 from scopemap.report.sheet import rgb_of
 from scopemap.report.verdict import verdict
 from scopemap.trajectory.frame_table import FrameTable
@@ -41,7 +42,6 @@ _SMOOTHING_BINS = 0.7
 _SEGMENT_RADII, _SEGMENT_DEG = 2.0, 20.0
 _LEAST_SPOT_RADII = 0.25  # square root of the smallest area listed
 _SHOWN = 10
-_OUTSIDE_GREY = 190
 _ALL_ROUND = 0.35  # length of the mean direction below which a blind spot is all round
 
 
@@ -70,6 +70,11 @@ class BlindSpot:
     position_mm: tuple[float, float, float]
     frame: int
     time_s: float
+
+    def where(self, unit: str) -> str:
+        """Return its place and when the camera was nearest, in words; unit : of places along."""
+        hours = "all round" if self.clock is None else f"{round(self.clock) or 12} o'clock"
+        return f"at {self.along:.0f} {unit}, {hours}; camera nearest at {self.time_s:.1f} s (frame {self.frame})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,11 +154,22 @@ class Coverage:
         lines = [f"not seen: {_percent(self.total)} of {_three_digits(self.total.area)} {area} of {of}; {self.scale}"]
         lines += [f"  {part.start:.0f} to {part.end:.0f} {along}: {_percent(part)}" for part in self.segments]
         lines += [f"blind spots: {len(self.spots)}" + (", the largest:" if self.spots else "")]
-        for number, spot in enumerate(self.spots[:_SHOWN], 1):
-            where = "all round" if spot.clock is None else f"{round(spot.clock) or 12} o'clock"
-            when = f"camera nearest at {spot.time_s:.1f} s (frame {spot.frame})"
-            lines.append(f"  {number}. {_three_digits(spot.area)} {area} at {spot.along:.0f} {along}, {where}; {when}")
+        spots = enumerate(self.spots[:_SHOWN], 1)
+        lines += [f"  {number}. {_three_digits(spot.area)} {area} {spot.where(along)}" for number, spot in spots]
         return "\n".join(lines)
+
+    @property
+    def findings(self) -> list[SurfaceFinding]:
+        """The blind spots, for `write_findings`."""
+        along, area = self.facts["along_unit"], f"{self.unit}2"
+        return [
+            SurfaceFinding(
+                f"blind spot {number} {spot.where(along)}",
+                np.array([spot.position_mm]),
+                [Measure("area not seen", spot.area, np.nan, np.nan, area)],
+            )
+            for number, spot in enumerate(self.spots, 1)
+        ]
 
     def draw(self, file: Path) -> None:
         """Draw the map as an image; raises `InputError` where it cannot be written."""
@@ -163,14 +179,18 @@ class Coverage:
         title = f"not seen: {_percent(self.total)}, estimated"
         draw_coverage(self.map.classes, self.map.frames, ends, label, spots, title, file)
 
-    def write_surface(self, file: Path) -> None:
-        """Write the closed surface in the map's colours, grey outside of what was examined, as PLY; `InputError`."""
+    @property
+    def painted(self) -> trimesh.Trimesh:
+        """The closed surface, its faces in the map's colours, grey outside of what was examined."""
         seen, _, hidden = map(rgb_of, COLOURS.values())
-        colours = np.full((len(self.unseen), 3), _OUTSIDE_GREY, np.uint8)
+        colours = np.full((len(self.unseen), 3), rgb_of(OUTSIDE), np.uint8)
         colours[self.unseen <= BLIND], colours[self.unseen > BLIND] = seen, hidden
-        faces = trimesh.Trimesh(self.surface.vertices, self.surface.faces, face_colors=colours, process=False)
+        return trimesh.Trimesh(self.surface.vertices, self.surface.faces, face_colors=colours, process=False)
+
+    def write_surface(self, file: Path) -> None:
+        """Write the painted surface as PLY; raises `InputError` where that fails."""
         with reporting(f"cannot write {file}"):
-            faces.export(file)
+            self.painted.export(file)
 
 
 def coverage(folder: Path) -> Coverage:
@@ -180,28 +200,16 @@ def coverage(folder: Path) -> Coverage:
     usable", and where no part of the space was seen enough.
     """
     run = _checked(folder)
-    space = closed_space(run.mesh, run.config.fusion.voxel_mm or 0.0)
-    surface = trimesh.Trimesh(*space.surface(), process=False)
-    tracked = run.frames.only(run.frames.tracked)
-    layout = layout_of(space, np.asarray(run.mesh.vertices), tracked["T_world_camera"])
-    views = views_of(run, surface)
-    present = cKDTree(run.mesh.vertices).query(surface.triangles_center)[0] <= SEEN_CELLS * space.cell_mm
-    known = features(surface, views, present, layout)
-    row, hours, wall = layout.place(surface.triangles_center, surface.face_normals)
-    area = surface.area_faces * (wall | present)
-    inside = layout.examined(*(binned(row, hours, weights, layout.rows) for weights in (area, area * present)))
-    if not inside.any():
-        raise InputError(f"{folder}: no part of the space was seen enough to say what was not")
-    rows = np.flatnonzero(inside.any(1))
-    first = int(rows[0]) if layout.kind == "lumen" else 0
-    inside = inside[first : rows[-1] + 1]
-    row = row - first
-    counted = np.flatnonzero((row >= 0) & (row < len(inside)) & (area > 0))
+    space = examined_space(run)
+    surface, layout, row, hours, inside = space.surface, space.layout, space.row, space.hours, space.inside
+    tracked, views = run.frames.only(run.frames.tracked), views_of(run, surface)
+    known = features(surface, views, space.present, layout)
+    counted = np.flatnonzero((row >= 0) & (row < len(inside)) & (space.area > 0))
     counted = counted[inside[row[counted], column_of(hours[counted])]]
-    unseen = np.full(len(area), np.nan)
+    unseen = np.full(len(row), np.nan)
     unseen[counted] = unseen_probability(known[counted])
-    parts = area * (1 - unseen), HIDDEN_AREA[layout.kind] * area * unseen
-    faces = _Faces(*(values[counted] for values in (surface.triangles_center, row, hours, area, *parts)))
+    parts = space.area * (1 - unseen), HIDDEN_AREA[layout.kind] * space.area * unseen
+    faces = _Faces(*(values[counted] for values in (surface.triangles_center, row, hours, space.area, *parts)))
     chart = _chart(faces, inside, views, counted, layout)
     spots = _spots(chart, faces, tracked, layout)
     every = max(1, round((_SEGMENT_RADII * layout.radius_mm if layout.kind == "lumen" else _SEGMENT_DEG) / layout.step))
@@ -210,7 +218,7 @@ def coverage(folder: Path) -> Coverage:
     shares = [_share(faces, start, end, step, odds, _NOTHING_HIDDEN) for start, end in pairwise(ends)]
     total = _share(faces, 0, len(inside), layout.step, ODDS[layout.kind])
     unit = "mm" if run.scale_known else "unit"
-    return Coverage(unit, run.scale, total, shares, spots, chart, surface, unseen, known, layout, first)
+    return Coverage(unit, run.scale, total, shares, spots, chart, surface, unseen, known, layout, space.first)
 
 
 def _percent(share: Share) -> str:

@@ -1,4 +1,4 @@
-"""Where points of an examined space are on its map: along the centreline of a lumen, or by directions in a cavity."""
+"""The examined part of a space, and where its points are on the map: along a centreline, or by directions."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
 
-from scopemap.fusion.watertight import ClosedSpace
+from scopemap.errors import InputError
+from scopemap.fusion.watertight import SEEN_CELLS, ClosedSpace, closed_space
 from scopemap.geometry.centreline import Centreline, centreline, clock
+from scopemap.io.run_folder import RunFolder
 
 CLOCK_BINS = 36
 LUMEN_RADII = 3.0
@@ -87,6 +91,41 @@ class Cavity:
 
 
 Layout = Lumen | Cavity
+
+
+@dataclass(frozen=True, eq=False)
+class ExaminedSpace:
+    """The closed surface of a run and the part of it that was examined.
+
+    present : (F,) whether the run's own surface is at a face. area : (F,) that counts, 0 of what is not the wall. row,
+    hours : (F,) place of the faces, rows from that where the examined part begins. inside : (S, 36) bins of that part.
+    first : its first row of the layout.
+    """
+
+    surface: trimesh.Trimesh
+    present: np.ndarray
+    area: np.ndarray
+    layout: Layout
+    row: np.ndarray
+    hours: np.ndarray
+    inside: np.ndarray
+    first: int
+
+
+def examined_space(run: RunFolder) -> ExaminedSpace:
+    """Return what of the space of a run was examined; raises `InputError` where nothing was seen enough."""
+    space = closed_space(run.mesh, run.config.fusion.voxel_mm or 0.0)
+    surface = trimesh.Trimesh(*space.surface(), process=False)
+    layout = layout_of(space, np.asarray(run.mesh.vertices), run.frames.only(run.frames.tracked)["T_world_camera"])
+    present = cKDTree(run.mesh.vertices).query(surface.triangles_center)[0] <= SEEN_CELLS * space.cell_mm
+    row, hours, wall = layout.place(surface.triangles_center, surface.face_normals)
+    area = surface.area_faces * (wall | present)
+    inside = layout.examined(*(binned(row, hours, weights, layout.rows) for weights in (area, area * present)))
+    if not inside.any():
+        raise InputError(f"{run.path}: no part of the space was seen enough to say what was not")
+    rows = np.flatnonzero(inside.any(1))
+    first = int(rows[0]) if layout.kind == "lumen" else 0
+    return ExaminedSpace(surface, present, area, layout, row - first, hours, inside[first : rows[-1] + 1], first)
 
 
 def layout_of(space: ClosedSpace, points_mm: np.ndarray, poses: np.ndarray) -> Layout:

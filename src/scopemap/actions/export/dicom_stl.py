@@ -20,7 +20,14 @@ _NOBODY = "no name, number or date was copied from the input; research software,
 
 
 def write_dicom_stl(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> None:
-    """Write the surface as a binary STL in a DICOM file: anonymous, and without a date.
+    """Write the surface as a binary STL in a DICOM file; raises as `dicom_stl`."""
+    stream = BytesIO()
+    dicom_stl(run, unit, axes).save_as(stream, enforce_file_format=True)
+    file.write_bytes(stream.getvalue())
+
+
+def dicom_stl(run: ExportedRun, unit: Unit, axes: Axes) -> Any:
+    """Return the surface as a binary STL in a data set of pydicom: anonymous, and without a date.
 
     The unit of a surface of unknown scale is "no units", so that no viewer measures in it. Raises `SettingsError`
     where pydicom is not installed, `InputError` where the run has no surface.
@@ -37,9 +44,7 @@ def write_dicom_stl(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> Non
     data.EncapsulatedDocument = content + b"\0" * (len(content) % 2)
     data.EncapsulatedDocumentLength = len(content)
     data.file_meta.MediaStorageSOPInstanceUID = data.SOPInstanceUID
-    stream = BytesIO()
-    data.save_as(stream, enforce_file_format=True)
-    file.write_bytes(stream.getvalue())
+    return data
 
 
 def _dataset(run: ExportedRun, unit: tuple[str, str]) -> Any:

@@ -9,7 +9,6 @@ seen from the feet by an upright camera that looks towards the head (x to the le
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +16,7 @@ import numpy as np
 import trimesh
 
 from scopemap.actions.export.exported_run import ExportedRun
+from scopemap.actions.export.markups import markup, write_markups
 from scopemap.errors import InputError
 from scopemap.fusion.mesh_files import ply_bytes, save_mesh
 from scopemap.geometry.rendering import vertex_colours
@@ -37,10 +37,6 @@ _AXES_IN_WORDS = {
     "gltf": "axes: glTF (x right, y up, z backward)",
 }
 _STL_HEADER_BYTES = 80
-_MARKUPS_SCHEMA = (
-    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"
-    "markups-schema-v1.0.3.json#"
-)
 
 
 def write_surface(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> None:
@@ -92,22 +88,8 @@ def write_slicer(run: ExportedRun, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_surface(run, folder / "surface.ply", "mm", "lps")
     positions = run.trajectory.positions_mm @ _R_FILE_WORLD["lps"].T
-    points = [
-        {"id": str(number), "label": f"frame {index}", "position": position.tolist(), "positionStatus": "defined"}
-        for number, (index, position) in enumerate(zip(run.trajectory.indices, positions, strict=True), start=1)
-    ]
-    curve = {
-        "type": "Curve",
-        "name": "camera path",
-        "description": run.scale,
-        "coordinateSystem": "LPS",
-        "coordinateUnits": "mm",
-        "locked": True,
-        "controlPoints": points,
-        "display": {"visibility": True, "pointLabelsVisibility": False},
-    }
-    document = {"@schema": _MARKUPS_SCHEMA, "markups": [curve]}
-    (folder / "path.mrk.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    points = {f"frame {index}": at for index, at in zip(run.trajectory.indices, positions, strict=True)}
+    write_markups([markup("Curve", "camera path", points, run.scale)], folder / "path.mrk.json")
 
 
 def _about(run: ExportedRun, unit: Unit, axes: Axes) -> list[str]:

@@ -55,6 +55,7 @@ async function finishPicks() {
     const [picture, pixels, known] = seenTogether(picks, mode === "reference" ? null : reference);
     const frame = await measuredFrame(picture), points = picks.map(({ at }) => at);
     if (mode === "reference") {
+      checkReference(pixels, frame.map.errors);
       hand.reference = { picture, pixels, at: points };
       tell(`The reference is set in frame ${frame.name}. Now choose Distance or Area, and measure where a frame sees it, too.`);
     } else {
@@ -100,12 +101,15 @@ function pickOnSurface(event) {
 
 const outlineOf = (points) => (points.length > 2 ? [...points, points[0]] : points);
 
+// A cross at a point, as lines of the scene.
+const crossAt = (at, size, ink) => [[1, 1, 0], [1, -1, 0], [0, 1, 1]].map((way) => ({ from: add(at, scaled(way, size)), to: add(at, scaled(way, -size)), colour: ink }));
+
 // What was picked and measured, as lines of the scene.
 function handLines() {
   const number = (one) => (one.folder === "." ? 0 : Number(one.folder.split("/")[1])), ink = colour("--hand");
   const shapes = [hand.picks.map(({ at }) => at), ...hand.list.filter((one) => number(one) === shown).map((one) => outlineOf(one.world))];
   const size = 0.012 * run.balls[shown].radius;
-  const crosses = shapes.flat().flatMap((at) => [[1, 1, 0], [1, -1, 0], [0, 1, 1]].map((way) => ({ from: add(at, scaled(way, size)), to: add(at, scaled(way, -size)), colour: ink })));
+  const crosses = shapes.flat().flatMap((at) => crossAt(at, size, ink));
   return [...crosses, ...shapes.flatMap((points) => points.slice(1).map((to, k) => ({ from: points[k], to, colour: ink })))];
 }
 

@@ -189,6 +189,12 @@ function percentile(values, percent) {
   return sorted[k] + (next - sorted[k]) * (place - k);
 }
 
+// Refuse a reference whose two pixels are so near that errors of picking them would decide.
+function checkReference([[a, b], [c, d]], errors) {
+  const px = Math.hypot(c - a, d - b);
+  if (px < errors.reference_px) throw new Error(`the reference is ${px.toFixed(1)} px long: ${errors.reference_px} px are needed`);
+}
+
 // What was measured in a frame {camera, pose, map, name, depthAt}: [{what, value, low, high, unit}]; refusals are thrown.
 function measured(frame, pixels, reference = null, referenceMm = null) {
   const { camera, pose, map } = frame, surface = surfaceOf(map, frame.row), errors = map.errors;
@@ -203,9 +209,9 @@ function measured(frame, pixels, reference = null, referenceMm = null) {
   const points = picked(pixels);
   let unit = "mm", divisor = 1, draws = drawn(2, errors.draws).map((z) => Math.exp(errors.scale * z));
   if (reference) {
+    checkReference(reference, errors);
     const known = picked(reference);
     divisor = straight(known.map((point) => point.at));
-    if (!(divisor > 0)) throw new Error("the reference's two points are the same");
     draws = relativeTo(camera, known, errors, straight, 3).map((one) => 1 / one);
     if (!referenceMm) unit = "times the reference";
     divisor /= referenceMm || 1;

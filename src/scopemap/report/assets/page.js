@@ -86,7 +86,7 @@ function drawScene() {
   run.maps[shown].row = row;
   view.draw(run.maps[shown], from, {
     near, far: distance + 3 * radius, fieldOfView: from.fieldOfView, lines: [...pathLines(), ...handLines()],
-    frustum: corners && !from.through ? frustumLines(pose, corners) : [], corners: from.through ? null : corners,
+    frustum: [...(corners && !from.through ? frustumLines(pose, corners) : []), ...spotLines()], corners: from.through ? null : corners,
   });
   root.dataset.frustum = pose ? pose.t.map((value) => value.toFixed(4)).join(" ") : "";
 }
@@ -202,6 +202,28 @@ function writeLosses() {
   put("more-losses", left ? `And ${left} shorter ones: see frames.csv.` : "");
 }
 
+// Share not seen, its map, and the blind spots, as `scopemap coverage` wrote them beside the result.
+function writeCoverage() {
+  const found = run.coverage, percent = (share) => `${Math.round(100 * share)} %`;
+  element("coverage").hidden = !found;
+  if (!found) return;
+  const { share, low, high, area } = found.total, lumen = found.kind === "lumen", digits = (value) => Number(value.toPrecision(3));
+  put("coverage-share", `Not seen: ${percent(share)} (90 % interval: ${percent(low)} to ${percent(high)}) of ${digits(area)} ${found.unit}² of a ${found.kind}.`);
+  element("coverage-map").src = `data:image/png;base64,${found.map}`;
+  element("spot-list").replaceChildren(...found.blind_spots.map((spot, n) => {
+    const item = document.createElement("li"), button = document.createElement("button");
+    const where = spot.clock === null ? "all round" : `${Math.round(spot.clock) || 12} o'clock`;
+    button.type = "button";
+    button.textContent = `${n + 1}. ${digits(spot.area)} ${found.unit}² at ${Math.round(spot.along)} ${lumen ? found.unit : "degrees"}, ${where}: second ${spot.time_s.toFixed(1)}`;
+    button.addEventListener("click", () => ((run.spot = spot.position_mm), setRow(run.indices.indexOf(spot.frame)), element("surface").scrollIntoView({ block: "nearest" })));
+    item.append(button);
+    return item;
+  }));
+}
+
+// The blind spot that was chosen, a cross in front of the surface of the result.
+const spotLines = () => (run.spot && shown === 0 ? crossAt(run.spot, 0.08 * run.balls[0].radius, colour("--hand")) : []);
+
 function open(number) {
   run = prepared(data.runs[number]);
   run.licences = data.licences;
@@ -213,6 +235,7 @@ function open(number) {
   writeDetails(run);
   writeSubmaps();
   writeLosses();
+  writeCoverage();
   element("truth-key").hidden = !run.truth;
   writeScales();
   if (data.runs.length === 1 && !data.served) document.querySelectorAll("a[data-file]").forEach((link) => (link.href = link.textContent));

@@ -1,0 +1,48 @@
+"""Surfaces in colours that mean something, for films: how sure they are, what was not seen of them, what changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from scopemap.actions.compare_exams import ExamComparison
+from scopemap.actions.coverage.coverage import coverage
+from scopemap.actions.fly_through import Painting
+from scopemap.errors import InputError
+from scopemap.io.run_folder import RunFolder
+from scopemap.report.coverage_picture import COLOURS, OUTSIDE
+from scopemap.report.sheet import rgb_of
+
+_LEVELS = 0.0, 0.25, 0.5, 0.75, 1.0
+_COMPARED = {"not compared": OUTSIDE, "as it was": "#2a9d8f", "changed": "#9b2226"}
+
+
+def coverage_painting(folder: Path) -> Painting:
+    """Return the closed surface of a run by whether a frame saw it; raises as `coverage`."""
+    seen, _, hidden = COLOURS
+    legend = {name: COLOURS[name] for name in (seen, hidden)} | {"not examined": OUTSIDE}
+    return Painting(coverage(folder).painted, legend)
+
+
+def confidence_painting(folder: Path) -> Painting:
+    """Return the surface of a run by the confidence of its vertices; `InputError` where the run does not know it."""
+    mesh = RunFolder(folder).checked().mesh
+    if "confidence" not in mesh.vertex_attributes:
+        raise InputError(f"{folder}: the confidence of its surface is not known")
+    colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
+    of = np.round(255 * np.clip(mesh.vertex_attributes["confidence"], 0, 1)).astype(int)
+    legend = {f"confidence {level:g}": "#" + bytes(colours[round(255 * level)]).hex() for level in _LEVELS}
+    return Painting(_painted(mesh, colours[of]), legend)
+
+
+def change_painting(first: Path, found: ExamComparison) -> Painting:
+    """Return the surface of the first of two examinations by where the second differs from it."""
+    colours = np.array([rgb_of(colour) for colour in _COMPARED.values()], np.uint8)
+    return Painting(_painted(RunFolder(first).mesh, colours[found.compared]), _COMPARED)
+
+
+def _painted(mesh: trimesh.Trimesh, colours: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
