@@ -37,7 +37,7 @@ def _rosenbrock() -> Problem[np.ndarray]:
 @settings(max_examples=25, deadline=None)
 def test_step_stays_in_the_ball_and_lowers_the_model(seed: int, radius: float) -> None:
     model = _model(seed)
-    step = dogleg_step(model, radius)
+    step = dogleg_step(model, model.gauss_newton_step(), radius)
     assert np.linalg.norm(step) <= radius * (1 + 1e-9)
     assert _value(model, step) < model.cost
 
@@ -48,12 +48,14 @@ def test_three_cases(seed: int) -> None:
     newton = model.gauss_newton_step()
     np.testing.assert_allclose(model.hessian @ newton, -model.gradient, rtol=1e-8, atol=1e-8)
     length = np.linalg.norm(newton)
-    np.testing.assert_allclose(dogleg_step(model, 1.01 * length), newton)
+    np.testing.assert_allclose(dogleg_step(model, newton, 1.01 * length), newton)
     descent = -model.gradient / np.linalg.norm(model.gradient)
     cauchy = minimize_scalar(lambda h: _value(model, h * descent)).x
-    np.testing.assert_allclose(dogleg_step(model, 0.5 * cauchy), 0.5 * cauchy * descent, rtol=1e-6)
+    np.testing.assert_allclose(
+        dogleg_step(model, newton, 0.5 * cauchy), 0.5 * cauchy * descent, rtol=1e-6
+    )
     between = 0.5 * (cauchy + length)
-    step = dogleg_step(model, between)
+    step = dogleg_step(model, newton, between)
     # On the straight way from the Cauchy point to the Gauss-Newton step, where it leaves the ball.
     assert np.linalg.norm(step) == pytest.approx(between)
     share = (step - cauchy * descent) @ (newton - cauchy * descent) / np.sum((newton - cauchy * descent) ** 2)

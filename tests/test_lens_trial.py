@@ -11,13 +11,15 @@ import pytest
 from front_door import warned
 from turning_clip import write_clip
 
-from scopemap.calibration.focal_length.from_motion import FocalEstimate
-from scopemap.calibration.focal_length.trial import KINDS, LensTrial, try_lenses
+from scopemap.calibration.focal_length.from_motion import FocalEstimate, with_focal_from_motion
+from scopemap.calibration.focal_length.trial import LensTrial, try_lenses
 from scopemap.calibration.focal_length.windows import Window
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.lenses import FisheyeCamera
+from scopemap.cameras.scopes import KINDS, SCOPES
 from scopemap.config import Config
+from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import so3_exp
 from scopemap.io.opening import open_sequence
 from scopemap.report.verdict import verdict
@@ -96,6 +98,15 @@ def test_tissue_that_deforms_tells_nothing() -> None:
     assert try_lenses([]) is None
 
 
+def test_a_kind_of_endoscope_leaves_out_other_lenses() -> None:
+    windows = [_window("orthographic fisheye", 190.0, seed, **FORWARD) for seed in range(2)]  # type: ignore[arg-type]
+    assert try_lenses(windows, SCOPES["laparoscope"]) is None
+    found = try_lenses(windows, SCOPES["colonoscope"])
+    assert found is not None
+    assert (found.kind, found.reason) == ("orthographic fisheye", "")
+    assert abs(math.log(found.focal_px / 190.0)) < max(2 * found.share, 0.02)
+
+
 # ---- in a run
 
 UNDETERMINED = FocalEstimate(math.nan, math.inf, math.nan, 0, reason="0 windows")
@@ -120,7 +131,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[LensTrial | None]:
         return UNDETERMINED
 
     monkeypatch.setattr(f"{place}.focal_from_motion", motion)
-    monkeypatch.setattr(f"{place}.try_lenses", lambda _: said[0])
+    monkeypatch.setattr(f"{place}.try_lenses", lambda *_: said[0])
     return said
 
 
@@ -158,3 +169,27 @@ def test_the_default_is_named_where_nothing_is_known(
     reasons = [reason.text for reason in verdict(result).reasons]
     assert sum("lens is a guess" in text for text in reasons) == 1
     assert not any("amera is unknown" in text for text in reasons)  # said once
+
+
+@pytest.mark.parametrize("scope", SCOPES)
+def test_the_lens_of_a_kind_of_endoscope_is_assumed_where_nothing_is_known(clip: Path, tried: list, scope: str) -> None:
+    tried.append(None)
+    config = Config.load(settings=LIGHT | {"input.scope": scope})
+    sequence = open_sequence(clip, settings=config.input)
+    assert sequence.camera.fx == pytest.approx(SCOPES[scope].focal * 200)
+    sequence, _ = with_focal_from_motion(sequence, config)
+    lens = sequence.rectifier.source
+    assert getattr(lens, "distortion", ()) == pytest.approx(KINDS[SCOPES[scope].kinds[0]])
+    assert sequence.focal_sigma_px == pytest.approx(SCOPES[scope].spread * SCOPES[scope].focal * 200)
+    assert sequence.camera_source.startswith(f"assumed: as of a {scope}, fx {SCOPES[scope].focal:g} of the width")
+    assert [notice.code for notice in sequence.source.warnings if not isinstance(notice, str)] == ["camera-unknown"]
+
+
+def test_what_is_stated_overrules_the_kind_of_endoscope(clip: Path) -> None:
+    settings = Config.load(settings={"input.scope": "colonoscope"}).input
+    assert open_sequence(clip, fov_deg=90.0, settings=settings).camera.fx == pytest.approx(100.0)
+    known = open_sequence(clip, camera="120 120 100 80", settings=settings)
+    assert known.calibrated
+    assert known.camera.fx == pytest.approx(120.0)
+    with pytest.raises(SettingsError, match="scope"):
+        Config.load(settings={"input.scope": "telescope"})

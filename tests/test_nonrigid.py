@@ -97,10 +97,8 @@ def _over_time(problem: BundleProblem, found: NonRigidSolution) -> np.ndarray:
     skin = skin_of(motion.nodes, at_host)
     # Nodes lie on the adjusted surface, which those who move it have.
     assert not motion.basis.any() or np.median(np.linalg.norm(motion.nodes[:, None] - at_host, axis=-1).min(1)) < 2.5
-    moved = [
-        skin.moved(motion.displacement, number, host, np.full(len(host), k)) for k in range(len(state.T_camera_world))
-    ]
-    return at_host[:, None] + np.stack(moved, 1)
+    moved = skin.displaced(motion.displacement)
+    return at_host[:, None] + (moved - moved[host, number]).transpose(1, 0, 2)
 
 
 def _shape_error_mm(points: np.ndarray, true: np.ndarray) -> float:

@@ -43,7 +43,10 @@ KINDS: dict[str, _Kind] = {
     "input-interrupted": _Kind("note", "interrupted at frame {frame}: the result is of the frames until then", ""),
     "camera-assumed": _Kind("info", "camera {source}"),
     "camera-unknown": _Kind(
-        "note", "{reason}; a calibration (--camera) or the field of view (--fov) makes the camera known", ""
+        "note",
+        "{reason}; a calibration (--camera) or the field of view (--fov) makes the camera known, "
+        "the kind of endoscope (--scope) the guess better",
+        "",
     ),
     "camera-distorted": _Kind(
         "doubtful",

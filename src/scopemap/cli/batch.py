@@ -46,6 +46,7 @@ def batch(
     dataset: options.Dataset = None,
     camera: options.CameraFile = None,
     fov: options.FieldOfView = None,
+    scope: options.Scope = None,
     frames: Annotated[str | None, typer.Option(metavar="A:B:S", help="Which frames of each, a Python slice.")] = None,
     size: options.Size = None,
     settings: options.SetPairs = None,
@@ -95,11 +96,12 @@ def batch(
     chosen = {"preset": preset, "config": config, "dataset": dataset, "camera": camera, "fov": fov}
     chosen |= {"frames": frames, "size": size}
     shared = {key: str(value) for key, value in chosen.items() if value is not None}
+    of_scope = {"input.scope": scope} if scope else {}
     of_part = options.parse_part(part) if part else (1, 1)
     from scopemap.io.inputs import named_inputs
     from scopemap.runner.processes import ProcessLimits, usable_cores
 
-    videos = videos_of(named_inputs(inputs), shared, options.parse_settings(settings or []))
+    videos = videos_of(named_inputs(inputs), shared, of_scope | options.parse_settings(settings or []))
     if workers is None and (engine == "slurm" or address):
         raise SettingsError("how many videos run at once on the cluster? Give --workers")
     limits = ProcessLimits(workers or max(1, usable_cores() // 2), time_limit, retries)

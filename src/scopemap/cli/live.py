@@ -50,6 +50,7 @@ def live(
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so many seconds.")] = None,
     camera: options.CameraFile = None,
     fov: options.FieldOfView = None,
+    scope: options.Scope = None,
     near_far: options.NearFar = None,
     size: options.Size = None,
     settings: options.SetPairs = None,
@@ -65,6 +66,7 @@ def live(
     from scopemap.config import Config
 
     chosen: dict[str, Any] = {"depth.near_far_mm": options.parse_near_far(near_far)} if near_far else {}
+    chosen |= {"input.scope": scope} if scope else {}
     config = Config.load(
         "realtime", settings=chosen | {"input.focal": "assume"} | options.parse_settings(settings or [])
     )

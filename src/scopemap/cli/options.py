@@ -56,6 +56,14 @@ FieldOfView = Annotated[
         help="Horizontal field of view, degrees, of an unknown camera; default: estimated, or 70 (live: 70).",
     ),
 ]
+Scope = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KIND",
+        help="Kind of endoscope of an unknown camera: colonoscope, gastroscope, bronchoscope, laparoscope, cystoscope, "
+        "ureteroscope, sinus, capsule.",
+    ),
+]
 NearFar = Annotated[
     str | None,
     typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm; replaces the anchor."),

@@ -38,6 +38,7 @@ def run(
         ),
     ] = None,
     fov: options.FieldOfView = None,
+    scope: options.Scope = None,
     stereo: Annotated[
         str | None,
         options.advanced(
@@ -126,6 +127,7 @@ def run(
         "input.deinterlace": deinterlace or None,
         "input.redact": [options.parse_box(box) for box in redact] if redact else None,
         "input.fps": fps,
+        "input.scope": scope,
         "run.memory_mb": options.parse_memory(memory) if memory else None,
         "depth.backend": depth,
         "depth.near_far_mm": options.parse_near_far(near_far) if near_far else None,

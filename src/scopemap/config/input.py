@@ -33,6 +33,12 @@ class InputSettings(Settings):
         "of the first frames; auto: Depth Pro's where it is in use, else flow, or a trial of "
         "lenses, where one of these tells it",
     )
+    scope: str = Field(
+        "",
+        pattern="^(|colonoscope|gastroscope|bronchoscope|laparoscope|cystoscope|ureteroscope|sinus|capsule)$",
+        description="kind of endoscope of an unknown camera, whose typical lens is assumed and tried first: "
+        "colonoscope, gastroscope, bronchoscope, laparoscope, cystoscope, ureteroscope, sinus, capsule",
+    )
     stereo: str = Field(
         "auto",
         pattern=r"^(auto|none|left-right|top-bottom|use(:.+)?)$",

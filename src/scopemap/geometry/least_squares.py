@@ -118,9 +118,8 @@ class Solution(Generic[State]):
     converged: bool
 
 
-def dogleg_step(model: Model, radius: float) -> np.ndarray:
-    """Return the dog-leg step (n,) of length <= `radius`."""
-    newton = model.gauss_newton_step()
+def dogleg_step(model: Model, newton: np.ndarray, radius: float) -> np.ndarray:
+    """Return the dog-leg step (n,) of length <= `radius`; newton : the model's Gauss-Newton step (n,)."""
     if np.linalg.norm(newton) <= radius:
         return newton
     descent = -model.gradient
@@ -139,9 +138,11 @@ def dogleg_step(model: Model, radius: float) -> np.ndarray:
 def minimise(problem: Problem[State], start: State, options: Options) -> Solution[State]:
     """Search from `start`; the cost of the solution is never above the cost of `start` (except for Gauss-Newton)."""
     state, radius = start, options.radius
-    model = problem.linearise(state)
+    model, newton = problem.linearise(state), None
     for iteration in range(1, options.max_iterations + 1):
-        step = model.gauss_newton_step() if options.gauss_newton else dogleg_step(model, radius)
+        # After a rejected step it is the same.
+        newton = model.gauss_newton_step() if newton is None else newton
+        step = newton if options.gauss_newton else dogleg_step(model, newton, radius)
         length = float(np.linalg.norm(step))
         if length < options.min_step or not np.isfinite(length):
             return Solution(state, model.cost, iteration, bool(np.isfinite(length)))
@@ -149,7 +150,7 @@ def minimise(problem: Problem[State], start: State, options: Options) -> Solutio
         # Most steps are taken: linearising at once is cheaper than asking for the cost first.
         ahead = problem.linearise(candidate)
         if options.gauss_newton:
-            state, model = candidate, ahead
+            state, model, newton = candidate, ahead, None
             continue
         predicted = -float(model.gradient @ step + 0.5 * model.curvature(step))
         ratio = (model.cost - ahead.cost) / max(predicted, 1e-300)
@@ -159,7 +160,7 @@ def minimise(problem: Problem[State], start: State, options: Options) -> Solutio
             radius = 2.0 * radius
         if ahead.cost < model.cost:
             small = model.cost - ahead.cost < options.min_decrease * model.cost
-            state, model = candidate, ahead
+            state, model, newton = candidate, ahead, None
             if problem.accept is not None:
                 state = problem.accept(candidate)
                 model = problem.linearise(state)

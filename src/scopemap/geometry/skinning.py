@@ -22,12 +22,6 @@ class Skin(NamedTuple):
         place = np.maximum(np.cumsum(moving) - 1, 0)
         return Skin(place[self.node], self.weight * moving[self.node])
 
-    def moved(self, displacement: np.ndarray, points: np.ndarray, since: np.ndarray, until: np.ndarray) -> np.ndarray:
-        """Return the motion (n, 3) of numbered points between keyframes (n,), by the nodes' displacement (K, N, 3)."""
-        node = self.node[points]
-        change = displacement[until[:, None], node] - displacement[since[:, None], node]
-        return np.einsum("nj,njc->nc", self.weight[points], change)
-
     def displaced(self, displacement: np.ndarray) -> np.ndarray:
         """Return the displacements (..., P, 3) of the points by those of the nodes, (..., N, 3)."""
         return np.einsum("pj,...pjc->...pc", self.weight, displacement[..., self.node, :])

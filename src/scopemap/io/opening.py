@@ -14,6 +14,7 @@ from scopemap.cameras.formats.calibration import Calibration, fitted
 from scopemap.cameras.formats.pair import NEEDS_PAIR, read_pair
 from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.rectification import Rectifier, StereoPair, working_camera, working_size
+from scopemap.cameras.scopes import SCOPES
 from scopemap.config import InputSettings
 from scopemap.errors import CalibrationError, InputError
 from scopemap.io.datasets.colmap import ColmapFolder
@@ -70,7 +71,8 @@ def open_sequence(
         recognises it.
     camera : calibration file, or the numbers "fx fy cx cy [k1 k2 p1 p2 [k3]]", px of the input's pictures; None: the
         data set's own, else a pinhole by `fov_deg`.
-    fov_deg : horizontal field of view of an unknown camera, degrees; None: 70 until a run estimates it.
+    fov_deg : horizontal field of view of an unknown camera, degrees; None: that of the settings' `scope`, else 70,
+        until a run estimates it.
     size : working size (width, height), px; None: by `settings.longest_side_px`.
     frames : which frames, by their positions in the input, a slice or "0:100:2"; None: all.
     settings : how the input is read, by default `Config().input`.
@@ -101,7 +103,7 @@ def sequence_of(
     settings = settings or InputSettings()
     with _errors_of_the_system(reader.path):
         source = _prepared(reader, settings)
-        calibration, calibrated = _calibration_of(source, camera, fov_deg, settings.camera_fit)
+        calibration, calibrated = _calibration_of(source, camera, fov_deg, settings)
     pair = _pair_of(source, camera, settings.camera_fit) if settings.uses_both_views else None
     size_source = "chosen" if size is None else "given (--size)"
     size = size or working_size(source.width, source.height, settings.longest_side_px)
@@ -261,10 +263,10 @@ def _pair_of(source: Source, file: Path | str | None, camera_fit: str) -> Stereo
 
 
 def _calibration_of(
-    source: Source, file: Path | str | None, fov_deg: float | None, camera_fit: str
+    source: Source, file: Path | str | None, fov_deg: float | None, settings: InputSettings
 ) -> tuple[Calibration, bool]:
     """Return the calibration, and whether the camera is known by it or only assumed."""
-    size = (source.width, source.height)
+    size, camera_fit = (source.width, source.height), settings.camera_fit
     try:
         if file is not None:
             return read_calibration(file, size, camera_fit), True
@@ -280,6 +282,10 @@ def _calibration_of(
     unfitted = f" (no calibration file: --camera-fit {camera_fit} has no effect)" if camera_fit != "exact" else ""
     if source.camera is not None:
         return Calibration(source.camera, source.depth_scale_mm, source.camera_source + unfitted), True
+    if settings.scope and fov_deg is None:
+        prior = SCOPES[settings.scope]
+        assumed = f"assumed: as of a {settings.scope}, fx {prior.focal:g} of the width ({prior.source}){unfitted}"
+        return Calibration(assumed_camera(source, prior.focal * source.width), None, assumed), False
     known, fov_deg, option = ("assumed", _USUAL_FOV_DEG, "") if fov_deg is None else ("stated", fov_deg, " (--fov)")
     if not 1 <= fov_deg <= 170:
         raise InputError(f"the horizontal field of view must be 1 to 170 deg, got {fov_deg:g}")

@@ -56,10 +56,12 @@ class _Adjusted(NamedTuple):
 
     main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph,
     infinite where the depths of keyframes agree less there than as tracked. between_px : between maps. support :
-    keyframes on either side of the accepted loops of the least supported map. rigid : the solution, refused or not.
+    keyframes on either side of the accepted loops of the least supported map. problem, rigid : what was solved, and
+    the solution, refused or not.
     """
 
     correction: FrameCorrection
+    problem: BundleProblem
     rigid: State
     main_px: float
     largest_px: float
@@ -274,7 +276,7 @@ class Backend:
         # A map of one keyframe has no observations: NaN.
         largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
         main_px, support = within[list(worlds).index(main)], loop_support(accepted, map_of, main)
-        return _Adjusted(correction, found.state, main_px, largest_px, between_px, graph_px, support)
+        return _Adjusted(correction, problem, found.state, main_px, largest_px, between_px, graph_px, support)
 
     def _with_moving_tissue(self, alone: _Adjusted, worlds: Mapping[int, Similarity]) -> FrameCorrection:
         """Return the correction with tissue that moves where left-out tracks confirm it, else the rigid one."""
@@ -282,14 +284,13 @@ class Backend:
         if self._camera is None or not self.settings.moving_tissue or by_depth:
             return alone.correction
         chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
-        problem, _ = self._problem(chosen, worlds, self._camera)
         time_s = np.array(self._times_s)[chosen]
-        solution = adjust_moving_tissue(problem, alone.rigid, time_s)
+        solution = adjust_moving_tissue(alone.problem, alone.rigid, time_s)
         if solution is None:
             return alone.correction
         found, deformation, left_out = solution
         rate = deformation.rate_per_min(time_s)
-        fields, tissue = self._fields(chosen, problem.points, found), TissueMotion(deformation, left_out, rate)
+        fields, tissue = self._fields(chosen, alone.problem.points, found), TissueMotion(deformation, left_out, rate)
         return replace(self._correction(chosen, worlds, found), depth_fields=fields, tissue=tissue)
 
     def _problem(

@@ -7,6 +7,7 @@ keyframe t observes it at project(T_t T_h^-1 exp(u_p) ray_p).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -76,6 +77,13 @@ class BundleProblem:
     correlated: float = 1.0
     held: int = 0
 
+    @cached_property
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of host and observer (Q,), host K + observer, and which of them each observation (N,) has."""
+        host, count = self.points.host[self.observations.point], len(self.T_camera_world)
+        pairs, which = np.unique(host * count + self.observations.keyframe, return_inverse=True)
+        return pairs, which
+
     @property
     def begin(self) -> State:
         """The state to begin with: `start`, or as tracked."""
@@ -123,11 +131,11 @@ def reproject(problem: BundleProblem, state: State, moved: np.ndarray | None = N
     moved : (N, 3) mm, by how much a point has moved in the world when it is observed; None: tissue is rigid.
     """
     points, observations, T = problem.points, problem.observations, state.T_camera_world
-    focal, host = np.exp(state.lens[0]), points.host[observations.point]
+    focal = np.exp(state.lens[0])
     rays = np.column_stack([(points.pixel - state.lens[1:]) / focal, np.ones(len(points.host))])
     in_host = (np.exp(state.log_depth)[:, None] * rays)[observations.point]
-    pairs, which = np.unique(host * len(T) + observations.keyframe, return_inverse=True)
-    between = T[pairs % len(T)] @ inverse(T[pairs // len(T)])
+    pairs, which = problem.pairs
+    between = T[pairs % len(T)] @ inverse(T)[pairs // len(T)]
     R = between[which, :3, :3]
     seen = np.einsum("nij,nj->ni", R, in_host) + between[which, :3, 3]
     if moved is not None:

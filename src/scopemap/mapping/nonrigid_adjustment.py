@@ -39,7 +39,7 @@ RIGID_CORE_PX = 0.4
 """Robust standard deviation of a rigid solution below which most of the tissue is at rest."""
 _NODES = 60
 # Nodes that find the curves, of up to so many keyframes and of many, and the least hat functions of each.
-_CURVE_NODES, _FEW_KEYFRAMES, _LEAST_CURVE_NODES, _LEAST_HATS = 30, 60, 10, 30
+_CURVE_NODES, _FEW_KEYFRAMES, _LEAST_CURVE_NODES, _LEAST_HATS = 15, 60, 10, 30
 _THINNED = 3  # one of so many points finds the curve
 # Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
 _FREE, _ONE_CURVE, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05

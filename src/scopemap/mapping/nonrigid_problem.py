@@ -29,10 +29,10 @@ from scopemap.mapping.bundle_adjustment import (
     weights,
 )
 from scopemap.mapping.bundle_problem import BundleProblem, Reprojection, State, jacobians, reproject
-from scopemap.mapping.deformation_graph import Deformation
 
 _RIDGE = 1e-9  # of the diagonal
-_MAX_ITERATIONS, _MIN_DECREASE = 20, 1e-3
+# Of nodes that move step by step only the curve is needed, which is found long before them.
+_MAX_ITERATIONS, _FOR_CURVE, _MIN_DECREASE = 20, 6, 1e-3
 _CURVE_SIGMA = 0.3  # prior standard deviation of a curve, whose largest value is 1
 
 
@@ -59,8 +59,12 @@ class NonRigidProblem:
     def moved(self, modes: np.ndarray, basis: np.ndarray) -> np.ndarray:
         """Return by how much (N, 3) mm the point of each observation has moved since its host saw it."""
         seen, hosts = self.rigid.observations, self.rigid.points.host
-        displacement = Deformation(self.nodes, basis, modes).displacement
-        return self.skin.moved(displacement, seen.point, hosts[seen.point], seen.keyframe)
+        change = basis[seen.keyframe] - basis[hosts[seen.point]]
+        return np.einsum("nl,nlc->nc", change, self.at_points(modes)[seen.point])
+
+    def at_points(self, modes: np.ndarray) -> np.ndarray:
+        """Return the displacement (P, L, 3) mm of the points where each curve is 1."""
+        return self.skin.displaced(modes).transpose(1, 0, 2)
 
 
 class NonRigidState(NamedTuple):
@@ -80,7 +84,8 @@ def solve(problem: NonRigidProblem, start: NonRigidState) -> NonRigidState:
         sigma_px = robust_sigma_2d(lengths_px, problem.rigid.least_sigma_px)
         return state._replace(rigid=state.rigid._replace(sigma_px=sigma_px))
 
-    options = least_squares.Options(np.inf, _MAX_ITERATIONS, min_step=0.0, min_decrease=_MIN_DECREASE)
+    most = _MAX_ITERATIONS if problem.free else _FOR_CURVE
+    options = least_squares.Options(np.inf, most, min_step=0.0, min_decrease=_MIN_DECREASE)
     search = least_squares.Problem(partial(NonRigidModel, problem), partial(_retract, problem), rescaled)
     return minimise(search, rescaled(start), options).state
 
@@ -100,14 +105,15 @@ def _modes_of(unknowns: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class _Linear(NamedTuple):
-    """Errors, derivatives and weights of all observations; of points, ln depth's error and weight of the estimate."""
+    """Derivatives and weights of all observations; of points, ln depth's error and weight of the estimate.
 
-    error: np.ndarray  # (N, 2) px
-    by_camera: np.ndarray  # (N, 2, 6)
-    by_host: np.ndarray  # (N, 2, 6)
+    columns : unknowns (N, U) that an observation touches beside its point. by : (N, 2, U) px.
+    """
+
+    columns: np.ndarray
+    by: np.ndarray
     by_depth: np.ndarray  # (N, 2)
-    by_world: np.ndarray  # (N, 2, 3), px / mm of the point's motion in the world
-    by_curve: np.ndarray  # (N, 2, L), px, by the observing keyframe's values of the curves
+    error: np.ndarray  # (N, 2) px
     weight: np.ndarray  # (N,)
     off: np.ndarray  # (P,)
     held: np.ndarray  # (P,)
@@ -134,18 +140,31 @@ class NonRigidModel:
 
     @cached_property
     def _linear(self) -> _Linear:
-        rigid, state = self._problem.rigid, self._state.rigid
+        problem, rigid, state = self._problem, self._problem.rigid, self._state.rigid
+        observer, points = rigid.observations.keyframe, rigid.observations.point
+        host, basis = rigid.points.host[points], self._state.basis
         by_camera, by_host, by_depth, _ = jacobians(rigid, state, self._seen)
-        R = state.T_camera_world[rigid.observations.keyframe, :3, :3]
-        by_world = by_camera[:, :, 3:] / rigid.unit_mm @ R
-        held = cauchy((self._off / rigid.points.sigma) ** 2, CAUCHY)[1] / rigid.points.sigma**2
+        # Px / mm of the point's motion in the world.
+        by_world = by_camera[:, :, 3:] / rigid.unit_mm @ state.T_camera_world[observer, :3, :3]
+        own, first = np.arange(6), PER_KEYFRAME * np.column_stack([observer, host])
+        columns, by = [first[:, :1] + own, first[:, 1:] + own], [by_camera, by_host]
+        # Of many curves an observation touches those that differ between its keyframe and the host.
+        change = basis[observer] - basis[host]
+        most = max(int((change != 0).sum(1).max(initial=0)), 1)
+        curve = np.argsort(change == 0, axis=1, kind="stable")[:, :most]
+        share = np.take_along_axis(change, curve, 1)[:, None, :, None] * problem.skin.weight[points][:, None, None]
+        axis = np.arange(3)[:, None, None] * basis.shape[1]
+        place = (axis + curve[:, None, :, None]) * len(problem.nodes) + problem.skin.node[points][:, None, None]
+        columns.append(self._first + place.reshape(len(points), -1))
+        by.append((by_world[..., None, None] * share[:, None]).reshape(len(points), 2, -1))
+        if problem.free:
+            start = self._end + np.arange(basis.shape[1]) * len(basis)
+            by_curve = by_world @ problem.at_points(self._state.modes)[points].transpose(0, 2, 1)
+            columns += [start + observer[:, None], start + host[:, None]]
+            by += [by_curve, -by_curve]
         weight = weights(state, self._seen) / rigid.correlated
-        node, share = self._problem.skin.node, self._problem.skin.weight
-        # Of a basis that is given there are many curves, whose derivatives nobody needs.
-        modes = self._state.modes if self._problem.free else self._state.modes[:1]
-        at_points = np.einsum("pj,lpjc->pcl", share, modes[:, node])
-        by_curve = np.einsum("nij,njl->nil", by_world, at_points[rigid.observations.point])
-        return _Linear(self._seen.error, by_camera, by_host, by_depth, by_world, by_curve, weight, self._off, held)
+        held = cauchy((self._off / rigid.points.sigma) ** 2, CAUCHY)[1] / rigid.points.sigma**2
+        return _Linear(np.hstack(columns), np.dstack(by), by_depth, self._seen.error, weight, self._off, held)
 
     @cached_property
     def _priors(self) -> list[CameraBlock]:
@@ -158,71 +177,46 @@ class NonRigidModel:
 
     def _change(self, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what a step without its points changes: all observations (N, 2), and ln scale at points (P,)."""
-        rigid, linear = self._problem.rigid, self._linear
-        own = step[: self._first].reshape(-1, PER_KEYFRAME)
-        host = rigid.points.host[rigid.observations.point]
-        modes = _modes_of(step[self._first : self._end], self._state.modes.shape)
-        moved = self._problem.moved(modes, self._state.basis)
-        if self._problem.free:
-            basis = step[self._end : self._unknowns].reshape(self._state.basis.T.shape).T
-            moved += self._problem.moved(self._state.modes, basis)
-        change = np.einsum("nij,nj->ni", linear.by_camera, own[rigid.observations.keyframe, :6])
-        change += np.einsum("nij,nj->ni", linear.by_host, own[host, :6])
-        return change + np.einsum("nij,nj->ni", linear.by_world, moved), own[rigid.points.host, 6]
+        scale = step[PER_KEYFRAME * self._problem.rigid.points.host + 6]
+        return np.einsum("nau,nu->na", self._linear.by, step[self._linear.columns]), scale
+
+    @cached_property
+    def _normal(self) -> _Normal:
+        """Normal equations with the points eliminated; the first keyframe's pose is held."""
+        problem, points, seen = self._problem, self._problem.rigid.points, self._problem.rigid.observations
+        normal = _Normal(
+            np.zeros((self._unknowns, self._unknowns)), *np.zeros((2, self._unknowns)), *np.zeros((2, len(points.host)))
+        )
+        start = np.searchsorted(seen.point, np.arange(len(points.host) + 1))
+        _add_points(normal, start, PER_KEYFRAME * points.host + 6, self._linear)
+        for prior in self._priors:
+            normal.matrix[np.ix_(prior.columns, prior.columns)] += prior.A
+            normal.gradient[prior.columns] += prior.b
+        size = self._modes.shape[1]
+        for first, modes in zip(range(self._first, self._end, size), self._modes, strict=True):
+            own = slice(first, first + size)
+            normal.matrix[own, own] += problem.prior.toarray()
+            normal.gradient[own] += problem.prior @ modes
+        normal.matrix[np.diag_indices(self._unknowns)] *= 1 + _RIDGE
+        normal.matrix[:, :6], normal.matrix[range(6), range(6)], normal.gradient[:6], normal.by_points[:6] = 0, 1, 0, 0
+        return normal
 
     @cached_property
     def gradient(self) -> np.ndarray:
         """First derivative; 0 for the first keyframe's pose."""
-        rigid, linear = self._problem.rigid, self._linear
-        seen, count = rigid.observations, len(self._state.rigid.T_camera_world)
-        error, host = linear.weight[:, None] * self._seen.error, rigid.points.host[seen.point]
-        own = np.zeros((count, PER_KEYFRAME))
-        for keyframe, by in ((seen.keyframe, linear.by_camera), (host, linear.by_host)):
-            np.add.at(own[:, :6], keyframe, np.einsum("nij,ni->nj", by, error))
-        held = linear.held * self._off
-        own[:, 6] = -np.bincount(rigid.points.host, held, count)
-        force, nodes = np.einsum("nij,ni->nj", linear.by_world, error), np.zeros((count, len(self._problem.nodes), 3))
-        skin = self._problem.skin
-        for node, weight in zip(skin.node[seen.point].T, skin.weight[seen.point].T, strict=True):
-            np.add.at(nodes, (seen.keyframe, node), weight[:, None] * force)
-            np.add.at(nodes, (host, node), -weight[:, None] * force)
-        modes = np.einsum("kl,knc->cln", self._state.basis, nodes).reshape(3, -1)
-        modes += (self._problem.prior @ self._modes.T).T
-        depth = np.bincount(seen.point, (linear.by_depth * error).sum(1), len(held)) + held
-        basis = np.einsum("knc,lnc->lk", nodes, self._state.modes) if self._problem.free else np.zeros(0)
-        gradient = np.concatenate([own.ravel(), modes.ravel(), basis.ravel(), depth])
-        for prior in self._priors:
-            gradient[prior.columns] += prior.b
-        gradient[:6] = 0
-        return gradient
+        return np.append(self._normal.gradient, self._normal.g)
 
     def gauss_newton_step(self) -> np.ndarray:
         """Return the step to the minimum."""
-        problem, linear = self._problem, self._linear
-        points, seen = problem.rigid.points, problem.rigid.observations
-        matrix, rhs = np.zeros((self._unknowns, self._unknowns)), np.zeros(self._unknowns)
-        start = np.searchsorted(seen.point, np.arange(len(points.host) + 1))
-        ends = _Ends(start, points.host, seen.keyframe)
-        _add_points(matrix, rhs, ends, linear, problem.skin, self._state.basis, len(problem.nodes))
-        for prior in self._priors:
-            matrix[np.ix_(prior.columns, prior.columns)] += prior.A
-            rhs[prior.columns] -= prior.b
-        size = self._modes.shape[1]
-        for first, modes in zip(range(self._first, self._end, size), self._modes, strict=True):
-            own = slice(first, first + size)
-            matrix[own, own] += problem.prior.toarray()
-            rhs[own] -= problem.prior @ modes
-        matrix[np.diag_indices_from(matrix)] *= 1 + _RIDGE
-        step = np.zeros(self._unknowns + len(points.host))
-        factor = cho_factor(matrix[6:, 6:], overwrite_a=True, check_finite=False)
-        step[6 : self._unknowns] = cho_solve(factor, rhs[6:], check_finite=False)
+        linear, points, normal = self._linear, self._problem.rigid.observations.point, self._normal
+        step = np.zeros(self._unknowns + len(normal.g))
+        # LAPACK reads by columns: the lower half is the upper one there, and nothing is copied.
+        factor = cho_factor(normal.matrix.T, overwrite_a=True, check_finite=False)
+        step[: self._unknowns] = cho_solve(factor, normal.by_points - normal.gradient, check_finite=False)
         change, log_scale = self._change(step)
-        slope = linear.weight[:, None] * linear.by_depth
-        h, g = (
-            np.bincount(seen.point, (slope * by).sum(1), len(points.host))
-            for by in (linear.by_depth, linear.error + change)
-        )
-        step[self._unknowns :] = -(g + linear.held * (self._off - log_scale)) / (h + linear.held)
+        slope = linear.weight * (linear.by_depth * change).sum(1)
+        shift = np.bincount(points, slope, len(normal.g)) - linear.held * log_scale
+        step[self._unknowns :] = -(normal.g + shift) / normal.h
         return step
 
     def curvature(self, step: np.ndarray) -> float:
@@ -235,71 +229,70 @@ class NonRigidModel:
         return total + self._stiffness(step[self._first : self._end].reshape(3, -1))
 
 
-class _Ends(NamedTuple):
-    """First observation of each point and their number (P + 1,), its host (P,), keyframe of each observation (N,)."""
+class _Normal(NamedTuple):
+    """Normal equations.
 
-    start: np.ndarray
-    host: np.ndarray
-    keyframe: np.ndarray
+    matrix : lower half of the second derivative (U, U) by all but the points, these eliminated. gradient : first
+    derivative (U,). by_points : what eliminating the points adds to its negative (U,). h, g : second and first
+    derivatives (P,) by the points.
+    """
+
+    matrix: np.ndarray
+    gradient: np.ndarray
+    by_points: np.ndarray
+    h: np.ndarray
+    g: np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _add_points(
-    matrix: np.ndarray, rhs: np.ndarray, ends: _Ends, linear: _Linear, skin: Skin, basis: np.ndarray, nodes: int
-) -> None:
-    """Add the normal equations of keyframes, modes and curves, without the points, to matrix and right-hand side."""
-    curves, size = basis.shape[1], len(rhs)
-    first = PER_KEYFRAME * len(basis)
-    end = first + 3 * curves * nodes
-    free = curves if size > end else 0
-    most = 12 + 3 * curves * skin.node.shape[1] + 2 * free
-    columns, row = np.empty(most, np.int64), np.empty((2, most))
-    E, touched, known = np.zeros(size), np.empty(size, np.int64), np.zeros(size, np.bool_)
-    for p in range(len(ends.host)):
-        host, held = ends.host[p], linear.held[p]
-        h, g, count = held, held * linear.off[p], 1
-        touched[0] = scale = PER_KEYFRAME * host + 6
-        known[scale], E[scale] = True, -held
-        matrix[scale, scale] += held
-        rhs[scale] += held * linear.off[p]
-        for k in range(ends.start[p], ends.start[p + 1]):
-            used = 12
-            columns[:6] = PER_KEYFRAME * ends.keyframe[k] + np.arange(6)
-            columns[6:12] = PER_KEYFRAME * host + np.arange(6)
-            row[:, :6], row[:, 6:12] = linear.by_camera[k], linear.by_host[k]
-            for curve in range(curves):
-                change = basis[ends.keyframe[k], curve] - basis[host, curve]
-                if change == 0:
-                    continue
-                for j in range(skin.node.shape[1]):
-                    if skin.weight[p, j] == 0:
+def _add_points(normal: _Normal, start: np.ndarray, scale: np.ndarray, linear: _Linear) -> None:
+    """Add the normal equations of keyframes, modes and curves, without the points.
+
+    start : first observation of each point and their number (P + 1,). scale : (P,) unknown of its host's ln scale.
+    """
+    size = len(normal.gradient)
+    # A point touches few unknowns: its sums are made among these, and added to the matrix once.
+    columns, place = np.empty(size, np.int64), np.full(size, -1)
+    rows = np.zeros((2 * np.diff(start).max(), size))
+    by, off, b, E = np.empty(len(rows)), np.empty(len(rows)), np.zeros(size), np.zeros(size)
+    for p in range(len(scale)):
+        held, used, count = linear.held[p], 0, 1
+        h, g = held, held * linear.off[p]
+        columns[0], place[scale[p]] = scale[p], 0
+        for k in range(start[p], start[p + 1]):
+            root = np.sqrt(linear.weight[k])
+            for axis in range(2):
+                by[used], off[used] = root * linear.by_depth[k, axis], root * linear.error[k, axis]
+                h += by[used] ** 2
+                g += by[used] * off[used]
+                for i in range(linear.columns.shape[1]):
+                    value, column = root * linear.by[k, axis, i], linear.columns[k, i]
+                    if value == 0:
                         continue
-                    for axis in range(3):
-                        columns[used] = first + (axis * curves + curve) * nodes + skin.node[p, j]
-                        row[:, used] = change * skin.weight[p, j] * linear.by_world[k, :, axis]
-                        used += 1
-            for curve in range(free):
-                column = end + curve * len(basis)
-                columns[used], columns[used + 1] = column + ends.keyframe[k], column + host
-                row[:, used], row[:, used + 1] = linear.by_curve[k, :, curve], -linear.by_curve[k, :, curve]
-                used += 2
-            for side in range(2):
-                depth = linear.weight[k] * linear.by_depth[k, side]
-                h += depth * linear.by_depth[k, side]
-                g += depth * linear.error[k, side]
-                for i in range(used):
-                    column, by = columns[i], row[side, i]
-                    if not known[column]:
-                        known[column], touched[count] = True, column
+                    if place[column] < 0:
+                        place[column], columns[count] = count, column
                         count += 1
-                    E[column] += depth * by
-                    rhs[column] -= linear.weight[k] * by * linear.error[k, side]
-                    for j in range(used):
-                        matrix[column, columns[j]] += linear.weight[k] * by * row[side, j]
+                    rows[used, place[column]] += value
+                used += 1
+        A = np.zeros((count, count))
+        A[0, 0], b[0], E[0] = held, -held * linear.off[p], -held
+        for row in range(used):
+            for i in range(count):
+                value = rows[row, i]
+                if value == 0:
+                    continue
+                b[i] += off[row] * value
+                E[i] += by[row] * value
+                for j in range(i + 1):
+                    A[i, j] += value * rows[row, j]
+        normal.h[p], normal.g[p] = h, g
         for i in range(count):
-            share = E[touched[i]] / h
-            rhs[touched[i]] += share * g
-            for j in range(count):
-                matrix[touched[i], touched[j]] -= share * E[touched[j]]
+            normal.gradient[columns[i]] += b[i]
+            normal.by_points[columns[i]] += E[i] / h * g
+            for j in range(i + 1):
+                row, column = max(columns[i], columns[j]), min(columns[i], columns[j])
+                normal.matrix[row, column] += A[i, j] - E[i] / h * E[j]
+            for row in range(used):
+                rows[row, i] = 0.0
         for i in range(count):
-            E[touched[i]], known[touched[i]] = 0.0, False
+            place[columns[i]], b[i], E[i] = -1, 0.0, 0.0

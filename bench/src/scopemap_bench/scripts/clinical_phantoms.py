@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 
 from scopemap.calibration.focal_length.from_motion import with_focal_from_motion
-from scopemap.calibration.focal_length.trial import KINDS
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.cameras.formats.writing import write_calibration
 from scopemap.cameras.lenses import FisheyeCamera
+from scopemap.cameras.scopes import KINDS
 from scopemap.config import Config
 from scopemap.io.depth_maps import DepthReader
 from scopemap.io.opening import open_sequence

@@ -16,9 +16,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scopemap.calibration.focal_length.trial import KINDS, LensTrial, try_lenses
+from scopemap.calibration.focal_length.trial import LensTrial, try_lenses
 from scopemap.calibration.focal_length.window_adjustment import Scene, WindowSolution, adjusted, at_rest
 from scopemap.calibration.focal_length.windows import MAX_FRAMES, Window, windows_of
+from scopemap.cameras.scopes import ANY_LENS, KINDS, SCOPES
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.io.sequence import Sequence
@@ -133,7 +134,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     """
     windows: list[Window] = []
     estimate, assumed_px = focal_from_motion(sequence, config, windows), sequence.camera.fx
-    wanted = config.input.focal == "flow"
+    wanted, scope = config.input.focal == "flow", SCOPES.get(config.input.scope, ANY_LENS)
     if wanted and estimate.reason:
         raise CalibrationError(
             f"input.focal = flow: the motion in {sequence.path} does not determine the focal length, "
@@ -152,7 +153,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     if not wanted and (is_unknown or bends):
         # A run that adjusts nothing afterwards does not wait for windows to be adjusted.
         adjusts = config.mapping.method != "none"
-        tried = _agreeing(try_lenses(windows), estimate, sequence, windows) if adjusts else None
+        tried = _agreeing(try_lenses(windows, scope), estimate, sequence, windows) if adjusts else None
         if tried is not None and not tried.reason:
             return _with_tried(sequence, tried, windows), []
         if is_unknown:
@@ -162,6 +163,9 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
             sequence.source.warnings.append(Notice("camera-unknown", {"reason": default}))
     if not kept and not wanted and not estimate.differs_from(assumed_px):
         kept = f"{assumed_px:.0f} px, consistent with the estimate from the motion: {described}"
+    if kept and is_unknown and config.input.scope:
+        source, focal_px = f"{sequence.camera_source}; {kept}", scope.focal * sequence.camera.width
+        return sequence.with_focal(focal_px, source, scope.spread * focal_px, KINDS[scope.kinds[0]]), []
     if kept:
         return replace(sequence, camera_source=f"{sequence.camera_source}; {kept}"), []
     distorted = Notice("camera-distorted", {"share": abs(estimate.distortion)})

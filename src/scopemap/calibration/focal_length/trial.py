@@ -2,7 +2,8 @@
 
 The radius of a ray at the angle t from the axis is f tan t, f t or f sin t. Depth is scopenet's, without rays. The cost
 of a lens is that of its reprojection errors, px, by Cauchy's kernel, `_CORRELATED` of which count as one
-(chosen on phantoms and real clips with known lenses). The costs give a probability over kinds and focal lengths.
+(chosen on phantoms and real clips with known lenses). The costs, and what is expected of the lens, give a probability
+over kinds and focal lengths.
 """
 
 from __future__ import annotations
@@ -11,21 +12,16 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from scopemap.calibration.focal_length.window_adjustment import Scene, Start, adjusted, at_rest
 from scopemap.calibration.focal_length.windows import Window
+from scopemap.cameras.scopes import ANY_LENS, LensPrior
 from scopemap.geometry.least_squares import cauchy, robust_sigma_2d
 from scopemap.io.device import cpu_threads
-
-KINDS: dict[str, tuple[float, ...]] = {
-    "pinhole": (),
-    "equidistant fisheye": (0.0, 0.0, 0.0, 0.0),
-    "orthographic fisheye": (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880),
-}
-"""Kinds of lenses, and the coefficients of fisheyes as of `FisheyeCamera`: f t, and f sin t as a series."""
 
 MAX_SHARE = 0.07
 """Standard deviation of ln fx above which a trial does not tell it, chosen with `_CORRELATED`."""
@@ -33,7 +29,7 @@ MAX_SHARE = 0.07
 # Focal lengths over the width: pinholes of 122 to 42 degrees, equidistant fisheyes of 150 and less.
 _COARSE = np.geomspace(0.28, 1.3, 10)
 _FINER = (_COARSE[1] / _COARSE[0]) ** np.array([-0.75, -0.5, -0.25, 0.25, 0.5, 0.75])
-_FIRST_FOCAL = 0.55
+_FARTHEST = 3.0  # spreads from the expected focal length
 _WIDEST_RAD = math.radians(86)  # farther out a straightened picture has no end
 _LEAST_SEEN = 0.6  # of the observations, within that angle
 _CORRELATED = 30.0
@@ -55,7 +51,7 @@ _FINE = 200
 class LensTrial:
     """Result of a trial of lenses.
 
-    kind : of the lens that fits best, one of `KINDS`. focal_px : its fx, at the windows' size. share : standard
+    kind : of the lens that fits best. focal_px : its fx, at the windows' size. share : standard
     deviation of ln fx over all kinds. fov_deg : horizontal field of view. certainty : probability of the kind.
     windows : number of windows used. reason : why this does not tell the lens, or "".
     """
@@ -69,10 +65,11 @@ class LensTrial:
     reason: str = ""
 
 
-def try_lenses(windows: Sequence[Window]) -> LensTrial | None:
+def try_lenses(windows: Sequence[Window], prior: LensPrior = ANY_LENS) -> LensTrial | None:
     """Return what windows of one camera say of its lens; None where fewer than two show a rigid scene."""
     with ThreadPoolExecutor(cpu_threads()) as pool:
-        tried = [one for one in pool.map(_Tried, windows) if one.sigma_px <= _MAX_RESIDUAL * one.width_px]
+        found = pool.map(partial(_Tried, prior), windows)
+        tried = [one for one in found if one.sigma_px <= _MAX_RESIDUAL * one.width_px]
     if len(tried) < _MIN_WINDOWS:
         return None
     costs = _costs(tried)
@@ -82,21 +79,21 @@ def try_lenses(windows: Sequence[Window]) -> LensTrial | None:
         # The others have no share in the probability.
         for one in tried if of_kind[best] - lowest < _HOPELESS * _CORRELATED else ():
             one.at(kind, best * _FINER)
-    return _judged([_costs([one]) for one in tried], 2 * windows[0].half_width_px)
+    return _judged([_costs([one]) for one in tried], 2 * windows[0].half_width_px, prior)
 
 
 class _Tried:
     """A window with the reprojection errors through each lens that was tried: by kind and focal length over width.
 
-    All kinds of `_COARSE` focal lengths are tried at once.
+    All kinds that are expected are tried at once, of the `_COARSE` focal lengths that are.
     """
 
-    def __init__(self, window: Window) -> None:
-        self.window, self.width_px = window, 2 * window.half_width_px
+    def __init__(self, prior: LensPrior, window: Window) -> None:
+        self.window, self.width_px, self.first = window, 2 * window.half_width_px, prior.focal
         self.errors: dict[tuple[str, float], np.ndarray] = {}
         self._states: dict[tuple[str, float], Start] = {}
-        for kind in KINDS:
-            self.at(kind, _COARSE)
+        for kind in prior.kinds:
+            self.at(kind, _COARSE[np.abs(np.log(_COARSE / prior.focal)) <= _FARTHEST * prior.spread])
 
     @property
     def sigma_px(self) -> float:
@@ -107,7 +104,7 @@ class _Tried:
     def at(self, kind: str, shares: np.ndarray) -> None:
         """Adjust the window through lenses of a kind, each from where a lens like it ended."""
         # Small motion converges best through a wide lens.
-        for share in sorted(map(float, shares), key=lambda share: abs(math.log(share / _FIRST_FOCAL))):
+        for share in sorted(map(float, shares), key=lambda share: abs(math.log(share / self.first))):
             # Of its own kind where there is one, then of the nearest focal length.
             near = min(self._states, key=lambda key: (key[0] != kind, abs(math.log(key[1] / share))), default=None)
             start = None if near is None else self._states[near]
@@ -175,7 +172,7 @@ def _bent(kind: str, pixel: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 def _costs(tried: list[_Tried]) -> dict[str, dict[float, float]]:
     """Return the cost of every lens over all windows, by kind and focal length over width."""
-    costs: dict[str, dict[float, float]] = {kind: {} for kind in KINDS}
+    costs: dict[str, dict[float, float]] = {kind: {} for kind, _ in tried[0].errors}
     for one in tried:
         sigma_px = one.sigma_px
         for (kind, share), errors in one.errors.items():
@@ -185,11 +182,12 @@ def _costs(tried: list[_Tried]) -> dict[str, dict[float, float]]:
     return costs
 
 
-def _judged(costs: list[dict[str, dict[float, float]]], width_px: float) -> LensTrial:
+def _judged(costs: list[dict[str, dict[float, float]]], width_px: float, prior: LensPrior) -> LensTrial:
     """Return the mean and the spread of the focal length from the costs of all lenses in each window."""
     fine = np.linspace(math.log(_COARSE[0]), math.log(_COARSE[-1]), _FINE)
-    total = {kind: {share: sum(one[kind][share] for one in costs) for share in costs[0][kind]} for kind in KINDS}
-    weight = _weights(total, fine)
+    total = {kind: {share: sum(one[kind][share] for one in costs) for share in costs[0][kind]} for kind in costs[0]}
+    expected = np.exp(-0.5 * ((fine - math.log(prior.focal)) / prior.spread) ** 2)
+    weight = {kind: expected * of_kind for kind, of_kind in _weights(total, fine).items()}
     every = np.sum(list(weight.values()), axis=0)
     every /= every.sum()
     kind = max(weight, key=lambda name: float(weight[name].sum()))
