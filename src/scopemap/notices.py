@@ -92,6 +92,10 @@ KINDS: dict[str, _Kind] = {
     ),
     "frames-failed": _Kind("note", "{frames} frame(s) could not be processed whole (first: frame {first}, {reason})"),
     "frames-without-depth": _Kind("note", "{frames} frame(s) got no depth from the network (first: frame {first})"),
+    "frames-skipped": _Kind(
+        "info",
+        "{frames} frame(s) were skipped, without depth, because nothing in them can be followed: {causes}",
+    ),
     "frames-few": _Kind(
         "note", "frames in the result: {frames}, too few to judge it by; the surface is a glimpse from one place", ""
     ),

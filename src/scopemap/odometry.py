@@ -12,7 +12,7 @@ from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.faults import StageFaults
 from scopemap.frame import Frame
 from scopemap.mapping.submaps import Mapper
-from scopemap.preprocessing import PreprocessedFrame, with_depth, without_depth
+from scopemap.preprocessing import PreprocessedFrame, with_depth, with_unknown_depth, without_depth
 from scopemap.tracking.relocalisation import RotationFollower
 from scopemap.tracking.smoothing import Wema
 from scopemap.tracking.track import FrameTracker, Track, motion_between
@@ -21,12 +21,16 @@ from scopemap.trajectory.causes import LossCause
 
 @dataclass(frozen=True)
 class Step:
-    """All results for a frame: refined depth (at the size of `raw_mm`'s estimate) and, unless lost, pose as tracked."""
+    """All results for a frame: refined depth (at the size of `raw_mm`'s estimate) and, unless lost, pose as tracked.
+
+    skipped : whether nothing was estimated of it.
+    """
 
     frame: Frame
     track: Track
     raw_mm: np.ndarray
     refined: RefinedDepth
+    skipped: bool = False
 
     @property
     def row(self) -> dict[str, Any]:
@@ -64,8 +68,10 @@ class Odometry:
             step = self._track(preprocessed)
         except Exception as error:
             step = self._lost(preprocessed, self.faults.noted(preprocessed.frame.index, error))
-        motion, quality = _motion(preprocessed.correspondence), preprocessed.frame.quality
+        motion, quality, fault = _motion(preprocessed.correspondence), preprocessed.frame.quality, preprocessed.fault
         track = replace(step.track, motion=motion, quality=quality)
+        if fault is not None and track.status == "lost":
+            track = replace(track, cause=fault.cause, reason=fault.reason)
         track = self._rotation.follow(track, preprocessed.small, preprocessed.correspondence)
         step = replace(step, track=track)
         self.mapper.observe(step.track)
@@ -75,6 +81,8 @@ class Odometry:
     def _track(self, preprocessed: PreprocessedFrame) -> Step:
         refined = self._refine(preprocessed, None) if self._config.mapis.constants.order == "refine-first" else None
         track, last = self._tracker.track(preprocessed.frame), self._last_track
+        if preprocessed.skipped and track.status == "lost":
+            return self._without_pose(preprocessed, track)
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()
         if np.isfinite(track.depth_ratio):
@@ -90,21 +98,24 @@ class Odometry:
             self._reset()
         else:
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
-        if preprocessed.fault and track.status == "lost":
-            track = replace(track, cause=preprocessed.fault.cause, reason=preprocessed.fault.reason)
         return Step(frame, track, np.asarray(preprocessed.frame.depth_mm), refined)
 
     def _lost(self, preprocessed: PreprocessedFrame, reason: str) -> Step:
         """Return the step of a frame that could not be tracked, without depth."""
-        self._reset()
         frame, last = preprocessed.frame, self._last_track
         if last is None:
             track = Track(frame.index, "lost", reason, np.eye(4), frame.index, cause=LossCause.OTHER)
         else:
             track = Track(frame.index, "lost", reason, last.T_world_camera, last.keyframe, map=last.map)
             track = replace(track, cause=LossCause.OTHER)
-        blind, unknown_mm = without_depth(frame), np.asarray(without_depth(preprocessed.small).depth_mm)
-        return Step(blind, track, np.asarray(blind.depth_mm), RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm))
+        return self._without_pose(replace(preprocessed, frame=without_depth(frame)), track)
+
+    def _without_pose(self, preprocessed: PreprocessedFrame, track: Track) -> Step:
+        """Return the step of a lost frame whose depth is unknown."""
+        self._reset()
+        unknown_mm = np.asarray(with_unknown_depth(preprocessed.small).depth_mm)
+        refined, frame = RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm), preprocessed.frame
+        return Step(frame, track, np.asarray(frame.depth_mm), refined, preprocessed.skipped)
 
     def new_tracker(self) -> FrameTracker | None:
         """Return a tracker that has seen no frame, to track lost frames anew; None where the tracker cannot."""

@@ -70,8 +70,8 @@ class Pipeline:
 
     @property
     def notices(self) -> list[Notice]:
-        """What could not be processed so far."""
-        return notices_of_faults([stage.faults for stage in self.stages.values()])
+        """What was not, or could not be, processed so far."""
+        return self.preprocessing.notices + notices_of_faults([stage.faults for stage in self.stages.values()])
 
     def estimate(self, frame: Frame) -> PreprocessedFrame:
         """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
@@ -86,8 +86,9 @@ class Pipeline:
         return self.odometry.track(preprocessed)
 
     def fuse(self, step: Step) -> None:
-        """Fuse a tracked frame, or store it until the last one."""
-        self.fusion.put(step.frame, step.track.map)
+        """Fuse a tracked frame, or store it until the last one; of one that was skipped nothing is kept."""
+        if not step.skipped:
+            self.fusion.put(step.frame, step.track.map)
 
     def preprocess(self, frame: Frame) -> PreprocessedFrame:
         """Estimate and match: all that needs no motion."""

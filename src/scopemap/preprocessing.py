@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -17,10 +18,16 @@ from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.warp import resampled
 from scopemap.masking.masker import Masker, StoredMasks, without_instruments
+from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
-from scopemap.tracking.sharpness import PictureQuality
-from scopemap.tracking.track import FrameTracker, TrackingLoss
+from scopemap.tracking.keyframe_alignment import MIN_TEXTURE
+from scopemap.tracking.pyramid import texture
+from scopemap.tracking.sharpness import LEAST_QUALITY, PictureQuality
+from scopemap.tracking.track import FrameTracker, TrackingLoss, unusable
 from scopemap.trajectory.causes import LossCause
+
+# Frames in a row with less texture than the tracker needs, from which they are skipped: motion blur is shorter.
+_MOST_BARE = 10
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,7 @@ class PreprocessedFrame:
 
     small : the frame at the size of the depth estimate and of `correspondence`, that of `frame` over `depth_downscale`.
     depth_note : that most of its depth is beyond the limit; else "". fault : why it could not be processed.
+    skipped : whether nothing was estimated, because the tracker refuses it anyway; its depth is unknown.
     """
 
     frame: Frame
@@ -53,18 +61,27 @@ class PreprocessedFrame:
     anchored: bool
     depth_note: str = ""
     fault: TrackingLoss | None = None
+    skipped: bool = False
 
 
 class Preprocessing:
     """Masks frames and estimates their raw depth, in order, each once."""
 
-    STATE: ClassVar = ("_masker", "_quality", "estimators", "faults")
+    STATE: ClassVar = ("_masker", "_quality", "estimators", "faults", "skipped", "_bare")
     """What changes from frame to frame."""
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._config, self.estimators = config, estimators
         self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
-        self.faults = StageFaults("depth")
+        self.faults, self._bare = StageFaults("depth"), 0
+        self.skipped: Counter[str] = Counter()
+        """How many frames were skipped, by the cause of their loss."""
+
+    @property
+    def notices(self) -> list[Notice]:
+        """Which frames were skipped so far."""
+        causes = ", ".join(f"{count} {cause}" for cause, count in self.skipped.most_common())
+        return [Notice("frames-skipped", {"frames": self.skipped.total(), "causes": causes})] if causes else []
 
     def estimate(self, frame: Frame) -> PreprocessedFrame:
         """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
@@ -72,20 +89,23 @@ class Preprocessing:
             return self._estimate(frame)
         except Exception as error:
             fault = TrackingLoss(LossCause.OTHER, self.faults.noted(frame.index, error))
-            blind = without_depth(frame)
-            small = without_depth(blind.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape))))
-            return PreprocessedFrame(blind, small, "measured", None, False, fault=fault)
+            return self._without_estimate(without_depth(frame), fault)
 
     def _estimate(self, frame: Frame) -> PreprocessedFrame:
         self.faults.frames += 1
-        frame = self._masker(frame)
+        frame, constants = self._masker(frame), self._config.tracking.constants
+        # A frame that the tracker refuses must not fix the scale of depth, and is not worth the networks.
+        if frame.valid.mean() < constants.min_valid_share:
+            return self._skipped(frame, unusable(frame))
+        found = texture(frame, self._config.tracking) if constants.min_texture else 1.0
+        self._bare = self._bare + 1 if found < MIN_TEXTURE else 0
+        if found < constants.min_texture or self._bare > _MOST_BARE:
+            bare = TrackingLoss(LossCause.NO_TEXTURE, f"{found:.2f} of texture, noise has 0.32: contact, blur or fluid")
+            return self._skipped(without_depth(frame), bare)
         frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))
-        # A frame that the tracker refuses must not fix the scale of depth.
-        usable = frame.valid.mean() >= self._config.tracking.constants.min_valid_share
         small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
-        shown = small if usable else replace(small, valid=np.zeros_like(small.valid))
-        estimate = self.estimators.depth.estimate(shown)
-        if usable and estimate.kind != "measured" and not np.isfinite(estimate.values).any():
+        estimate = self.estimators.depth.estimate(small)
+        if estimate.kind != "measured" and not np.isfinite(estimate.values).any():
             self.faults.has_no_depth(frame.index)
         fault, instruments = None, self._masker.instruments(estimate.instruments)
         if instruments is not None:
@@ -93,14 +113,24 @@ class Preprocessing:
             unknown = np.where(instruments, np.float32(np.nan), np.float32(1))
             sigma = None if estimate.sigma is None else estimate.sigma * unknown
             estimate = replace(estimate, values=estimate.values * unknown, sigma=sigma)
-            frame, small, shown = (without_instruments(seen, instruments) for seen in (frame, small, shown))
-            if usable and frame.valid.mean() < self._config.tracking.constants.min_valid_share:
+            frame, small = (without_instruments(seen, instruments) for seen in (frame, small))
+            if frame.valid.mean() < constants.min_valid_share:
                 left = f"only {frame.valid.mean():.0%} of the image is usable"
                 fault = TrackingLoss(LossCause.VIEW_COVERED, f"{left}: instruments cover {instruments.mean():.0%}")
-        raw = self.estimators.anchor.metric(estimate, shown)
+        raw = self.estimators.anchor.metric(estimate, small)
         small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm, views=None)
         frame, fitted = with_depth(frame, raw.depth_mm, raw.sigma_mm), self.estimators.anchor.just_fitted
         return PreprocessedFrame(frame, small, estimate.kind, None, fitted, raw.limit_note, fault)
+
+    def _skipped(self, frame: Frame, why: TrackingLoss) -> PreprocessedFrame:
+        self.skipped[str(why.cause)] += 1
+        return replace(self._without_estimate(frame, why), skipped=True)
+
+    def _without_estimate(self, frame: Frame, fault: TrackingLoss) -> PreprocessedFrame:
+        self._masker.instruments(None)
+        frame = replace(with_unknown_depth(frame), quality=LEAST_QUALITY)
+        small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
+        return PreprocessedFrame(frame, with_unknown_depth(small), "measured", None, False, fault=fault)
 
 
 class Matching:
@@ -118,6 +148,9 @@ class Matching:
         """Add the correspondence of a frame with the one before, where its depth is to be refined with it."""
         frame, wanted = estimated.small, self._needs_previous(estimated.kind)
         self.faults.frames += 1
+        if estimated.skipped:
+            self._matcher.reset()
+            return estimated
         try:
             return replace(estimated, correspondence=self._matcher.match(frame.rgb, frame.valid, wanted=wanted))
         except Exception as error:
@@ -127,8 +160,13 @@ class Matching:
 
 def without_depth(frame: Frame) -> Frame:
     """Return a frame without a usable pixel, and with unknown depth."""
-    nowhere, unknown_mm = np.zeros_like(frame.valid), np.full(frame.valid.shape, np.nan, np.float32)
-    return replace(frame, valid=nowhere, depth_mm=unknown_mm, depth_sigma_mm=None, views=None)
+    return with_unknown_depth(replace(frame, valid=np.zeros_like(frame.valid)))
+
+
+def with_unknown_depth(frame: Frame) -> Frame:
+    """Return a frame with the same usable pixels, and with unknown depth."""
+    unknown_mm = np.full(frame.valid.shape, np.nan, np.float32)
+    return replace(frame, depth_mm=unknown_mm, depth_sigma_mm=None, views=None)
 
 
 def with_depth(frame: Frame, depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> Frame:

@@ -59,7 +59,9 @@ class InputSettings(Settings):
         "smallest whole number that brings it to this, px; 0: the input's size",
     )
     fps: float | None = Field(None, gt=0, description="maximum frames per second, by the time stamps")
-    skip_duplicates: bool = Field(True, description="leave out images of a video that repeat the one before")
+    skip_duplicates: bool = Field(
+        True, description="leave out images of a video that repeat the last one, but for noise"
+    )
 
     @property
     def uses_both_views(self) -> bool:

@@ -15,6 +15,9 @@ class TrackingConstants:
     """Constants of tracking."""
 
     min_valid_share: float = 0.1  # a frame with a smaller usable overlap is lost
+    # A frame whose picture has less texture is lost without being looked at further, as `tracking.pyramid.texture` has
+    # it: noise has 0.32, tissue that can be tracked 0.51 and more; from the 11th in a row on, below 0.5. 0: off.
+    min_texture: float = 0.35
     # A frame below this share of the recent frames' median sharpness is lost where it also fits its keyframe badly.
     min_sharpness: float = 0.6
     relocalisation_keyframes: int = 10  # recent ones in which a lost camera is relocalised; 0: off
@@ -49,11 +52,11 @@ TRACKING: dict[str, dict[str, Any]] = {
     "paper": {
         **{"min_sharpness": 0.0, "relocalisation_keyframes": 0, "new_map_after": 0, "corner_depth_sigma": 0.0},
         **{"min_keyframe_agreement": 0.0, "finest_level": 0, "depth_weight": 0.0, "min_correlation": -1.0},
-        **{"min_keyframe_motion": 0.0, "keyframe_patience": 0},
+        **{"min_keyframe_motion": 0.0, "keyframe_patience": 0, "min_texture": 0.0},
         **{"start": "identity", "channels": "grey", "lamp_gamma": 0.0, "gain_bias": False},
     },
     "least-squares": {"huber": 1e6},
-    "no-verdicts": {"min_valid_share": 0.001, "min_inlier_share": 0.0, "max_step": 1e6},
+    "no-verdicts": {"min_valid_share": 0.001, "min_texture": 0.0, "min_inlier_share": 0.0, "max_step": 1e6},
     "realtime": {"search_every": 3, "max_iterations": 15},
     "no-corners": {"corner_depth_sigma": 0.0},
     "no-early-keyframes": {"min_keyframe_agreement": 0.0},

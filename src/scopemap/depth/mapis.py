@@ -63,6 +63,10 @@ class DenseMatcher:
         consistent = flow.consistent & seen & valid
         return DenseCorrespondence(flow.to_previous, consistent, values, float(valid.mean()))
 
+    def reset(self) -> None:
+        """Let the next image have no previous one."""
+        self._previous = None
+
 
 @dataclass(frozen=True)
 class RefinedDepth:

@@ -226,6 +226,10 @@ class FrameStore:
         for file in self._files:
             file.reopen()
 
+    def __contains__(self, index: int) -> bool:
+        """Return whether the frame with this number is stored."""
+        return index in self._index()[1]
+
     def frame(self, index: int) -> Frame:
         """Return the frame with this number; any thread may call it."""
         entries, place = self._index()

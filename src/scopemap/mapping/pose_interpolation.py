@@ -57,10 +57,11 @@ class FrameCorrection:
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
     tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth. sigma_px :
     robust standard deviation of the reprojection errors; NaN without observations. refused : why nothing is changed,
-    None where it is. loops : number of accepted loop closures. depth_fields : (K,) further factors of each pixel's
-    depth; (): none. S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked :
-    poses as tracked by number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad.
-    lens_residual : what the observations ask of the lens. tissue : how it moves; None: it is taken to be at rest.
+    None where it is. loops : number of accepted loop closures. loop_frames : the two frames of each. depth_fields :
+    (K,) further factors of each pixel's depth; (): none. S_common_map : by number of each merged map, Sim(3) from its
+    world to the common one. tracked : poses as tracked by number of the frame, where known. depth_mm : typical depth,
+    the unit of translations beside rad. lens_residual : what the observations ask of the lens. tissue : how it moves;
+    None: it is taken to be at rest.
     """
 
     index: np.ndarray
@@ -69,6 +70,7 @@ class FrameCorrection:
     sigma_px: float = float("nan")
     refused: Notice | None = None
     loops: int = 0
+    loop_frames: tuple[tuple[int, int], ...] = ()
     depth_fields: tuple[DepthCorrectionField, ...] = ()
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
     tracked: Mapping[int, TrackedPose] = field(default_factory=dict)

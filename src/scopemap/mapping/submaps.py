@@ -62,6 +62,9 @@ class Mapper:
     poses and observations are kept until the last frame. features : of keyframes, for loop closure; None: SIFT.
     """
 
+    NOT_IN_CHECKPOINT = ("_read",)
+    """Not in a checkpoint: `_rows` holds it."""
+
     def __init__(
         self,
         settings: MappingSettings,
@@ -79,6 +82,7 @@ class Mapper:
         # Changes after the last frame: a checkpoint has what was before.
         self._changed: dict[int, TrackedPose] = {}
         self._extended: set[int] = set()
+        self._read: dict[int, TrackedPose] = {}
 
     def observe(self, track: Track) -> None:
         """Note where a frame was tracked, or that it was lost."""
@@ -136,6 +140,7 @@ class Mapper:
     def forget(self, indices: Collection[int]) -> None:
         """Forget where these frames were tracked: they are in no submap."""
         self._rows.keep(~np.isin(self._rows.read()["index"], list(indices)))
+        self._read = {}
 
     def add_keyframe(self, keyframe: Frame, track: Track) -> None:
         """Take a keyframe with refined depth and pose, to be adjusted with the others; it may be observed already."""
@@ -194,14 +199,15 @@ class Mapper:
         return frozenset(index for index, pose in self._tracked.items() if pose.map in maps)
 
     def _poses(self) -> dict[int, TrackedPose]:
-        """Return the poses of all tracked frames by their numbers."""
-        found = self._rows.read()
-        numbers = (found[name].tolist() for name in ("index", "map", "keyframe", "segment"))
-        poses = {
-            index: TrackedPose(number, keyframe, T, segment)
-            for index, number, keyframe, segment, T in zip(*numbers, found["T_world_camera"], strict=True)
-        }
-        return poses | self._changed
+        """Return the poses of all tracked frames by their numbers; after the last frame they are read once."""
+        if len(self._read) != len(self._rows):
+            found = self._rows.read()
+            numbers = (found[name].tolist() for name in ("index", "map", "keyframe", "segment"))
+            self._read = {
+                index: TrackedPose(number, keyframe, T, segment)
+                for index, number, keyframe, segment, T in zip(*numbers, found["T_world_camera"], strict=True)
+            }
+        return self._read | self._changed
 
     def _pose(self, track: Track) -> TrackedPose:
         return TrackedPose(track.map, track.keyframe, track.T_world_camera, self._lost_frames)

@@ -27,7 +27,7 @@ from scopemap.report.summary_picture import summary_picture
 
 PAGE, PICTURE = "report.html", "summary.png"
 _SCRIPTS = (
-    *("matrices", "surface_view", "frame_panels", "curves", "words"),
+    *("matrices", "surface_view", "frame_panels", "curves", "words", "atlas"),
     *("measuring", "measure_by_hand", "page", "gestures"),
 )
 _LICENCES = (

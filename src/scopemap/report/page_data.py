@@ -26,6 +26,7 @@ from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measur
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
 from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.report.verdict import Result, frames_per_s, scale_is_known, scale_source, verdict
+from scopemap.report.video_parts import video_parts
 from scopemap.trajectory.frame_table import NOT_USED
 from scopemap.trajectory.trajectory import Trajectory
 
@@ -92,6 +93,7 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
             {"row": loss.first, "when": loss.when, "frames": loss.frames, "cause": loss.cause, "advice": loss.advice}
             for loss in losses(run.frames)
         ],
+        "parts": [asdict(part) for part in video_parts(run)],
         "not_shown_maps": max(len(run.submaps) - _MOST_MAPS, 0),
         "albedo": tomllib.loads(run.config_text).get("fusion", {}).get("colours") != "raw",
         "truth": _truth(run),
@@ -117,8 +119,11 @@ def _frames(run: RunFolder) -> dict[str, Any]:
     reasons = np.where(place < 0, frames["reason"], "")
     different = sorted({reason for reason in reasons if reason})
     number_of = {reason: number for number, reason in enumerate(different)} | {"": -1}
+    causes = sorted(set(frames["cause"].tolist()))
     return {
         "count": len(frames),
+        "causes": causes,
+        "cause": base64_of(np.searchsorted(causes, frames["cause"]), "i1"),
         "index": base64_of(frames["index"], "i4"),
         "time_s": base64_of(frames["time_s"], "f4"),
         "place": base64_of(place, "i2"),

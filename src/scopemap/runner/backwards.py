@@ -9,6 +9,7 @@ import numpy as np
 
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.pipeline import Pipeline
+from scopemap.preprocessing import without_depth
 from scopemap.tracking.track import Track
 from scopemap.trajectory.frame_table import FrameTable
 
@@ -67,8 +68,10 @@ def _tracked_from(pipeline: Pipeline, start: np.void, earlier: np.ndarray) -> It
         was_tracked = before["status"] != "lost"
         if overlap == _OVERLAP or (was_tracked and before["map"] == start["map"]):
             return
-        frame = replace(store.frame(int(before["index"])), T_world_camera=None)
-        track = tracker.track(frame)
+        # One that was skipped is lost again.
+        index = int(before["index"])
+        frame = store.frame(index) if index in store else replace(without_depth(first), index=index)
+        track = tracker.track(replace(frame, T_world_camera=None))
         failed = failed + 1 if track.status == "lost" else 0
         # A new map would have nothing to do with the first frame.
         if track.map or failed > pipeline.config.tracking.constants.new_map_after or (failed and was_tracked):

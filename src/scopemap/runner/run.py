@@ -240,6 +240,7 @@ class _Finishing:
         notices += depth_notices(medians_mm, fused.settings)
         provenance["notices"] += [notice.as_json() for notice in notices]
         provenance["surface"] = agreement
+        provenance["loops"] = [] if submap.correction is None else submap.correction.loop_frames
         config = config.model_copy(update={"fusion": fused.settings})
         source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px
         return Reconstruction(

@@ -58,6 +58,16 @@ def build_pyramid(
     return views
 
 
+def texture(frame: Frame, settings: TrackingSettings) -> float:
+    """Return the root mean square of a picture's locally normalised channel over usable pixels, 0..1.
+
+    Tissue that fills the picture, heavy blur and fluid leave noise alone.
+    """
+    view = build_pyramid(replace(frame, depth_mm=None), settings, levels=1)[0]
+    weight = view.weight.sum()
+    return float(np.sqrt((view.channels[1] ** 2 * view.weight).sum() / weight)) if weight else 0.0
+
+
 def _slope(depth_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     """Derivative of smoothed inverse depth along the ray's x and y, (H, W, 2) 1/mm; 0 where depth is unknown."""
     known = np.isfinite(depth_mm).astype(np.float32)

@@ -14,7 +14,7 @@ _FRAMES = 30
 # Quality is measured in a small copy, against the upper quartile of so many frames: unlike their median, it is still
 # that of clear ones where fluid stays for seconds.
 _SMALL_PX, _NEIGHBOURS, _CLEAR_PERCENTILE = 320, 100, 75
-_LEAST_QUALITY = 0.01
+LEAST_QUALITY = 0.01
 
 
 class SharpnessMonitor:
@@ -45,7 +45,7 @@ class PictureQuality:
         """Return the quality, 0.01..1, of an image (H, W, 3) uint8 with valid pixels (H, W) bool."""
         share = float(valid.mean())
         if share == 0:
-            return _LEAST_QUALITY
+            return LEAST_QUALITY
         height, width = valid.shape
         factor = min(1.0, _SMALL_PX / max(height, width))
         size = max(1, round(factor * width)), max(1, round(factor * height))
@@ -55,14 +55,15 @@ class PictureQuality:
         self._recent.append(found)
         clear = np.percentile(self._recent, _CLEAR_PERCENTILE, axis=0)
         shares = np.minimum(found / np.maximum(clear, 1e-9), 1.0)
-        return max(float(shares.prod()), _LEAST_QUALITY)
+        return max(float(shares.prod()), LEAST_QUALITY)
 
 
 def _saturation(rgb: np.ndarray, valid: np.ndarray) -> float:
     """Return the mean saturation of the colours, 0..1, over valid pixels."""
-    seen = rgb[valid].astype(np.float32)
-    brightest = seen.max(1, initial=1.0)
-    return float(((brightest - seen.min(1, initial=255.0)) / brightest).mean()) if len(seen) else 0.0
+    r, g, b = cv2.split(rgb)
+    brightest, darkest = cv2.max(cv2.max(r, g), b), cv2.min(cv2.min(r, g), b)
+    share = (brightest - darkest).astype(np.float32) / cv2.max(brightest, 1)  # black has none
+    return cv2.mean(share, valid.astype(np.uint8))[0]
 
 
 def sharpness(rgb: np.ndarray, valid: np.ndarray) -> float:

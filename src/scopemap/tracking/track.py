@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from scopemap.frame import Frame
+from scopemap.frame import Frame, percentiles
 from scopemap.geometry.se3 import inverse
 from scopemap.trajectory.causes import LossCause
 
@@ -84,7 +84,7 @@ class Track:
 
 def unusable(frame: Frame) -> TrackingLoss:
     """Return why few pixels of an image are usable: it is dark, overexposed, or something covers the view."""
-    low, middle = np.percentile(frame.rgb.max(axis=2), [20, 50])
+    low, middle = percentiles(frame.rgb[::2, ::2].max(axis=2), [20.0, 50.0])
     reason = f"only {frame.valid.mean():.0%} of the image is usable"
     if middle < _DARK_LEVEL:
         return TrackingLoss(LossCause.TOO_DARK, f"{reason}, it is too dark")

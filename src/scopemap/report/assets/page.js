@@ -17,7 +17,7 @@ function prepared(raw) {
   };
   return {
     ...raw, places, curves, poseOf, reasons: frames.reasons, indices: new Int32Array(bytesOf(frames.index)), times: floats(frames.time_s),
-    reasonOf: new Int16Array(bytesOf(frames.reason)), truth: raw.truth && { ...raw.truth, positions: floats(raw.truth.positions) },
+    reasonOf: new Int16Array(bytesOf(frames.reason)), causes: frames.causes, causeOf: new Int8Array(bytesOf(frames.cause)), truth: raw.truth && { ...raw.truth, positions: floats(raw.truth.positions) },
   };
 }
 
@@ -162,7 +162,7 @@ function writeSceneScale(from, distance) {
 }
 
 function writeSubmaps() {
-  element("submaps").hidden = run.maps.length < 2;
+  element("apart").hidden = element("submap-list").hidden = run.maps.length < 2;
   const buttons = run.maps.map((map, number) => {
     const button = document.createElement("button"), canvas = document.createElement("canvas"), first = run.places.indexOf(number);
     const note = document.createElement("small");
@@ -170,8 +170,12 @@ function writeSubmaps() {
     button.dataset.map = String(number);
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", number ? `Surface of submap ${number}` : "Surface of the result");
-    note.textContent = [`${map.frames} frames, from ${run.times[Math.max(first, 0)].toFixed(1)} s on`, map.inliers].filter(Boolean).join(", ");
-    button.append(canvas, number ? `Submap ${number} (maps/${number})` : "The result", note);
+    note.textContent = [`${map.frames} frames, ${partsInWords(run, number)}`, map.inliers].filter(Boolean).join(", ");
+    const pair = document.createElement("span"), seen = run.pictures.filter((picture) => run.places[picture.row] === number);
+    pair.className = "pair";
+    pair.append(canvas);
+    if (seen.length) pair.append(Object.assign(new Image(), { src: `data:image/jpeg;base64,${seen[seen.length >> 1].jpg}`, alt: "a frame of it" }));
+    button.append(pair, number ? `Submap ${number} (maps/${number})` : "The result", note);
     button.addEventListener("click", () => (showMap(number), setRow(first)));
     if (view && map.vertices) {
       const { centre, radius } = run.balls[number], R = turned(-0.7, -0.4), t = add(centre, scaled(column(R, 2), -2.2 * radius)), lens = lensOf(320, 240, 0.9);
@@ -245,6 +249,7 @@ function open(number) {
   element("slider").max = run.places.length - 1;
   showMap(0);
   drawStrip(element("strip"), run);
+  openAtlas(run, setRow);
   row = Math.max(run.places.indexOf(0), 0);
   openMeasures();
 }
@@ -255,6 +260,7 @@ function setTheme(dark) {
   put("theme", dark ? "Light" : "Dark");
   if (!run) return;
   drawStrip(element("strip"), run);
+  drawAtlas(element("atlas"), run);
   setRow(row);
 }
 

@@ -1,0 +1,62 @@
+"""Frames in which nothing can be followed: no network looks at them, and what is said of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from spied_depth import spied
+from tiny_phantom import write_tiny
+
+from scopemap import open_sequence, reconstruct
+from scopemap.config import Config
+from scopemap.io.frame_choice import is_at_rest
+
+FRAMES = 14
+BLACK, WALL = {4, 5, 6}, {8, 9}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A phantom; some frames are black, some show a red wall with a sensor's noise."""
+    made, rng = write_tiny(tmp_path_factory.mktemp("phantom"), frames=FRAMES), np.random.default_rng(0)
+    for index in BLACK | WALL:
+        file = made / f"{index:04d}_color.png"
+        shape = cv2.imread(str(file)).shape
+        # Brighter on one side, as a wall that is touched is.
+        wall = np.linspace(0.6, 1.2, shape[1])[None, :, None] * np.array([50, 60, 180])
+        picture = (0 if index in BLACK else wall) + rng.normal(0, 1.5, shape)
+        cv2.imwrite(str(file), picture.clip(0, 255).astype(np.uint8))
+    return made
+
+
+def test_no_network_looks_at_them_and_they_are_counted(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spies = spied(monkeypatch)
+    result = reconstruct(open_sequence(folder), Config(), out=tmp_path / "out")
+    asked = {frame.index for frame in spies[0].seen}
+    assert asked == set(range(FRAMES)) - BLACK - WALL
+    causes = dict(zip(result.frames["index"].tolist(), result.frames["cause"].tolist(), strict=True))
+    assert {causes[index] for index in BLACK} == {"too dark"}
+    assert {causes[index] for index in WALL} == {"no texture"}
+    assert result.frames.tracked.sum() == len(asked)
+    (notice,) = (one for one in result.provenance["notices"] if one["code"] == "frames-skipped")
+    assert notice["values"] == {"frames": 5, "causes": "3 too dark, 2 no texture"}
+    depths = {int(file.stem) for file in (tmp_path / "out" / "depth").glob("*.png")}
+    assert depths == asked
+
+
+def test_noise_is_no_motion_and_a_small_motion_is_one() -> None:
+    rng = np.random.default_rng(1)
+    scene = cv2.GaussianBlur(rng.normal(0, 800, (256, 330, 3)), (0, 0), 12) + 120
+
+    def seen(x: int) -> np.ndarray:
+        return (scene[:, x : x + 320] + rng.normal(0, 2, (256, 320, 3))).clip(0, 255).astype(np.uint8)
+
+    assert is_at_rest(seen(0), seen(0))
+    assert not is_at_rest(seen(0), seen(1))
+    black = np.zeros((256, 320, 3), np.uint8)
+    assert not is_at_rest(black, black)
