@@ -134,10 +134,11 @@ def test_ablations_and_scared_c_run_to_the_last_row(
 
 def test_hamlyn_is_drawn_by_the_estimated_poses(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     use_weights(data / "weights", monkeypatch)
-    rows, figures = run(only("hamlyn", "rectified14"), data / "hamlyn", tmp_path, monkeypatch)
-    absent = set(IMPORTED) | (set() if OPEN3D_IS_THERE else WITHOUT_OPEN3D)
-    assert {row.method for row in rows if row.status != "done"} == absent
-    assert all(row.figure("poses", "frames_until_loss") > 0 for row in rows if row.status == "done")
+    plan = only("hamlyn", "rectified14")
+    few = plan.model_copy(update={"method": tuple(m for m in plan.method if m.name in OURS[:2])})
+    rows, figures = run(few, data / "hamlyn", tmp_path, monkeypatch)
+    assert [row.status for row in rows] == ["done", "done"]
+    assert all(row.figure("poses", "frames_until_loss") > 0 for row in rows)
     shown = {name.removesuffix(".png").partition("_rectified14")[0] for name in figures if "rectified14" in name}
     assert shown == OF_A_SEQUENCE
     assert "frames_until_loss.png" in figures

@@ -51,9 +51,7 @@ def test_three_cases(seed: int) -> None:
     np.testing.assert_allclose(dogleg_step(model, newton, 1.01 * length), newton)
     descent = -model.gradient / np.linalg.norm(model.gradient)
     cauchy = minimize_scalar(lambda h: _value(model, h * descent)).x
-    np.testing.assert_allclose(
-        dogleg_step(model, newton, 0.5 * cauchy), 0.5 * cauchy * descent, rtol=1e-6
-    )
+    np.testing.assert_allclose(dogleg_step(model, newton, 0.5 * cauchy), 0.5 * cauchy * descent, rtol=1e-6)
     between = 0.5 * (cauchy + length)
     step = dogleg_step(model, newton, between)
     # On the straight way from the Cauchy point to the Gauss-Newton step, where it leaves the ball.

@@ -261,7 +261,6 @@ class Backend:
         graph = problem.begin
         (within, between_px), (before, _) = sigmas_px(found.state), sigmas_px(graph)
         index = np.array(self._frames)[chosen]
-        loop_frames = tuple((past, new) for past, new in index[accepted].tolist())
         if not refused:
             correction = self._correction(chosen, worlds, found)
             residual = lens_residual(problem, found)
@@ -275,7 +274,7 @@ class Backend:
         else:
             as_tracked = np.tile(np.eye(4), (len(chosen), 1, 1))
             correction = FrameCorrection(index, as_tracked, np.zeros(len(index)), found.sigma_px, refused=refused)
-        correction = replace(correction, loop_frames=loop_frames if correction.loops else ())
+        correction = replace(correction, loop_frames=index[accepted].tolist() if correction.loops else [])
         # A map of one keyframe has no observations: NaN.
         largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
         main_px, support = within[list(worlds).index(main)], loop_support(accepted, map_of, main)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -70,7 +70,7 @@ class FrameCorrection:
     sigma_px: float = float("nan")
     refused: Notice | None = None
     loops: int = 0
-    loop_frames: tuple[tuple[int, int], ...] = ()
+    loop_frames: Sequence[Sequence[int]] = ()
     depth_fields: tuple[DepthCorrectionField, ...] = ()
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
     tracked: Mapping[int, TrackedPose] = field(default_factory=dict)

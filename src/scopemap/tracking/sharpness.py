@@ -62,7 +62,7 @@ def _saturation(rgb: np.ndarray, valid: np.ndarray) -> float:
     """Return the mean saturation of the colours, 0..1, over valid pixels."""
     r, g, b = cv2.split(rgb)
     brightest, darkest = cv2.max(cv2.max(r, g), b), cv2.min(cv2.min(r, g), b)
-    share = (brightest - darkest).astype(np.float32) / cv2.max(brightest, 1)  # black has none
+    share = (brightest - darkest).astype(np.float32) / np.maximum(brightest, 1)  # black has none
     return cv2.mean(share, valid.astype(np.uint8))[0]
 
 
