@@ -175,7 +175,7 @@ CEILINGS = {
     "core, net": (lambda: _net(MODULES), 22_295),
     "bench": (lambda: _total(BENCH_MODULES), 14_090),  # 445: polyps; 235: two runs; 980: peers, tissue; 210: exams
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 34_715),  # those of all of these; 230: a network at rest; 30: merging by the graph
+    "tests": (lambda: _total(TESTS), 34_720),  # those of all of these; 230: a network at rest; 30: merging by the graph
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 103),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 14_900),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

@@ -126,12 +126,13 @@ def test_kinds_of_own_depth_mean_different_scales(folder: Path) -> None:
     ],
 )
 def test_what_own_depth_returns_is_checked(function: Callable[[np.ndarray], np.ndarray], fault: str) -> None:
-    one, grey = Reconstructor(None, CAMERA, depth=OwnDepth(function, "metric")), np.full((128, 160, 3), 99, np.uint8)
+    one = Reconstructor(None, CAMERA, depth=OwnDepth(function, "metric"))
+    tissue = np.random.default_rng(0).integers([120, 50, 40], [180, 90, 80], (128, 160, 3)).astype(np.uint8)
     with pytest.raises(InputError, match=fault):
-        one.step(grey)
+        one.step(tissue)
     two = Reconstructor(None, CAMERA, flow=lambda a, b: np.zeros((2, 2, 2)))
     with pytest.raises(InputError, match="own flow: expected floats of shape"):
-        [two.step(grey + step) for step in range(3)]
+        [two.step(tissue + step) for step in range(3)]
 
 
 def test_own_parts_without_a_kind_or_a_function_are_refused() -> None:

@@ -14,8 +14,9 @@ from scopemap import open_sequence, reconstruct
 from scopemap.config import Config
 from scopemap.io.frame_choice import is_at_rest
 
-FRAMES = 14
-BLACK, WALL = {4, 5, 6}, {8, 9}
+FRAMES = 24
+BLACK, WALL = {4, 5, 6}, set(range(7, 20))
+PASSED_OVER = {17, 18, 19}  # the first ten of a wall are looked at
 
 
 @pytest.fixture(scope="module")
@@ -38,13 +39,12 @@ def test_no_network_looks_at_them_and_they_are_counted(
     spies = spied(monkeypatch)
     result = reconstruct(open_sequence(folder), Config(), out=tmp_path / "out")
     asked = {frame.index for frame in spies[0].seen}
-    assert asked == set(range(FRAMES)) - BLACK - WALL
+    assert asked == set(range(FRAMES)) - BLACK - PASSED_OVER
     causes = dict(zip(result.frames["index"].tolist(), result.frames["cause"].tolist(), strict=True))
     assert {causes[index] for index in BLACK} == {"too dark"}
-    assert {causes[index] for index in WALL} == {"no texture"}
-    assert result.frames.tracked.sum() == len(asked)
+    assert {causes[index] for index in PASSED_OVER} == {"no texture"}
     (notice,) = (one for one in result.provenance["notices"] if one["code"] == "frames-skipped")
-    assert notice["values"] == {"frames": 5, "causes": "3 too dark, 2 no texture"}
+    assert notice["values"] == {"frames": 6, "causes": "3 too dark, 3 no texture"}
     depths = {int(file.stem) for file in (tmp_path / "out" / "depth").glob("*.png")}
     assert depths == asked
 

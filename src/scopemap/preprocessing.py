@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -20,13 +21,12 @@ from scopemap.geometry.warp import resampled
 from scopemap.masking.masker import Masker, StoredMasks, without_instruments
 from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
-from scopemap.tracking.keyframe_alignment import MIN_TEXTURE
 from scopemap.tracking.pyramid import texture
 from scopemap.tracking.sharpness import LEAST_QUALITY, PictureQuality
 from scopemap.tracking.track import FrameTracker, TrackingLoss, unusable
 from scopemap.trajectory.causes import LossCause
 
-# Frames in a row with less texture than the tracker needs, from which they are skipped: motion blur is shorter.
+# So many frames in a row with too little texture are looked at: motion blur is shorter.
 _MOST_BARE = 10
 
 
@@ -97,9 +97,9 @@ class Preprocessing:
         # A frame that the tracker refuses must not fix the scale of depth, and is not worth the networks.
         if frame.valid.mean() < constants.min_valid_share:
             return self._skipped(frame, unusable(frame))
-        found = texture(frame, self._config.tracking) if constants.min_texture else 1.0
-        self._bare = self._bare + 1 if found < MIN_TEXTURE else 0
-        if found < constants.min_texture or self._bare > _MOST_BARE:
+        found = texture(frame, self._config.tracking) if constants.min_texture else math.inf
+        self._bare = self._bare + 1 if found < constants.min_texture else 0
+        if self._bare > _MOST_BARE:
             bare = TrackingLoss(LossCause.NO_TEXTURE, f"{found:.2f} of texture, noise has 0.32: contact, blur or fluid")
             return self._skipped(without_depth(frame), bare)
         frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))

@@ -15,9 +15,9 @@ class TrackingConstants:
     """Constants of tracking."""
 
     min_valid_share: float = 0.1  # a frame with a smaller usable overlap is lost
-    # A frame whose picture has less texture is lost without being looked at further, as `tracking.pyramid.texture` has
-    # it: noise has 0.32, tissue that can be tracked 0.51 and more; from the 11th in a row on, below 0.5. 0: off.
-    min_texture: float = 0.35
+    # From the 11th frame in a row with less texture on, as `tracking.pyramid.texture` has it, a frame is lost without
+    # being looked at further: noise has 0.32, a wall that is touched up to 0.45. 0: off.
+    min_texture: float = 0.5
     # A frame below this share of the recent frames' median sharpness is lost where it also fits its keyframe badly.
     min_sharpness: float = 0.6
     relocalisation_keyframes: int = 10  # recent ones in which a lost camera is relocalised; 0: off
