@@ -24,7 +24,7 @@ from scopemap.cli.app import app, main
 
 Capture = pytest.CaptureFixture[str]
 JSON_KEYS = ["input", "dataset", "frames", "tracked", "lost", "rotation_only", "in_other_maps", "skipped", "camera"]
-JSON_KEYS += ["scale", "estimators", "notices", "seconds", "versions", "machine", "surface", "loops"]
+JSON_KEYS += ["scale", "estimators", "notices", "seconds", "versions", "machine", "surface"]
 JSON_KEYS += [
     "loops",
     "interrupted_at_frame",
