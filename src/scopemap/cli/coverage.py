@@ -29,8 +29,8 @@ def coverage(
 ) -> None:
     """Estimate which share of the tissue no frame saw, with an interval of 90 %, and list where.
 
-    Writes coverage.json, map.csv, map.png and coverage.ply. Calibrated on synthetic colons and cavities; not for decisions
-    about a patient.
+    Writes coverage.json, map.csv, map.png and coverage.ply. Calibrated on synthetic colons and cavities; not for
+    decisions about a patient.
     """
     from scopemap.report.page import PAGE, write_report
     from scopemap.report.page_data import COVERAGE
