@@ -44,7 +44,6 @@ _MAX_PART_ERROR = 0.05
 # Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
 MOST_OBSERVATIONS = 1_000_000
 """Of an adjustment, unless memory is limited."""
-_MOST_REFUSED = 2  # maps that a map is tried with in vain: each costs an adjustment
 
 
 class Backend:
@@ -154,27 +153,52 @@ class Backend:
             self._take(self._finder.between([pose.map for pose in self._tracked]))
             self._all_weighed = True
         allowed = {pose.map for pose in self._tracked} if among is None else set(among)
-        worlds = {map_number: Similarity.identity()}
         # Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
         for share in (1.0, 0.0) if any(self._log_scales) else (0.0,):
             self._path = path_without_drift(self._tracked, share * np.array(self._log_scales))
-            found = alone = self._adjusted(worlds, map_number)
+            alone = self._adjusted({map_number: Similarity.identity()}, map_number)
             if not alone.correction.refused:
                 break
-        refused = 0
-        for number in [*self._merged(map_number, allowed)][1:]:  # the best supported first
-            more = self._merged(map_number, {*worlds, number})
-            if number not in more or refused == _MOST_REFUSED:
-                continue
-            together = self._adjusted(more, map_number)
-            if together.accepted(alone, self.settings.max_sigma_px):
-                found, worlds = together, more
-            else:
-                refused += 1
+        found, worlds = self._merged_and_adjusted(map_number, allowed, alone)
         correction = found.correction if len(worlds) > 1 else self._with_moving_tissue(found, worlds)
         if not correction.refused and correction.tissue is None:
             correction = replace(correction, lens_residual=lens_residual(found.problem, found.rigid))
         return replace(correction, S_common_map=worlds, tracked=tracked or {})
+
+    def _merged_and_adjusted(
+        self, main: int, allowed: Collection[int], alone: AdjustedMaps
+    ) -> tuple[AdjustedMaps, dict[int, Similarity]]:
+        """Return the adjustment of a map with all that fit to it, the best supported first, and their Sim(3).
+
+        alone : the map's own. Each map is tried with the main one and with that of the merged ones that it has most
+        loops with, so that time grows with the number of maps, and all are adjusted together in the end.
+        """
+        found, worlds, merged, refused = alone, {main: Similarity.identity()}, {main}, 0
+        for number in [*self._merged(main, allowed)][1:]:
+            few = {main, self._partner(number, merged), number}
+            # Each try costs an adjustment: no more of them fail than maps are merged, and one.
+            if refused > len(merged) or number not in (S := self._merged(main, few)):
+                continue
+            together = self._adjusted(S, main)
+            if not together.accepted(alone, self.settings.max_sigma_px):
+                refused += 1
+                continue
+            merged.add(number)
+            if merged <= few or len(worlds) == 1:
+                found, worlds = together, S
+        if len(worlds) < len(merged):
+            S = self._merged(main, merged)
+            together = self._adjusted(S, main)
+            if together.accepted(alone, self.settings.max_sigma_px):
+                return together, S
+        return found, worlds
+
+    def _partner(self, number: int, merged: Collection[int]) -> int:
+        """Return the map among merged ones that a map has most loops with."""
+        map_of, loops = np.array([pose.map for pose in self._tracked]), self._loops.read()
+        ends = np.column_stack([map_of[loops["past"]], map_of[loops["new"]]])
+        others = ends[(ends == number).any(1)].sum(1) - number
+        return max(sorted(merged), key=lambda one: int((others == one).sum()))
 
     def _observe(self, keyframe: Frame, map_number: int) -> None:
         """Add a keyframe's feature tracks and loop closures."""
