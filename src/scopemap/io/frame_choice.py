@@ -104,10 +104,12 @@ def is_at_rest(one: np.ndarray, other: np.ndarray) -> bool:
     """Return whether two (h, w, 3) uint8 of one size, not constant, differ by no more than a sensor's noise."""
     height, width = one.shape[:2]
     step = max(1, min(height, width) // _BLOCKS)
-    size = max(1, width // step), max(1, height // step)
+    columns, rows = width // step, height // step
     if mean_difference(one, other) > _MOST_NOISE:
         return False
-    before, now = (cv2.resize(rgb, size, interpolation=cv2.INTER_AREA) for rgb in (one, other))
+    # Blocks of whole pixels take a quarter of the time.
+    whole = (rgb[: rows * step, : columns * step] for rgb in (one, other))
+    before, now = (cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA) for rgb in whole)
     change = cv2.absdiff(before, now).mean(axis=2)
     limits = (change.mean() < _REST[0]) & (np.percentile(change, 99) < _REST[1])
     return bool(limits) and not is_constant(now)
