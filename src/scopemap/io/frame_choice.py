@@ -108,8 +108,10 @@ def is_at_rest(one: np.ndarray, other: np.ndarray) -> bool:
     one, other = (np.ascontiguousarray(rgb[::every, ::every]) for rgb in (one, other))
     height, width = one.shape[:2]
     step = max(1, min(height, width) // _BLOCKS)
-    size = max(1, width // step), max(1, height // step)
-    before, now = (cv2.resize(rgb, size, interpolation=cv2.INTER_AREA) for rgb in (one, other))
+    columns, rows = width // step, height // step
+    # Blocks of whole pixels take a quarter of the time.
+    whole = (rgb[: rows * step, : columns * step] for rgb in (one, other))
+    before, now = (cv2.resize(rgb, (columns, rows), interpolation=cv2.INTER_AREA) for rgb in whole)
     change = cv2.absdiff(before, now).mean(axis=2)
     limits = (change.mean() < _REST[0]) & (np.percentile(change, 99) < _REST[1])
     return bool(limits) and not is_constant(now)
