@@ -45,13 +45,13 @@ def test_observations_ask_for_the_right_lens(factor: float, shift: tuple[float, 
     seen = observations.pixel + off_px + rng.normal(0, 0.1, observations.pixel.shape)
     points, observations = replace(points, pixel=points.pixel + off_px), replace(observations, pixel=seen)
     problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, factor * FOCAL_PX)
-    asked = np.array(lens_residual(problem, adjust(problem))[:3])
+    asked = np.array(lens_residual(problem, adjust(problem).state)[:3])
     expected = np.array([-np.log(factor), *np.array(shift) / factor])
     assert asked == pytest.approx(expected, abs=0.02)
     assert ((asked == 0) == (expected == 0)).all()
     nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     unseen = replace(problem, observations=nothing)
-    assert np.isnan(lens_residual(unseen, adjust(unseen))).all()
+    assert np.isnan(lens_residual(unseen, adjust(unseen).state)).all()
 
 
 @pytest.mark.parametrize("window", [2, 3])

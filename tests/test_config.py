@@ -24,7 +24,7 @@ READERS = {
     "run": ["runner/memory.py"],
     "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner/*.py"],
     "mask": ["masking/*.py"],
-    "depth": ["depth/*.py", "estimators.py"],
+    "depth": ["depth/*.py", "estimators.py", "preprocessing.py"],
     "mapis": ["depth/*.py", "preprocessing.py", "odometry.py"],
     "networks": ["estimators.py"],
     "tracking": ["tracking/*.py", "estimators.py", "preprocessing.py"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import trimesh
 from drawn_run import CAMERA, drawn_result, tube
 from front_door import call, refused
+from test_true_surface import write_coverage
 
 from scopemap.actions.coverage.coverage import BLIND, NOT_SEEN, Coverage, coverage, regions
 from scopemap.actions.coverage.layout import Cavity, Lumen, binned
@@ -23,10 +25,11 @@ from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.geometry.centreline import Centreline, centreline, clock
 from scopemap.geometry.rendering import render_mesh
-from scopemap.geometry.se3 import se3
+from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.io.depth_maps import DepthWriter
 from scopemap.io.run_folder import RunFolder
 from scopemap.trajectory.frame_table import FrameTable
+from scopemap_bench.scripts import coverage as scoring
 
 HOLE_AT, HOLE_CLOCK, HOLE_MM = 40.0, 3.0, 12.0
 
@@ -242,3 +245,42 @@ def test_a_known_scale_gives_millimetres(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", tube(), ALONG_THE_TUBE[::2], scale=known)
     found: Coverage = coverage(run)
     assert found.facts["unit"] == found.facts["along_unit"] == "mm"
+
+
+def write_truth(folder: Path, positions_mm: np.ndarray) -> Path:
+    """C3VD's truth of the tube, twice as large: its hole was missed, and all of a tube beside it."""
+    folder.mkdir()
+    R, t, wall = so3_exp(np.array([0.3, -0.2, 0.5])), np.array([5.0, -8.0, 20.0]), tube()
+    beside = wall.copy().apply_translation([70.0, 0, 0])
+    mesh = trimesh.util.concatenate([wall, beside])
+    observed = np.concatenate([~in_hole(wall.triangles_center), np.zeros(len(beside.faces), bool)])
+    mesh.vertices = 2 * mesh.vertices @ R.T + t
+    write_coverage(folder / "coverage_mesh.obj", mesh, observed)
+    # Its poses are transposed.
+    rows = [se3(R, 2 * R @ position + t).T.ravel() for position in positions_mm]
+    np.savetxt(folder / "pose.txt", rows, fmt="%.9g", delimiter=",")
+    return folder
+
+
+def test_a_result_is_measured_against_c3vds_coverage_mesh(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    around = np.linspace(0, 3 * np.pi, 30)
+    positions = ALONG_THE_TUBE + np.column_stack([np.cos(around), np.sin(around), np.zeros(30)])
+    run = write_run(tmp_path / "run", without(tube(), in_hole), positions)
+    with pytest.raises(InputError, match=r"holds no coverage_mesh\.obj"):
+        scoring.of_c3vd(run, tmp_path)
+    name, found, errors = scoring.of_c3vd(run, write_truth(tmp_path / "tube_t1_a", positions))
+    hole = HOLE_MM**2 / (2 * np.pi * 10 * (found.total.end - found.total.start))
+    assert errors.share == pytest.approx(hole, rel=0.15)
+    place = HOLE_AT - found.layout.line.points_mm[found.first, 2]
+    assert np.argmax(errors.segments) == np.argmax([part.end > place for part in found.segments])
+    assert sum(share > 0 for share in errors.segments) <= 2
+    assert errors.found == [True]
+    assert sum(errors.right) == 1
+    monkeypatch.setattr(sys, "argv", ["coverage", "--c3vd", str(run), str(tmp_path / name)])
+    scoring.main()
+    row = capfd.readouterr().out.splitlines()[2]
+    estimated = f"{found.total.share:.1%} ({found.total.low:.0%} to {found.total.high:.0%})"
+    assert row.startswith(f"| tube_t1_a | {errors.share:.1%} | {estimated} | ")
+    assert row.endswith("| 1 of 1 |")

@@ -19,6 +19,7 @@ from scopemap.frame import Frame
 from scopemap.io.depth_maps import DepthReader, DepthWriter
 from scopemap.io.sequence import Sequence
 from scopemap.notices import scale_words
+from scopemap.report.depth_figures import write_previews
 
 UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
 
@@ -47,13 +48,18 @@ def _frame(images: Sequence, index: int, depth_mm: float) -> Frame:
     return replace(frame, index=index, depth_mm=ramp_mm, depth_sigma_mm=None)
 
 
-def test_previews_have_one_range_for_all_frames_and_unknown_is_black(images: Sequence, tmp_path: Path) -> None:
+def test_previews_have_one_range_and_legend_for_all_frames_and_unknown_is_black(
+    images: Sequence, tmp_path: Path
+) -> None:
     write = DepthWriter(tmp_path)
     for index, depth_mm in enumerate((10.0, 40.0)):
         write(_frame(images, index, depth_mm))
-    write.finish(scale_known=False)
+    range_mm = write.finish(scale_known=False)
+    assert range_mm is not None
+    write_previews(tmp_path, range_mm, scale_known=False)
     facts = json.loads((tmp_path / "depth" / "depth.json").read_text())
     near_mm, far_mm = facts["preview_mm"]
+    assert (near_mm, far_mm) == range_mm
     assert 10 <= near_mm < 12
     assert 75 < far_mm <= 80
     assert facts["scale_known"] is False
@@ -61,8 +67,21 @@ def test_previews_have_one_range_for_all_frames_and_unknown_is_black(images: Seq
     assert near.dtype == np.uint8
     assert max(near[:6].max(), far[:6].max()) < 20
     assert near[11, 5, 2] > 100 > near[11, 5, 0]  # red, as OpenCV orders colours
-    assert far[-2, -5, 0] > far[-2, -5, 2]
-    assert np.median(near[12:].max(axis=-1)) > 100
+    height = images.camera.height
+    legend = far[height:]
+    assert far[height - 2, -5, 0] > far[height - 2, -5, 2]
+    assert np.median(near[12:height].max(axis=-1)) > 100
+    np.testing.assert_array_equal(near[height + 8 :], legend[8:])  # but for what JPEG smears
+    # What the legend calls nearest, farthest and unknown has the colours of these.
+    nearest, farthest, unknown = (legend[23:29, x : x + 6].mean((0, 1)) for x in (8, 62, 116))
+    assert nearest[2] > 100 > nearest[0]
+    assert np.abs(nearest - near[10:14, :4].mean((0, 1))).max() < 40
+    assert np.abs(farthest - far[height - 3 : height, -4:].mean((0, 1))).max() < 40
+    assert unknown.max() < 30
+    write_previews(tmp_path, range_mm, scale_known=True)
+    known = cv2.imread(str(tmp_path / "depth_preview" / "000001.jpg"))[height:]
+    assert (known != legend).any()  # millimetres, not multiples
+    assert DepthWriter(tmp_path / "none").finish(scale_known=True) is None
     depth_mm = DepthReader(tmp_path).read(1)
     assert depth_mm is not None
     np.testing.assert_allclose(depth_mm[10:].min(), np.nanmin(_frame(images, 1, 40.0).depth_mm), atol=0.01)

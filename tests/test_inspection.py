@@ -30,6 +30,7 @@ from drawn_clips import (
 )
 from drawn_dicom import write_dicom_video
 
+from scopemap.cameras.scopes import SCOPES
 from scopemap.errors import InputError
 from scopemap.inspection.clip import VideoFinding
 from scopemap.inspection.inspecting import Inspection, inspect
@@ -89,7 +90,7 @@ def test_the_field_of_view_is_reported_with_its_outline(
     tmp_path: Path, shape: str, draw: Callable[[np.ndarray], None]
 ) -> None:
     found = inspected(tmp_path, inside(draw))
-    assert list(by_code(found)) == [f"field-{shape.replace(' ', '-')}"]
+    assert [code for code in by_code(found) if code != "scope"] == [f"field-{shape.replace(' ', '-')}"]
     assert (found.field.shape, found.findings[0].severity) == (shape, "info")
     truth, drawn = np.zeros(SIZE[::-1], np.uint8), np.zeros(SIZE[::-1], np.uint8)
     draw(truth)
@@ -98,9 +99,41 @@ def test_the_field_of_view_is_reported_with_its_outline(
     assert found.field.share == pytest.approx(truth.mean(), abs=0.03)
 
 
+def disc(radius_px: int) -> Callable[[np.ndarray], object]:
+    """A round field around the picture's middle."""
+    return lambda mask: cv2.circle(mask, (mask.shape[1] // 2, mask.shape[0] // 2), radius_px, 1, -1)
+
+
+def cut(left: int, corner_px: int) -> Callable[[np.ndarray], object]:
+    """A rectangle with cut corners, some pixels inside of the picture's left and right."""
+    low, across = SIZE[1] - 1, SIZE[0] - 1 - 2 * left
+    a, b, c = corner_px, across - corner_px, low - corner_px
+    corners = [[0, a], [a, 0], [b, 0], [across, a], [across, c], [b, low], [a, low], [0, c]]
+    return lambda mask: cv2.fillConvexPoly(mask, np.add(corners, [left, 0]), 1)
+
+
+@pytest.mark.parametrize(
+    ("draw", "size", "kinds"),
+    [(circle, SIZE, "laparoscope|cystoscope|sinus|bronchoscope|ureteroscope"),
+     (disc(112), (240, 240), "laparoscope|cystoscope|sinus|bronchoscope|ureteroscope|capsule"),
+     (octagon, SIZE, "colonoscope|gastroscope"),
+     (cut(40, 60), SIZE, ""), (cut(0, 36), SIZE, ""),  # square, as a capsule's may be; corners as small as an arc's
+     (disc(168), SIZE, ""), (disc(178), SIZE, ""),  # round, but the picture shows no more than its corners
+     (rounded, SIZE, ""), (bars, SIZE, "")],
+)  # fmt: skip
+def test_the_kind_of_endoscope_is_guessed_where_the_field_of_view_tells_it(
+    tmp_path: Path, draw: Callable[[np.ndarray], object], size: tuple[int, int], kinds: str
+) -> None:
+    video = write(tmp_path / "video.mp4", clip(25, inside(draw), size=size))
+    advice = [found.advice for found in inspect(video).findings if found.code == "scope"]
+    assert advice == ([f"--scope {kinds}: name the one that it is"] if kinds else [])
+    assert set(kinds.split("|")) <= {*SCOPES, ""}
+    assert "scope" not in by_code(inspect(video, camera="300 300 160 120"))
+
+
 def test_a_field_that_moves_is_reported(tmp_path: Path) -> None:
     found = inspected(tmp_path, drifting, count=75)
-    assert set(by_code(found)) == {"field-circle", "field-moves"}
+    assert set(by_code(found)) == {"field-circle", "field-moves", "scope"}
     assert found.field.moved == pytest.approx(28 / SIZE[0], abs=0.02)
 
 
@@ -113,7 +146,7 @@ def test_text_over_tissue_and_beside_it(tmp_path: Path) -> None:
     assert 80 < left < 95 < 180 < right < 195
     assert 42 < top < 52 < 58 < bottom < 68
     both = inspected(tmp_path, inside(circle), text(at=(110, 60)), text("ID 7", (2, 20)))
-    assert set(by_code(both)) == {"field-circle", "overlay", "overlay-outside", "overlay-privacy"}
+    assert set(by_code(both)) == {"field-circle", "overlay", "overlay-outside", "overlay-privacy", "scope"}
     assert sorted(one.in_field for one in both.overlays) == [False, True]
 
 
@@ -149,6 +182,7 @@ def test_fields_and_two_views_are_found_and_the_camera_may_be_that_of_one(tmp_pa
     assert by_code(inspected(tmp_path, combed))["interlaced"].advice == "--deinterlace"
     found, camera = inspected(tmp_path, beside), tmp_path / "camera.yaml"
     assert by_code(found)["stereo"].advice == "--stereo left-right"
+    assert by_code(found)["scope"].message == "two views: typical of laparoscope"
     camera.write_text(
         "%YAML:1.0\n---\nimage_width: 320\nimage_height: 240\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
         "   cols: 3\n   dt: d\n   data: [300.,0.,159.5,0.,300.,119.5,0.,0.,1.]\n"
@@ -156,6 +190,7 @@ def test_fields_and_two_views_are_found_and_the_camera_may_be_that_of_one(tmp_pa
     of_one = inspect(found.path, camera=camera)
     assert of_one.size == SIZE
     assert of_one.packed is not None
+    assert "scope" not in by_code(of_one)
 
 
 def test_freezes_and_duplicates(tmp_path: Path) -> None:
@@ -278,7 +313,7 @@ def test_soft_frames_and_missing_texture_are_reported(tmp_path: Path) -> None:
 @pytest.mark.real
 @pytest.mark.parametrize(
     ("path", "codes"),
-    [("endoscopy/video/laparoscopy_rvim.mp4", {"field-circle", "field-moves"}),
+    [("endoscopy/video/laparoscopy_rvim.mp4", {"field-circle", "field-moves", "scope"}),
      ("endoscopy/video/colonoscopy_nflba_03.mp4", {"motion-fast", "soft", "unlike"}),
      ("endoscopy/endonerf/pulling_soft_tissues", {"overlay", "overlay-privacy"})],
 )  # fmt: skip

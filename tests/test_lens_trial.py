@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from front_door import warned
+from front_door import refused, warned
 from turning_clip import write_clip
 
 from scopemap.calibration.focal_length.from_motion import FocalEstimate, with_focal_from_motion
@@ -19,7 +19,6 @@ from scopemap.cameras.formats.reading import read_calibration
 from scopemap.cameras.lenses import FisheyeCamera
 from scopemap.cameras.scopes import KINDS, SCOPES
 from scopemap.config import Config
-from scopemap.errors import SettingsError
 from scopemap.geometry.se3 import so3_exp
 from scopemap.io.opening import open_sequence
 from scopemap.report.verdict import verdict
@@ -191,5 +190,13 @@ def test_what_is_stated_overrules_the_kind_of_endoscope(clip: Path) -> None:
     known = open_sequence(clip, camera="120 120 100 80", settings=settings)
     assert known.calibrated
     assert known.camera.fx == pytest.approx(120.0)
-    with pytest.raises(SettingsError, match="scope"):
-        Config.load(settings={"input.scope": "telescope"})
+
+
+@pytest.mark.parametrize("command", [("run", "--out"), ("batch", "--out"), ("live",)])
+def test_a_kind_that_is_not_known_is_answered_with_those_that_are(
+    command: tuple[str, ...], clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    name, *out = command
+    answer = refused(capfd, name, clip, *out, *[tmp_path / "out"][: len(out)], "--scope", "telescope")
+    kinds = ", ".join(f"'{scope}'" for scope in list(SCOPES)[:-1])
+    assert f"'input.scope': Input should be '', {kinds} or 'capsule' (got 'telescope')" in answer

@@ -12,6 +12,7 @@ from tiny_phantom import write_tiny
 
 from scopemap import open_sequence, reconstruct
 from scopemap.config import Config
+from scopemap.io.depth_maps import DepthReader
 from scopemap.io.frame_choice import is_at_rest
 
 FRAMES = 24
@@ -47,6 +48,28 @@ def test_no_network_looks_at_them_and_they_are_counted(
     assert notice["values"] == {"frames": 6, "causes": "3 too dark, 3 no texture"}
     depths = {int(file.stem) for file in (tmp_path / "out" / "depth").glob("*.png")}
     assert depths == asked
+
+
+def test_in_realtime_the_network_looks_at_every_second_frame_and_flow_carries_its_depth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_tiny(tmp_path / "phantom", frames=12)
+    spies, found = spied(monkeypatch), []
+    for method in ("realtime", "scopemap"):
+        out = tmp_path / method
+        config = Config.load("realtime", settings={"depth.method": method})
+        found.append(reconstruct(open_sequence(folder), config, out=out))
+        assert found[-1].frames.tracked.all()
+    assert [frame.index for frame in spies[0].seen] == [*range(0, 12, 2)]
+    assert len(spies[1].seen) == 12
+    carried, own = [DepthReader(tmp_path / name).read(3) for name in ("realtime", "scopemap")]
+    assert carried is not None
+    assert own is not None
+    known = (carried > 0) & (own > 0)
+    assert known.mean() > 0.7
+    assert np.median(np.abs(np.log(carried[known] / own[known]))) < 0.05
+    (notice,) = (one for one in found[0].provenance["notices"] if one["code"] == "depth-carried")
+    assert notice["values"] == {"frames": 6, "every": 2}
 
 
 def test_noise_is_no_motion_and_a_small_motion_is_one() -> None:

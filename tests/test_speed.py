@@ -66,6 +66,8 @@ def test_a_measurement_is_kept_and_slower_stages_are_named(measured: Speed, tmp_
     slower = replace(measured, stages=measured.stages | {"masks": replace(masks, ratio=masks.ratio + 1)})
     assert [line.partition(":")[0] for line in slower.slower_than(before, 0.25)] == ["masks"]
     assert before.slower_than(slower, 0.25) == []
+    whole = replace(measured, cpu_ms=2 * measured.cpu_ms)
+    assert [line.partition(":")[0] for line in whole.slower_than(before, 0.25)] == ["whole process"]
     unknown = replace(before, stages={name: stage for name, stage in before.stages.items() if name != "depth network"})
     assert measured.slower_than(unknown, 0.25)[0].startswith("depth network: ")
     with pytest.raises(InputError, match="preset realtime: measure the same"):

@@ -17,7 +17,7 @@ from scopemap.depth.mapis import DenseCorrespondence, DenseMatcher, Mapis
 from scopemap.faults import StageFaults
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
-from scopemap.geometry.warp import resampled
+from scopemap.geometry.warp import pull, resampled
 from scopemap.masking.masker import Masker, StoredMasks, without_instruments
 from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector, SiftFeatures
@@ -52,6 +52,7 @@ class PreprocessedFrame:
     small : the frame at the size of the depth estimate and of `correspondence`, that of `frame` over `depth_downscale`.
     depth_note : that most of its depth is beyond the limit; else "". fault : why it could not be processed.
     skipped : whether nothing was estimated, because the tracker refuses it anyway; its depth is unknown.
+    carried : whether its depth is that of the frame before, by flow, and not the network's.
     """
 
     frame: Frame
@@ -62,12 +63,13 @@ class PreprocessedFrame:
     depth_note: str = ""
     fault: TrackingLoss | None = None
     skipped: bool = False
+    carried: bool = False
 
 
 class Preprocessing:
     """Masks frames and estimates their raw depth, in order, each once."""
 
-    STATE: ClassVar = ("_masker", "_quality", "estimators", "faults", "skipped", "_bare")
+    STATE: ClassVar = ("_masker", "_quality", "estimators", "faults", "skipped", "carried", "_bare", "_turn", "_kind")
     """What changes from frame to frame."""
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
@@ -76,12 +78,20 @@ class Preprocessing:
         self.faults, self._bare = StageFaults("depth"), 0
         self.skipped: Counter[str] = Counter()
         """How many frames were skipped, by the cause of their loss."""
+        self.carried = 0
+        """How many frames got the depth of the one before."""
+        from_files = config.depth.backend.startswith("files:") or config.mask.instruments == "auto"
+        self._every, self._needs_previous = config.depth.constants.network_every, Mapis(config.mapis).needs_previous
+        self._every = 1 if from_files else self._every
+        self._turn = 0
+        self._kind: DepthKind | None = None  # of what the network said last; None: it looks at the next frame
 
     @property
     def notices(self) -> list[Notice]:
-        """Which frames were skipped so far."""
+        """Which frames were skipped, and how many got the depth of the one before, so far."""
         causes = ", ".join(f"{count} {cause}" for cause, count in self.skipped.most_common())
-        return [Notice("frames-skipped", {"frames": self.skipped.total(), "causes": causes})] if causes else []
+        found = [Notice("frames-skipped", {"frames": self.skipped.total(), "causes": causes})] if causes else []
+        return found + [Notice("depth-carried", {"frames": self.carried, "every": self._every})] * bool(self.carried)
 
     def estimate(self, frame: Frame) -> PreprocessedFrame:
         """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
@@ -104,6 +114,10 @@ class Preprocessing:
             return self._skipped(without_depth(frame), bare)
         frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))
         small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
+        if self._kind is not None and self._turn + 1 < self._every:
+            self._turn, self.carried = self._turn + 1, self.carried + 1
+            frame, small = with_unknown_depth(frame), with_unknown_depth(small)
+            return PreprocessedFrame(frame, small, self._kind, None, False, carried=True)
         estimate = self.estimators.depth.estimate(small)
         if estimate.kind != "measured" and not np.isfinite(estimate.values).any():
             self.faults.has_no_depth(frame.index)
@@ -117,7 +131,8 @@ class Preprocessing:
             if frame.valid.mean() < constants.min_valid_share:
                 left = f"only {frame.valid.mean():.0%} of the image is usable"
                 fault = TrackingLoss(LossCause.VIEW_COVERED, f"{left}: instruments cover {instruments.mean():.0%}")
-        raw = self.estimators.anchor.metric(estimate, small)
+        raw, is_followed = self.estimators.anchor.metric(estimate, small), self._needs_previous(estimate.kind)
+        self._turn, self._kind = 0, estimate.kind if is_followed and self.estimators.anchor.conversion else None
         small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm, views=None)
         frame, fitted = with_depth(frame, raw.depth_mm, raw.sigma_mm), self.estimators.anchor.just_fitted
         return PreprocessedFrame(frame, small, estimate.kind, None, fitted, raw.limit_note, fault)
@@ -128,6 +143,7 @@ class Preprocessing:
 
     def _without_estimate(self, frame: Frame, fault: TrackingLoss) -> PreprocessedFrame:
         self._masker.instruments(None)
+        self._kind = None
         frame = replace(with_unknown_depth(frame), quality=LEAST_QUALITY)
         small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
         return PreprocessedFrame(frame, with_unknown_depth(small), "measured", None, False, fault=fault)
@@ -136,26 +152,43 @@ class Preprocessing:
 class Matching:
     """Finds the correspondence of each frame with the one before, where its depth is to be refined with it."""
 
-    STATE: ClassVar = ("_matcher", "faults")
+    STATE: ClassVar = ("_matcher", "_before", "faults")
     """What changes from frame to frame."""
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
         self._needs_previous = Mapis(config.mapis).needs_previous
+        self._before: Frame | None = None
         self.faults = StageFaults("flow")
 
     def match(self, estimated: PreprocessedFrame) -> PreprocessedFrame:
         """Add the correspondence of a frame with the one before, where its depth is to be refined with it."""
         frame, wanted = estimated.small, self._needs_previous(estimated.kind)
+        before, self._before = self._before, None
         self.faults.frames += 1
         if estimated.skipped:
             self._matcher.reset()
             return estimated
         try:
-            return replace(estimated, correspondence=self._matcher.match(frame.rgb, frame.valid, wanted=wanted))
+            found = self._matcher.match(frame.rgb, frame.valid, wanted=wanted)
+            if estimated.carried and before is not None and found is not None:
+                estimated = _with_carried_depth(estimated, before, found)
+            self._before = estimated.small
+            return replace(estimated, correspondence=found)
         except Exception as error:
             fault = TrackingLoss(LossCause.OTHER, self.faults.noted(frame.index, error))
             return replace(estimated, fault=fault)
+
+
+def _with_carried_depth(estimated: PreprocessedFrame, before: Frame, found: DenseCorrespondence) -> PreprocessedFrame:
+    """Return a frame with the raw depth of the one before, where flow is consistent; MAPIS corrects it by motion."""
+    depth_mm, sigma_mm = (
+        None if values is None else np.where(found.consistent, pull(values, found.to_previous), np.float32(np.nan))
+        for values in (before.depth_mm, before.depth_sigma_mm)
+    )
+    assert depth_mm is not None
+    small = replace(estimated.small, depth_mm=depth_mm, depth_sigma_mm=sigma_mm)
+    return replace(estimated, frame=with_depth(estimated.frame, depth_mm, sigma_mm), small=small)
 
 
 def without_depth(frame: Frame) -> Frame:

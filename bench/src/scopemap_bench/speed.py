@@ -109,17 +109,20 @@ class Speed:
         return rounded
 
     def slower_than(self, before: Speed, tolerance: float) -> list[str]:
-        """Return a line for each stage slower by more than the share `tolerance`; `InputError` for other clips or
-        presets.
+        """Return a line for each stage, and for the whole process, slower by more than the share `tolerance`.
+
+        Raises `InputError` for other clips or presets.
         """
         if before._measured != self._measured:
             raise InputError(f"cannot compare {self._measured} with {before._measured}: measure the same")
-        lines = []
-        for name, stage in self.stages.items():
-            then = before.stages[name].ratio if name in before.stages else 0.0
-            if stage.ratio > max((1 + tolerance) * then, then + _NOISE):
-                lines.append(f"{name}: {stage.ratio:.2f} of the calibration, before {then:.2f}")
-        return lines
+        now, then = ({name: stage.ratio for name, stage in speed.stages.items()} for speed in (self, before))
+        now["whole process"], then["whole process"] = (one.cpu_ms / one.calibration_ms for one in (self, before))
+        slower = {name: (ratio, then.get(name, 0.0)) for name, ratio in now.items()}
+        return [
+            f"{name}: {ratio:.2f} of the calibration, before {was:.2f}"
+            for name, (ratio, was) in slower.items()
+            if ratio > max((1 + tolerance) * was, was + _NOISE)
+        ]
 
 
 def read_speed(file: Path) -> Speed:

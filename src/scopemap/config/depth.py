@@ -23,6 +23,7 @@ class DepthConstants:
     disparity_floor: float = 0.1
     # Focal length that scales Depth Pro's depth: of the frames' camera, or the one that Depth Pro finds (the paper).
     depth_pro_focal: Literal["camera", "network"] = "camera"
+    network_every: int = 1  # the network looks at every n-th frame; flow carries its depth to those between
     factor: float = 30.0  # anchor = factor: the nearest tissue of frame 1 is at 1000 mm / factor
 
 
@@ -34,6 +35,7 @@ DEPTH: dict[str, dict[str, Any]] = {
     "factor-100": {"factor": 100.0},
     "factor-1000": {"factor": 1000.0},
     "reanchored": {"reanchor_every": 10},
+    "realtime": {"network_every": 2},
 }
 
 

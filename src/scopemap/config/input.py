@@ -16,6 +16,9 @@ Box = tuple[
 """Left, top, width and height, px."""
 
 _Layout = Literal["auto", "none", "left-right", "top-bottom"]
+_Scope = Literal[
+    "", "colonoscope", "gastroscope", "bronchoscope", "laparoscope", "cystoscope", "ureteroscope", "sinus", "capsule"
+]
 
 
 class InputSettings(Settings):
@@ -33,9 +36,8 @@ class InputSettings(Settings):
         "of the first frames; auto: Depth Pro's where it is in use, else flow, or a trial of "
         "lenses, where one of these tells it",
     )
-    scope: str = Field(
+    scope: _Scope = Field(
         "",
-        pattern="^(|colonoscope|gastroscope|bronchoscope|laparoscope|cystoscope|ureteroscope|sinus|capsule)$",
         description="kind of endoscope of an unknown camera, whose typical lens is assumed and tried first: "
         "colonoscope, gastroscope, bronchoscope, laparoscope, cystoscope, ureteroscope, sinus, capsule",
     )

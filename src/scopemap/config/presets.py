@@ -43,6 +43,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": _PAPER,
     "paper-strict": _PAPER | _BEYOND_PAPER,
     "realtime": {
+        "depth.method": "realtime",
         "tracking.method": "realtime",
         "fusion.voxel_mm": 1.5,
         "fusion.truncation_mm": 5.0,

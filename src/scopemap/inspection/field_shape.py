@@ -26,8 +26,9 @@ _FULL_SHARE, _BAR_SHARE, _EDGE_PX = 0.995, 0.01, 2
 # Shares of a circle's radius: deviation of its outline, and least part of the outline.
 _ROUND_TOLERANCE, _LEAST_ARC = 0.02, 0.3
 _LEAST_CORNER, _LEAST_CORNER_PX, _INSIDE_PX = 0.03, 6, 2
-# Height of an arc over its chord: a quarter of a circle has 0.2, what is left of it at the size of a pixel 0.07.
-_LEAST_BULGE = 0.04
+# Height of an arc over its chord: a quarter of a circle has 0.2, what is left of it at the size of a pixel 0.07; an arc
+# around the picture's middle the chord over four diagonals or more, and a straight cut less than half of that.
+_LEAST_BULGE, _DIAGONALS = 0.04, 8
 _WINDOW, _MOST_WINDOWS = 25, 400
 # Pixels lit less often are coding artefacts beside a bright rim.
 _LIT_SHARE = 0.1
@@ -170,5 +171,8 @@ def _is_cut(quarter: np.ndarray) -> bool | None:
     # Where cut or arc meets the sides, both are round at the size of a pixel.
     points = points[len(points) // 8 : len(points) - len(points) // 8]
     chord = points[-1] - points[0]
-    bulge = np.abs((points - points[0]) @ [-chord[1], chord[0]]).max() / max(float(np.hypot(*chord)), 1e-9) ** 2
-    return bool(bulge < _LEAST_BULGE)
+    length = max(float(np.hypot(*chord)), 1e-9)
+    across, up = np.array([chord, [-chord[1], chord[0]]]) / length @ (points - points[0]).T
+    # By a parabola through all points: single ones are off by half a pixel.
+    bulge = abs(float(np.polyfit(across, up, 2)[0])) * length / 4
+    return bulge < min(_LEAST_BULGE, length / (_DIAGONALS * 2 * float(np.hypot(*quarter.shape))))

@@ -19,6 +19,7 @@ from scopemap.inspection.clip import Clip, VideoFinding
 from scopemap.inspection.container import check_container, read_container
 from scopemap.inspection.field_shape import Field, FieldWatcher, ShareBox
 from scopemap.inspection.frame_measures import FrameInspector, InspectedFrame
+from scopemap.inspection.scope_guess import check_scope
 from scopemap.io.opening import open_sequence, open_source
 from scopemap.io.prepared import OF_UNKNOWN_VIEWS, sample_pictures
 from scopemap.io.sequence import Sequence
@@ -123,6 +124,7 @@ def inspect(
         found = stopped or f"{len(measures)} picture(s) could be read, two are needed"
         raise InputError(f"inspecting {sequence.path}: {found}")
     clip = Clip(tuple(measures), sequence.source.stamped, sequence.selection)
+    size = sequence.source.width, sequence.source.height
     findings = [
         *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
         *_of_source(list(map(str, sequence.warnings))),
@@ -131,12 +133,13 @@ def inspect(
         *checks.check_packing(packed, [item.rgb for item in sampled.kept if not item.measures.blank]),
         *checks.check_repeats(clip),
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
+        *([] if sequence.calibrated else check_scope(field.field(), size, stereo=packed is not None)),
         *checks.check_frames(clip),
         *checks.check_dangers(clip),
     ]
     return Inspection(
         path=sequence.path,
-        size=(sequence.source.width, sequence.source.height),
+        size=size,
         clip=clip,
         container=container,
         packed=packed,

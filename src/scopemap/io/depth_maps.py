@@ -1,4 +1,4 @@
-"""The depth of a result's frames: written as 16-bit PNG with standard deviations and previews, and read back."""
+"""The depth of a result's frames: written as 16-bit PNG with standard deviations, and read back."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from scopemap.errors import InputError, reporting
@@ -26,21 +25,18 @@ _LEAST_SIGMA, _SIGMA_STEP = 0.001, 1.03
 class DepthWriter:
     """Writes the depth of each frame as 16-bit PNG, 0 = unknown, named by the frame's number.
 
-    Beside it the standard deviation of frames that have one, as 8-bit PNG: 0.001 * 1.03^(v - 1) of the depth. `finish`
-    adds pictures to look at, in colours over one range for all frames.
+    Beside it the standard deviation of frames that have one, as 8-bit PNG: 0.001 * 1.03^(v - 1) of the depth.
 
     largest_mm : depth that must be representable; it makes the unit coarser than `DEPTH_SCALE_MM` where necessary.
     Raises `InputError` where nothing can be written.
     """
 
-    NOT_IN_CHECKPOINT = ("_folder", "_sigma_folder", "_preview_folder")
+    NOT_IN_CHECKPOINT = ("_folder", "_sigma_folder")
     """Not in a checkpoint: a run may go on under another name of its folder."""
 
     def __init__(self, folder: Path, largest_mm: float = 0.0) -> None:
-        names = ("depth", "depth_sigma", "depth_preview")
-        self._folder, self._sigma_folder, self._preview_folder = (Path(folder) / name for name in names)
+        self._folder, self._sigma_folder = (Path(folder) / name for name in ("depth", "depth_sigma"))
         self._scale_mm = _unit_for(largest_mm)
-        self._written: list[str] = []
         self._histogram = np.zeros(_LARGEST_UNIT + 2, np.int64)  # of every 16th pixel, by unit
         self._describe({})
 
@@ -49,8 +45,7 @@ class DepthWriter:
         depth_mm = np.asarray(frame.depth_mm)
         units = np.nan_to_num(depth_mm / self._scale_mm, nan=0.0)
         image = np.where(units < _LARGEST_UNIT + 1, np.round(units), 0).astype(np.uint16)
-        _write_picture(self._folder / f"{frame.index:06d}.png", image)
-        self._written.append(f"{frame.index:06d}")
+        write_picture(self._folder / f"{frame.index:06d}.png", image)
         self._histogram += np.bincount(image[::4, ::4].ravel(), minlength=len(self._histogram))
         if frame.depth_sigma_mm is not None:
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -58,36 +53,18 @@ class DepthWriter:
             levels = np.where(np.isnan(code), 0, np.clip(np.round(code), 1, 255)).astype(np.uint8)
             with reporting(f"cannot write to {self._sigma_folder}"):
                 self._sigma_folder.mkdir(exist_ok=True)
-            _write_picture(self._sigma_folder / f"{frame.index:06d}.png", levels)
+            write_picture(self._sigma_folder / f"{frame.index:06d}.png", levels)
 
-    def finish(self, *, scale_known: bool) -> None:
-        """Write a JPEG of each frame's depth: turbo over its logarithm from red (near) to blue (far), the same range
-        for all frames.
+    def finish(self, *, scale_known: bool) -> tuple[float, float] | None:
+        """Return the nearest and the farthest depth, mm, but for 1 % at each end; None where no depth is known.
 
-        Unknown depth is black. depth.json then states the range, and whether the millimetres are known or a guess.
+        depth.json then states them, and whether the millimetres are known or a guess.
         """
         seen = np.cumsum(self._histogram[1:])
         near, far = (1 + int(np.searchsorted(seen, share * seen[-1])) for share in _PREVIEW_SHARES)
-        far = max(far, near + 1)
-        facts: dict[str, Any] = {"scale_known": scale_known}
-        if seen[-1]:
-            with reporting(f"cannot write to {self._preview_folder}"):
-                self._preview_folder.mkdir(exist_ok=True)
-            # Level 0 is unknown, 1 the far end of the colours.
-            colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)
-            colours[0] = 0
-            unit = np.arange(_LARGEST_UNIT + 2).clip(1)
-            level = np.clip(255 - 254 * np.log(unit / near) / np.log(far / near), 1, 255).astype(np.uint8)
-            level[0] = 0
-            for name in dict.fromkeys(self._written):
-                levels = level[read_decoded(self._folder / f"{name}.png")]
-                _write_picture(self._preview_folder / f"{name}.jpg", cv2.applyColorMap(levels, colours))
-            range_mm = [round(unit * self._scale_mm, 4) for unit in (near, far)]
-            facts |= {
-                "preview_mm": range_mm,
-                "preview_colours": "turbo over the logarithm, red = near, blue = far, black = unknown",
-            }
-        self._describe(facts)
+        near_mm, far_mm = (round(unit * self._scale_mm, 4) for unit in (near, max(far, near + 1)))
+        self._describe({"scale_known": scale_known} | ({"preview_mm": [near_mm, far_mm]} if seen[-1] else {}))
+        return (near_mm, far_mm) if seen[-1] else None
 
     def _describe(self, facts: dict[str, Any]) -> None:
         try:
@@ -98,7 +75,8 @@ class DepthWriter:
             raise InputError(f"cannot write depth to {self._folder}: {error.strerror or error}") from None
 
 
-def _write_picture(file: Path, image: np.ndarray) -> None:
+def write_picture(file: Path, image: np.ndarray) -> None:
+    """Write an image (BGR, or of one channel); raises `InputError` where that fails."""
     try:
         write_encoded(file, image)
     except OSError as error:

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from scopemap.mapping.depth_correction import (
 )
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
-from scopemap.mapping.map_merging import Part, loop_support, merge_maps, split_maps
+from scopemap.mapping.map_merging import AdjustedMaps, Part, loop_support, merge_maps, split_maps
 from scopemap.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
 from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
 from scopemap.mapping.pose_interpolation import FrameCorrection, TissueMotion, TrackedPose
@@ -45,42 +44,6 @@ _MAX_PART_ERROR = 0.05
 # Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
 MOST_OBSERVATIONS = 1_000_000
 """Of an adjustment, unless memory is limited."""
-# Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
-_MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
-# Keyframes of either map with loops to the other that the pose graph must accept where no adjustment tests them.
-_MIN_GRAPH_SUPPORT = 4
-
-
-class _Adjusted(NamedTuple):
-    """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
-
-    main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph,
-    infinite where the depths of keyframes agree less there than as tracked. between_px : between maps. support :
-    keyframes on either side of the accepted loops of the least supported map. problem, rigid : what was solved, and
-    the solution, refused or not.
-    """
-
-    correction: FrameCorrection
-    problem: BundleProblem
-    rigid: State
-    main_px: float
-    largest_px: float
-    between_px: float
-    graph_px: float
-    support: int
-
-    def accepted(self, alone: _Adjusted, max_sigma_px: float) -> bool:
-        """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone.
-
-        Where tissue moves, so that not even the main map is adjusted, the pose graph merges them: loops of several
-        keyframes agree with each other and with both maps as tracked, which fit as well as alone.
-        """
-        if alone.correction.refused:
-            fits = self.graph_px <= _MAX_ERROR_FACTOR * alone.graph_px + _NOISE_PX
-            return bool(self.correction.refused) and fits and self.support >= _MIN_GRAPH_SUPPORT
-        rigid = not self.correction.refused and self.largest_px <= max_sigma_px
-        connected = self.correction.loops > 0 and self.between_px <= max_sigma_px
-        return rigid and connected and self.main_px <= _MAX_ERROR_FACTOR * alone.main_px + _NOISE_PX
 
 
 class Backend:
@@ -190,25 +153,52 @@ class Backend:
             self._take(self._finder.between([pose.map for pose in self._tracked]))
             self._all_weighed = True
         allowed = {pose.map for pose in self._tracked} if among is None else set(among)
-        worlds = {map_number: Similarity.identity()}
         # Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
         for share in (1.0, 0.0) if any(self._log_scales) else (0.0,):
             self._path = path_without_drift(self._tracked, share * np.array(self._log_scales))
-            found = alone = self._adjusted(worlds, map_number)
+            alone = self._adjusted({map_number: Similarity.identity()}, map_number)
             if not alone.correction.refused:
                 break
-        others, tried = [*self._merged(map_number, allowed)][1:], {frozenset(worlds)}
-        # All maps at once if they fit; else one by one, because a single one may not fit.
-        for some in (others, *([number] for number in others if len(others) > 1)):
-            more = self._merged(map_number, {*worlds, *some})
-            if frozenset(more) in tried:  # the rest may be added to what is merged already, and all were refused before
-                continue
-            tried.add(frozenset(more))
-            together = self._adjusted(more, map_number)
-            if together.accepted(alone, self.settings.max_sigma_px):
-                found, worlds = together, more
+        found, worlds = self._merged_and_adjusted(map_number, allowed, alone)
         correction = found.correction if len(worlds) > 1 else self._with_moving_tissue(found, worlds)
+        if not correction.refused and correction.tissue is None:
+            correction = replace(correction, lens_residual=lens_residual(found.problem, found.rigid))
         return replace(correction, S_common_map=worlds, tracked=tracked or {})
+
+    def _merged_and_adjusted(
+        self, main: int, allowed: Collection[int], alone: AdjustedMaps
+    ) -> tuple[AdjustedMaps, dict[int, Similarity]]:
+        """Return the adjustment of a map with all that fit to it, the best supported first, and their Sim(3).
+
+        alone : the map's own. Each map is tried with the main one and with that of the merged ones that it has most
+        loops with, so that time grows with the number of maps, and all are adjusted together in the end.
+        """
+        found, worlds, merged, refused = alone, {main: Similarity.identity()}, {main}, 0
+        for number in [*self._merged(main, allowed)][1:]:
+            few = {main, self._partner(number, merged), number}
+            # Each try costs an adjustment: no more of them fail than maps are merged, and one.
+            if refused > len(merged) or number not in (S := self._merged(main, few)):
+                continue
+            together = self._adjusted(S, main)
+            if not together.accepted(alone, self.settings.max_sigma_px):
+                refused += 1
+                continue
+            merged.add(number)
+            if merged <= few or len(worlds) == 1:
+                found, worlds = together, S
+        if len(worlds) < len(merged):
+            S = self._merged(main, merged)
+            together = self._adjusted(S, main)
+            if together.accepted(alone, self.settings.max_sigma_px):
+                return together, S
+        return found, worlds
+
+    def _partner(self, number: int, merged: Collection[int]) -> int:
+        """Return the map among merged ones that a map has most loops with."""
+        map_of, loops = np.array([pose.map for pose in self._tracked]), self._loops.read()
+        ends = np.column_stack([map_of[loops["past"]], map_of[loops["new"]]])
+        others = ends[(ends == number).any(1)].sum(1) - number
+        return max(sorted(merged), key=lambda one: int((others == one).sum()))
 
     def _observe(self, keyframe: Frame, map_number: int) -> None:
         """Add a keyframe's feature tracks and loop closures."""
@@ -237,7 +227,7 @@ class Backend:
         among, found = set(chosen), map(Loop.of_row, self._loops.read())
         return [loop.among(chosen, log_unit) for loop in found if {loop.past, loop.new} <= among]
 
-    def _adjusted(self, worlds: Mapping[int, Similarity], main: int) -> _Adjusted:
+    def _adjusted(self, worlds: Mapping[int, Similarity], main: int) -> AdjustedMaps:
         """Return the bundle adjustment of all keyframes of maps with these Sim(3) to the common world."""
         assert self._camera is not None
         chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
@@ -254,17 +244,17 @@ class Backend:
 
         def sigmas_px(state: State) -> tuple[list[float], float]:
             length_px = errors_px(problem, state)
-            some = [*((host == number) & (observer == number) for number in worlds), host != observer]
-            *within, between = (robust_sigma_2d(length_px[chosen]) if chosen.any() else math.nan for chosen in some)
-            return within, between
+            own = [((host == number).astype(int) + (observer == number), number) for number in worlds]
+            # Each map with all others: a wrong one hides among right ones that have more loops.
+            some = [of == 2 for of, _ in own] + [of == 1 for of, number in own if number != main]
+            sigma = [robust_sigma_2d(length_px[chosen]) if chosen.any() else math.nan for chosen in some]
+            return sigma[: len(own)], max(sigma[len(own) :], default=math.nan)
 
         graph = problem.begin
         (within, between_px), (before, _) = sigmas_px(found.state), sigmas_px(graph)
         index = np.array(self._frames)[chosen]
         if not refused:
-            correction = self._correction(chosen, worlds, found)
-            residual = lens_residual(problem, found)
-            correction = replace(correction, loops=loops, depth_fields=fields, lens_residual=residual)
+            correction = replace(self._correction(chosen, worlds, found), loops=loops, depth_fields=fields)
         elif len(worlds) > 1 and problem.start is not None:
             by_graph = found._replace(state=graph)
             correction = self._correction(chosen, worlds, by_graph)
@@ -278,9 +268,9 @@ class Backend:
         # A map of one keyframe has no observations: NaN.
         largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
         main_px, support = within[list(worlds).index(main)], loop_support(accepted, map_of, main)
-        return _Adjusted(correction, problem, found.state, main_px, largest_px, between_px, graph_px, support)
+        return AdjustedMaps(correction, problem, found.state, main_px, largest_px, between_px, graph_px, support)
 
-    def _with_moving_tissue(self, alone: _Adjusted, worlds: Mapping[int, Similarity]) -> FrameCorrection:
+    def _with_moving_tissue(self, alone: AdjustedMaps, worlds: Mapping[int, Similarity]) -> FrameCorrection:
         """Return the correction with tissue that moves where left-out tracks confirm it, else the rigid one."""
         by_depth = alone.correction.refused and alone.rigid.sigma_px < RIGID_CORE_PX
         if self._camera is None or not self.settings.moving_tissue or by_depth:

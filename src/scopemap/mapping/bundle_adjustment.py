@@ -150,8 +150,8 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     return BundleSolution(state, log_depth_sigma(problem, state), found.iterations)
 
 
-def lens_residual(problem: BundleProblem, found: BundleSolution) -> LensResidual:
-    """Return what the observations ask of the lens, all else adjusted with it.
+def lens_residual(problem: BundleProblem, solution: State) -> LensResidual:
+    """Return what the observations ask of the lens, all else adjusted with it from the solution.
 
     Changes are significant from five standard deviations; all is NaN where it is undetermined, and with more keyframes
     than are adjusted at once.
@@ -160,7 +160,7 @@ def lens_residual(problem: BundleProblem, found: BundleSolution) -> LensResidual
         return LensResidual()
     unit = np.array([1.0, problem.focal_px, problem.focal_px])
     points = replace(problem.points, sigma=_RESIDUAL_DEPTH * problem.points.sigma)
-    free = replace(problem, start=found.state, points=points, lens_sigma=_RESIDUAL_SIGMA * unit)
+    free = replace(problem, start=solution, points=points, lens_sigma=_RESIDUAL_SIGMA * unit)
     state = adjust(free, max_iterations=40, min_decrease=1e-4).state  # a wrong lens may be far away
     try:
         covariance = np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)
@@ -298,19 +298,26 @@ def _summed(
     touched = np.empty(12 + lens, np.int64)
     touched[6:12] = PER_KEYFRAME * host + np.arange(6)
     touched[12:] = last + np.arange(lens)
-    row = np.empty(12 + lens)
+    rows_of, weighed = np.empty((2, 12 + lens)), np.empty((2, 12 + lens))
     for k in range(len(weight)):
         touched[:6] = PER_KEYFRAME * observer[k] + np.arange(6)
         for axis in range(2):
+            row, own = rows_of[axis], weight[k] * by_depth[k, axis]
             row[:6], row[6:12], row[12:] = by_camera[k, axis], by_host[k, axis], by_lens[k, axis]
-            depth, off = weight[k] * by_depth[k, axis], weight[k] * error[k, axis]
-            h[point[k]] += depth * by_depth[k, axis]
-            g[point[k]] += off * by_depth[k, axis]
-            for i in range(len(row)):
-                E[point[k], touched[i]] += depth * row[i]
-                scores[point[k], touched[i]] += off * row[i]
-                for j in range(len(row)):
-                    A[touched[i], touched[j]] += weight[k] * row[i] * row[j]
+            weighed[axis] = weight[k] * row
+            h[point[k]] += own * by_depth[k, axis]
+            g[point[k]] += own * error[k, axis]
+        for i in range(12 + lens):
+            one, other, at = weighed[0, i], weighed[1, i], touched[i]
+            E[point[k], at] += one * by_depth[k, 0] + other * by_depth[k, 1]
+            scores[point[k], at] += one * error[k, 0] + other * error[k, 1]
+            for j in range(i, 12 + lens):
+                A[at, touched[j]] += one * rows_of[0, j] + other * rows_of[1, j]
+    # Of each pair of unknowns one product was added; an observer is never the host.
+    for i in range(size):
+        for j in range(i):
+            A[i, j] += A[j, i]
+            A[j, i] = A[i, j]
     return A, scores, E, h, g
 
 

@@ -6,7 +6,8 @@ map to the world of p's has
 
     scale exp(-r),    rotation R_p R_n_p^T R_n^T,    and takes the position of n to the position of T_p T_n_p^-1
 
-A loop closure is accepted only if loop closures of other keyframes agree with it.
+A loop closure is accepted only if loop closures of other keyframes agree with it, and maps are merged only if they fit
+after an adjustment (`AdjustedMaps`).
 
 Where the camera was lost and aligned again to a keyframe from before, the alignment may be wrong. If keyframes from
 before and after the loss observe no points in common, nothing supports it, and the map is split there.
@@ -23,8 +24,9 @@ import numpy as np
 
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse
+from scopemap.mapping.bundle_problem import BundleProblem, State
 from scopemap.mapping.loop_closure import Loop
-from scopemap.mapping.pose_interpolation import TrackedPose
+from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
 
 _MIN_SUPPORT = 2  # agreeing keyframes in either map
 # Maps drift independently: two loops agree within these, rad, share of the scene's depth, ln.
@@ -33,8 +35,48 @@ _MAX_LOG_SCALE = 1.0  # between maps of one video
 # Observations of points in common that support a motion tracked across a loss: as many as relocalisation needs inliers.
 _MIN_COMMON = 20
 
+# Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
+_MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
+# Keyframes of either map with loops to the other, where errors between maps are larger than within or untested.
+_MIN_LOOPED = 4
+# Learned features are matched to about a pixel: errors between maps of one place were up to 0.96 px, of two from 1.38.
+_MAX_FEATURE_PX = 1.2
+
 Part = tuple[int, int]
 """A part of a map between two losses: number of the map, and segment as in `TrackedPose`."""
+
+
+class AdjustedMaps(NamedTuple):
+    """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
+
+    main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph,
+    infinite where the depths of keyframes agree less there than as tracked. between_px : the largest between another
+    map and all others. support : keyframes on either side of the accepted loops of the least supported map. problem,
+    rigid : what was solved, and the solution, refused or not.
+    """
+
+    correction: FrameCorrection
+    problem: BundleProblem
+    rigid: State
+    main_px: float
+    largest_px: float
+    between_px: float
+    graph_px: float
+    support: int
+
+    def accepted(self, alone: AdjustedMaps, max_sigma_px: float) -> bool:
+        """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone.
+
+        Where tissue moves, so that not even the main map is adjusted, the pose graph merges them: loops of several
+        keyframes agree with each other and with both maps as tracked, which fit as well as alone.
+        """
+        if alone.correction.refused and self.correction.refused:
+            fits = self.graph_px <= _MAX_ERROR_FACTOR * alone.graph_px + _NOISE_PX
+            return fits and self.support >= _MIN_LOOPED
+        rigid = not self.correction.refused and self.largest_px <= max_sigma_px
+        by_features = self.support >= _MIN_LOOPED and self.between_px <= _MAX_FEATURE_PX
+        connected = self.correction.loops > 0 and (self.between_px <= max_sigma_px or by_features)
+        return rigid and connected and self.main_px <= _MAX_ERROR_FACTOR * alone.main_px + _NOISE_PX
 
 
 class _Hypothesis(NamedTuple):

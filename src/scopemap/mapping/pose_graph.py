@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.sparse import identity, lil_matrix
+from scipy.sparse import bsr_matrix, csr_matrix, identity
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
@@ -141,12 +141,15 @@ def optimise_pose_graph(
         scale = s[edges.j] - s[edges.i] - edges.log_ratio
         return (np.column_stack([rotation, translation, scale]) / edges.sigma).ravel()
 
-    x, pattern = np.zeros(_UNKNOWNS * (count - 1)), _sparsity(edges, count)
+    def jacobian(x: np.ndarray) -> csr_matrix:
+        return _jacobian(edges, *state(x), np.vstack([np.zeros(_UNKNOWNS), x.reshape(-1, _UNKNOWNS)])[:, :3])
+
+    x = np.zeros(_UNKNOWNS * (count - 1))
     for tolerance in _TOLERANCES:
         x = least_squares(
             errors,
             x,
-            jac_sparsity=pattern,
+            jacobian,
             loss="cauchy",
             f_scale=tolerance,
             ftol=1e-4,
@@ -184,12 +187,37 @@ def _edges(T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list[Loop]
     return _Edges(i, j, T, ratio, np.repeat(sigma, (3, 3, 1), axis=1))
 
 
-def _sparsity(edges: _Edges, count: int) -> lil_matrix:
-    """Pattern of the Jacobian: which error depends on which unknown; the first keyframe has none."""
-    pattern = lil_matrix((_UNKNOWNS * len(edges.i), _UNKNOWNS * (count - 1)), dtype=np.int8)
-    for row, ends in enumerate(zip(edges.i, edges.j, strict=True)):
-        for k in ends:
-            if k > 0:
-                rows, columns = (slice(_UNKNOWNS * n, _UNKNOWNS * (n + 1)) for n in (row, k - 1))
-                pattern[rows, columns] = 1
-    return pattern
+def _jacobian(edges: _Edges, R: Rotation, p: np.ndarray, s: np.ndarray, turns: np.ndarray) -> csr_matrix:
+    """Return the derivatives (7 E, 7 (K - 1)) of the edges' errors; turns : (K, 3), rotations from the start to R."""
+    R_i_world, turned = R[edges.i].inv(), _right_jacobian(turns)
+    to_i, shrink = R_i_world.as_matrix(), np.exp(-s[edges.i])[:, None]
+    seen = R_i_world.apply(p[edges.j] - p[edges.i]) * shrink
+    error = Rotation.from_matrix(edges.T[:, :3, :3]).inv() * R_i_world * R[edges.j]
+    by_turn = np.linalg.inv(_right_jacobian(error.as_rotvec()))
+    by_i, by_j = np.zeros((2, len(edges.i), _UNKNOWNS, _UNKNOWNS))
+    by_i[:, :3, :3] = -by_turn @ (R[edges.j].inv() * R[edges.i]).as_matrix() @ turned[edges.i]
+    by_i[:, 3:6, :3] = _hat(seen) @ turned[edges.i]
+    by_i[:, 3:6, 3:6] = -shrink[:, None] * to_i
+    by_i[:, 3:6, 6] = -seen
+    by_i[:, 6, 6] = -1
+    by_j[:, :3, :3] = by_turn @ turned[edges.j]
+    by_j[:, 3:6, 3:6] = shrink[:, None] * to_i
+    by_j[:, 6, 6] = 1
+    size = (_UNKNOWNS * len(edges.i), _UNKNOWNS * len(p))
+    start = np.arange(len(edges.i) + 1)  # one block a row
+    i, j = (
+        bsr_matrix((by / edges.sigma[:, :, None], ends, start), size) for by, ends in ((by_i, edges.i), (by_j, edges.j))
+    )
+    return (i + j).tocsr()[:, _UNKNOWNS:]  # the first keyframe is held
+
+
+def _hat(vectors: np.ndarray) -> np.ndarray:
+    """Return the matrices (N, 3, 3) whose products are the cross products with vectors (N, 3)."""
+    return np.cross(np.eye(3), vectors[:, None])
+
+
+def _right_jacobian(turns: np.ndarray) -> np.ndarray:
+    """Return (N, 3, 3): exp(turn + d) is exp(turn) exp(jacobian d) to first order (Sola et al., eq. 143)."""
+    angle, K = np.maximum(np.linalg.norm(turns, axis=1), 1e-5)[:, None, None], _hat(turns)
+    jacobian: np.ndarray = np.eye(3) - (1 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * K @ K
+    return jacobian

@@ -8,9 +8,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.report.sheet import picture_grid
+from scopemap.errors import reporting
+from scopemap.io.decoding import read_decoded
+from scopemap.io.depth_maps import DepthReader, write_picture
+from scopemap.report.sheet import Sheet, picture_grid
 
 _CELL_PX = (300, 250)
+_LEGEND_PX, _STEP_PX, _LAST_PX, _MOST_NUMBERS = 36, 54, 74, 5
 
 
 def colour_depth(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndarray:
@@ -22,6 +26,42 @@ def colour_depth(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndar
     rgb = cv2.applyColorMap(np.round(255 * np.clip(share, 0, 1)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
     rgb[~known] = 0
     return rgb
+
+
+def write_previews(folder: Path, range_mm: tuple[float, float], *, scale_known: bool) -> None:
+    """Write a JPEG of each depth map of a result: turbo over its logarithm, red near, blue far, black unknown.
+
+    range_mm : depth at the ends of the colours, the same for all frames. What they mean is written below the map: mm,
+    or multiples of the nearest depth where the scale is unknown. Raises `InputError` where nothing can be written.
+    """
+    previews, legend = folder / "depth_preview", None
+    with reporting(f"cannot write to {previews}"):
+        previews.mkdir(exist_ok=True)
+    by_unit = _logarithmic(DepthReader(folder).scale_mm * np.arange(1 << 16).clip(1), range_mm)
+    by_unit[0] = 0
+    for file in sorted((folder / "depth").glob("*.png")):
+        picture = by_unit[read_decoded(file)]
+        legend = _depth_legend(picture.shape[1], range_mm, scale_known) if legend is None else legend
+        write_picture(previews / f"{file.stem}.jpg", np.vstack([picture, legend])[..., ::-1])
+
+
+def _logarithmic(depth_mm: np.ndarray, range_mm: tuple[float, float]) -> np.ndarray:
+    """Return the colours (N, 3) uint8 of depths (N,), mm, in the previews."""
+    near_mm, far_mm = range_mm
+    share = np.clip(np.log(far_mm / depth_mm) / np.log(far_mm / near_mm), 0, 1)
+    return cv2.applyColorMap(np.round(255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)[:, 0, ::-1].copy()
+
+
+def _depth_legend(width: int, range_mm: tuple[float, float], scale_known: bool) -> np.ndarray:
+    """Return what the colours of the previews mean, (h, width, 3) uint8."""
+    shown_mm = np.geomspace(*range_mm, max(2, min(_MOST_NUMBERS, (width - _LAST_PX) // _STEP_PX)))
+    unit_mm = 1.0 if scale_known else range_mm[0]
+    colours = (f"#{bytes(rgb).hex()}" for rgb in _logarithmic(shown_mm, range_mm))
+    words = dict(zip([f"{mm / unit_mm:.3g}" for mm in shown_mm], colours, strict=True)) | {"unknown": "#000000"}
+    sheet = Sheet(width, _LEGEND_PX)
+    sheet.text((4, 2), "depth, mm" if scale_known else "depth, multiples of the nearest", 11)
+    sheet.legend((4, 18), words, _STEP_PX, 10)
+    return sheet.rgb
 
 
 def draw_depths(images: Sequence[np.ndarray], depths_mm: Mapping[str, Sequence[np.ndarray]], file: Path) -> None:

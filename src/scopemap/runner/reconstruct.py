@@ -19,6 +19,7 @@ from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
+from scopemap.report.depth_figures import write_previews
 from scopemap.report.notebook import in_notebook, notebook_progress
 from scopemap.report.verdict import state_verdict
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
@@ -118,7 +119,9 @@ def _reconstruct(
         del run, pipeline  # with their keyframes and volumes: a long run has none to spare when it writes
         if folder is not None and write_depth is not None:
             progress("writing", 0, 0)
-            write_depth.finish(scale_known=result.provenance["scale"]["known"])
+            scale_known = result.provenance["scale"]["known"]
+            if range_mm := write_depth.finish(scale_known=scale_known):
+                write_previews(folder, range_mm, scale_known=scale_known)
             result.save(folder)
             for owner in _kept_with(observers):
                 owner.save(folder)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from scopemap_bench.speed import Speed
 
 _Preset = Literal["default", "paper", "paper-strict", "realtime"]
-_TOLERANCE = 0.25  # share by which a stage may be slower: measurements of one machine differ by a tenth
+_TOLERANCE = 0.1  # share by which a stage may be slower
 
 
 def bench(
@@ -125,7 +125,8 @@ def _print_stages(speed: Speed) -> None:
     for name, stage in speed.stages.items():
         typer.echo(f"{name:28s}{stage.ms:8.2f}{stage.ratio:8.2f}{stage.share:8.1%}  {stage.thread}")
     passed = f"{speed.passed_ms:.1f} ms passed, {1e3 / speed.passed_ms:.1f} frames/s"
-    typer.echo(f"\nwhole process, start and compilers too: {speed.cpu_ms:.1f} ms of processor time, {passed}")
+    flows = f"{speed.cpu_ms:.1f} ms of processor time, {speed.cpu_ms / speed.calibration_ms:.1f} DIS flows"
+    typer.echo(f"\nwhole process, start and compilers too: {flows}, {passed}")
 
 
 def _list_plans() -> None:

@@ -1,8 +1,8 @@
-"""The truth for `scopemap coverage`: which of a phantom's faces any frame shows, and errors of shares and blind spots.
+"""The truth for `scopemap coverage`: which faces of the tissue any frame shows, and errors of shares and blind spots.
 
-A frame shows a face that is turned to the camera and whose middle is not behind the farthest of 3 x 3 pixels of the
-true depth around it. The tissue that there is are the faces in the bins of the map that were examined, after the
-Sim(3) of the run's path to the truth.
+C3VD states it face by face (`coverage_mesh.obj`). A phantom's frame shows a face that is turned to the camera and whose
+middle is not behind the farthest of 3 x 3 pixels of the true depth around it. The tissue that there is are the faces in
+the bins of the map that were examined, after the Sim(3) of the run's path to the truth.
 """
 
 from __future__ import annotations
@@ -14,19 +14,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 
 from scopemap.actions.coverage.coverage import Coverage, regions, smoothed
-from scopemap.actions.coverage.layout import binned, column_of
+from scopemap.actions.coverage.layout import Lumen, binned, column_of
+from scopemap.errors import InputError
 from scopemap.evaluation.poses import match
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, transform
 from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap_bench.evaluation.true_surface import read_true_surface
 from scopemap_bench.phantom.render import prepare
 from scopemap_bench.phantom.spec import Event, PhantomSpec
 from scopemap_bench.phantom.writer import CLIPPED, seen_surface
 
 LEAST_SPOT_MM2 = 100.0
 _TOLERANCE_MM = 0.3
+_FARTHEST_RADII = 4.0  # from the centreline, or the centre; what is farther is another part of the organ
 _MOST_UNSEEN = 0.5  # share of a true bin that is not seen from which it belongs to a true blind spot
 
 
@@ -74,17 +78,31 @@ def shown_faces(folder: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
     return mesh, shown
 
 
+def observed_faces(folder: Path) -> tuple[trimesh.Trimesh, np.ndarray]:
+    """Return the whole surface of a C3VD video, mm, and which of its faces (F,) its coverage mesh calls observed.
+
+    Raises `InputError` for a folder without a coverage mesh.
+    """
+    truth = read_true_surface(folder)
+    if truth is None or truth.seen is None or not isinstance(truth.surface, trimesh.Trimesh):
+        raise InputError(f"{folder} holds no coverage_mesh.obj that says which faces were observed")
+    return truth.surface, truth.seen
+
+
 def similarity_to_truth(run: Path, source: Path) -> Similarity:
-    """Return what takes a run's world to that of its phantom."""
+    """Return what takes a run's world to that of its phantom or C3VD video."""
     return match(read_trajectory(run), read_trajectory(source), "sim3").similarity
 
 
 def coverage_errors(found: Coverage, to_truth: Similarity, mesh: trimesh.Trimesh, shown: np.ndarray) -> CoverageErrors:
-    """Return what was found of a run beside the truth of `shown_faces`."""
-    back, chart = to_truth.inverse(), found.map
-    row, hours, _ = found.layout.place(back.transform_points(mesh.triangles_center), mesh.face_normals @ back.R.T)
+    """Return what was found of a run beside the truth of `shown_faces` or `observed_faces`."""
+    back, chart, layout = to_truth.inverse(), found.map, found.layout
+    points = back.transform_points(mesh.triangles_center)
+    row, hours, _ = layout.place(points, mesh.face_normals @ back.R.T)
     row, column, rows = row - found.first, column_of(hours), len(chart.along)
-    own = (row >= 0) & (row < rows)
+    middle = layout.line.points_mm if isinstance(layout, Lumen) else layout.centre_mm[None]
+    near = cKDTree(middle).query(points)[0] <= _FARTHEST_RADII * layout.radius_mm
+    own = near & (row >= 0) & (row < rows)
     own[own] = np.isfinite(chart.unseen[row[own], column[own]])
     row, hours, area, shown = row[own], hours[own], mesh.area_faces[own], shown[own]
     hidden, seen = (binned(row, hours, area * chosen, rows) for chosen in (~shown, shown))

@@ -1,15 +1,18 @@
-"""Errors of `scopemap coverage` on phantoms: the share that was not seen, its intervals, blind spots.
+"""Errors of `scopemap coverage`: the share that was not seen, its intervals, blind spots.
 
     python -m scopemap_bench.scripts.coverage [--out FOLDER] [--only NAME ...]
     python -m scopemap_bench.scripts.coverage --fit [--out FOLDER]
+    python -m scopemap_bench.scripts.coverage --c3vd RESULT VIDEO [--c3vd RESULT VIDEO ...]
 
 Phantoms of 50 frames, three times as fast as usual: forward, withdrawn, there and back, with the camera turned away by
 30 degrees on the way, with folds of 9 mm in place of 6 mm, and cavities. None of them was used for choosing constants;
-`--fit` prints the regression's weights, and the widths of intervals, from those that were.
+`--fit` prints the regression's weights, and the widths of intervals, from those that were. `--c3vd` measures results
+of whole C3VD videos instead, each against the `coverage_mesh.obj` in the video's folder.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import chain
 from pathlib import Path
 
@@ -18,7 +21,13 @@ from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from scopemap.actions.coverage.coverage import HIDDEN_AREA, Coverage, coverage
-from scopemap_bench.evaluation.coverage import CoverageErrors, coverage_errors, shown_faces, similarity_to_truth
+from scopemap_bench.evaluation.coverage import (
+    CoverageErrors,
+    coverage_errors,
+    observed_faces,
+    shown_faces,
+    similarity_to_truth,
+)
 from scopemap_bench.scripts import measuring
 
 FAST = ("--frames", 50, "--set", "speed=3")
@@ -58,6 +67,12 @@ def found_and_true(name: str, words: tuple[object, ...], folder: Path) -> tuple[
     return found, coverage_errors(found, similarity, mesh, shown), ~shown[nearest]
 
 
+def of_c3vd(run: Path, video: Path) -> tuple[str, Coverage, CoverageErrors]:
+    """Return the name of a C3VD video, the coverage of a result of it, and its errors."""
+    truth, found = observed_faces(video), coverage(run)
+    return video.name, found, coverage_errors(found, similarity_to_truth(run, video), *truth)
+
+
 def print_fit(folder: Path) -> None:
     """Print the weights, and for lumens and cavities the odds ratio that nine in ten keep, each phantom left out."""
     parts = [found_and_true(name, words, folder) for name, words in FITTED.items()]
@@ -84,25 +99,24 @@ def fitted_weights(parts: list[tuple[Coverage, CoverageErrors, np.ndarray]]) -> 
     return weights
 
 
-def print_table(names: list[str], folder: Path) -> None:
-    """Print a row for each phantom, and the sums over lumens and cavities."""
+def print_table(parts: Iterable[tuple[str, Coverage, CoverageErrors]]) -> None:
+    """Print a row for each result, by its name, and the sums over lumens and cavities."""
     heads = ("not seen, true", "estimated", "error, points", "segments inside", "spots right", "spots found")
-    measuring.print_head("phantom", *heads)
+    measuring.print_head("result", *heads)
     everything: dict[str, list[tuple[Coverage, CoverageErrors]]] = {}
-    for name in names:
-        found, errors, _ = found_and_true(name, PHANTOMS[name], folder)
+    for name, found, errors in parts:
         everything.setdefault(found.layout.kind, []).append((found, errors))
         total, inside = found.total, _inside(found, errors)
         estimated = f"{total.share:.1%} ({total.low:.0%} to {total.high:.0%})"
         cells = [_of(values) for values in (inside[1:], errors.right, errors.found)]
         measuring.print_row(name, f"{errors.share:.1%}", estimated, f"{_points(found, errors):+.1f}", *cells)
-    for kind, parts in everything.items():
-        points = [abs(_points(*part)) for part in parts]
-        held = [_inside(*part) for part in parts]
+    for kind, own in everything.items():
+        points = [abs(_points(*part)) for part in own]
+        held = [_inside(*part) for part in own]
         lists = [
             [one[1:] for one in held],
-            [errors.right for _, errors in parts],
-            [errors.found for _, errors in parts],
+            [errors.right for _, errors in own],
+            [errors.found for _, errors in own],
         ]
         cells = [_of([*chain(*values)]) for values in lists]
         error = f"{np.median(points):.1f} median, {max(points):.1f} most"
@@ -128,13 +142,18 @@ def main() -> None:
     parser = measuring.options_of(__doc__, out=True)
     parser.add_argument("--only", nargs="+", choices=PHANTOMS, default=list(PHANTOMS), metavar="NAME")
     parser.add_argument("--fit", action="store_true", help="print the regression's weights")
+    places, help_c3vd = ("RESULT", "VIDEO"), "measure a result of a C3VD video, which is the second folder"
+    parser.add_argument("--c3vd", nargs=2, type=Path, action="append", metavar=places, help=help_c3vd)
     options = parser.parse_args()
+    if options.c3vd:
+        print_table(of_c3vd(*pair) for pair in options.c3vd)
+        return
     with measuring.folder_or_scratch(options.out) as folder:
         folder.mkdir(parents=True, exist_ok=True)
         if options.fit:
             print_fit(folder)
         else:
-            print_table(options.only, folder)
+            print_table((name, *found_and_true(name, PHANTOMS[name], folder)[:2]) for name in options.only)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,12 @@ import numpy as np
 
 from scopemap.calibration.focal_length.trial import LensTrial, try_lenses
 from scopemap.calibration.focal_length.window_adjustment import Scene, WindowSolution, adjusted, at_rest
-from scopemap.calibration.focal_length.windows import MAX_FRAMES, Window, windows_of
+from scopemap.calibration.focal_length.windows import MAX_FRAMES, Window, frames_of_windows, window_of
 from scopemap.cameras.scopes import ANY_LENS, KINDS, SCOPES
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
+from scopemap.frame import Frame
+from scopemap.io.device import cpu_threads
 from scopemap.io.sequence import Sequence
 from scopemap.notices import Notice
 
@@ -198,20 +200,24 @@ def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window]) -> 
 
 def focal_from_motion(sequence: Sequence, config: Config, windows: list[Window] | None = None) -> FocalEstimate:
     """Return the focal length estimated from the first frames of a sequence; its camera's is the mean of the prior."""
-    camera, scale = sequence.camera, 1.0
-    # Flow, of the next window, and the adjustment of this one take about equally long.
-    with ThreadPoolExecutor(max_workers=1) as adjusting:
-        pending = []
-        for window in windows_of(sequence, config):
-            # All windows have one size, which may be smaller than the sequence's.
-            scale = 2 * window.half_width_px / camera.width
-            if windows is not None:
-                windows.append(window)
-            pending.append(adjusting.submit(adjust_window, window, camera.fx * scale))
-    found = [fit for fit in (one.result() for one in pending) if fit is not None]
-    fits = [fit for fit in found if fit.residual_px <= _MAX_RESIDUAL * scale * camera.width]
-    estimate = combine(fits, scale * camera.width)
-    return replace(estimate, focal_px=estimate.focal_px / scale)
+    camera = sequence.camera
+
+    def adjusted_window(frames: list[Frame]) -> tuple[Window, WindowFit | None] | None:
+        window = window_of(frames)
+        if window is None:
+            return None
+        return window, adjust_window(window, camera.fx * 2 * window.half_width_px / camera.width)
+
+    # Frames are read while the windows of those before are found and adjusted.
+    with ThreadPoolExecutor(cpu_threads()) as pool:
+        found = [one for one in pool.map(adjusted_window, frames_of_windows(sequence, config)) if one is not None]
+    if windows is not None:
+        windows.extend(window for window, _ in found)
+    # All windows have one size, which may be smaller than the sequence's.
+    width_px = 2 * found[0][0].half_width_px if found else camera.width
+    fits = [fit for _, fit in found if fit is not None and fit.residual_px <= _MAX_RESIDUAL * width_px]
+    estimate = combine(fits, width_px)
+    return replace(estimate, focal_px=estimate.focal_px * camera.width / width_px)
 
 
 def combine(fits: Iterable[WindowFit], width_px: float) -> FocalEstimate:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from scopemap.calibration.focal_length.window_adjustment import Scene, Start, adjusted, at_rest
-from scopemap.calibration.focal_length.windows import Window
+from scopemap.calibration.focal_length.windows import Window, with_distance
 from scopemap.cameras.scopes import ANY_LENS, LensPrior
 from scopemap.geometry.least_squares import cauchy, robust_sigma_2d
 from scopemap.io.device import cpu_threads
@@ -89,7 +89,7 @@ class _Tried:
     """
 
     def __init__(self, prior: LensPrior, window: Window) -> None:
-        self.window, self.width_px, self.first = window, 2 * window.half_width_px, prior.focal
+        self.window, self.width_px, self.first = with_distance(window), 2 * window.half_width_px, prior.focal
         self.errors: dict[tuple[str, float], np.ndarray] = {}
         self._states: dict[tuple[str, float], Start] = {}
         for kind in prior.kinds:
@@ -114,25 +114,26 @@ class _Tried:
 
 def _adjusted(window: Window, kind: str, focal_px: float, start: Start | None) -> tuple[np.ndarray, Start]:
     """Return the reprojection errors (n,), picture px, NaN too far out, `_OUTSIDE_PX` if unseen; and the state."""
-    unit = focal_px * np.array([1.0, window.aspect])
-    host, seen, is_seen = _straight(kind, window.start / unit), _straight(kind, window.seen / unit), _observed(window)
-    reach = math.tan(_WIDEST_RAD)
-    near = is_seen & (np.linalg.norm(host, axis=1) <= reach)[:, None] & (np.linalg.norm(seen, axis=-1) <= reach)
-    errors = np.where(np.isfinite(host[:, None] + seen).all(-1), np.nan, _OUTSIDE_PX)
-    seen = np.where(near[..., None], focal_px * seen, np.nan)
+    unit = np.array([1.0, window.aspect])
+    # The host's corners first, then those of the partners.
+    pixel = np.concatenate([window.start[:, None], window.seen], 1) / (focal_px * unit)
+    radius = np.maximum(np.hypot(pixel[..., 0], pixel[..., 1]), _AXIS)
+    angle = _angle(kind, radius)
+    tangent = np.tan(angle)
+    # Where their rays meet the plane z = 1; NaN: nowhere.
+    straight, reached = pixel * (tangent / radius)[..., None], tangent <= math.tan(_WIDEST_RAD)
+    host, is_seen, near = straight[:, 0], np.isfinite(pixel[:, 1:, 0]), reached[:, :1] & reached[:, 1:]
+    errors = np.where(np.isfinite(tangent[:, :1] + tangent[:, 1:]), np.nan, _OUTSIDE_PX)
+    seen = np.where(near[..., None], focal_px * straight[:, 1:], np.nan)
     lens = np.array([math.log(focal_px), 0.0])
     scene = Scene(
         focal_px * np.nan_to_num(host), seen, *_expected(window, host), window.half_width_px, lens, np.zeros(2)
     )
     begin = at_rest(scene) if start is None else start._replace(lens=lens)
     found = adjusted(scene, begin, _FIRST if start is None else _NEXT, _MIN_DECREASE)
-    bent = unit * _bent(kind, window.seen / unit, found.error / focal_px)
-    errors[near] = np.where(np.isfinite(found.error[near, 0]), np.linalg.norm(bent[near], axis=1), _OUTSIDE_PX)
+    bent = unit * _bent(kind, pixel[:, 1:][near], radius[:, 1:][near], angle[:, 1:][near], found.error[near])
+    errors[near] = np.where(np.isfinite(found.error[near, 0]), np.hypot(*bent.T), _OUTSIDE_PX)
     return errors[is_seen], found.state
-
-
-def _observed(window: Window) -> np.ndarray:
-    return np.isfinite(window.seen).all(-1)
 
 
 def _expected(window: Window, host: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -153,20 +154,15 @@ def _angle(kind: str, radius: np.ndarray) -> np.ndarray:
     return np.where(angle < math.pi / 2, angle, np.nan)
 
 
-def _straight(kind: str, pixel: np.ndarray) -> np.ndarray:
-    """Return where the rays of pixels (..., 2), in focal lengths, meet the plane z = 1; NaN: nowhere."""
-    radius = np.linalg.norm(pixel, axis=-1, keepdims=True)
-    straight: np.ndarray = pixel * np.tan(_angle(kind, radius)) / np.maximum(radius, _AXIS)
-    return straight
+def _bent(kind: str, pixel: np.ndarray, radius: np.ndarray, angle: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return small errors (n, 2) on the plane z = 1 at pixels (n, 2), in focal lengths, as errors of the pixels.
 
-
-def _bent(kind: str, pixel: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Return small errors (..., 2) on the plane z = 1 at pixels (..., 2) as errors of the pixels, in focal lengths."""
-    radius = np.maximum(np.linalg.norm(pixel, axis=-1, keepdims=True), _AXIS)
-    angle, out = _angle(kind, radius), pixel / radius
-    slope = {"pinhole": np.cos(angle) ** -2, "equidistant fisheye": 1.0, "orthographic fisheye": np.cos(angle)}
-    along = (error * out).sum(-1, keepdims=True) * out
-    bent: np.ndarray = along * np.cos(angle) ** 2 * slope[kind] + (error - along) * radius / np.tan(angle)
+    radius, angle : (n,) of the pixels from the middle, in focal lengths, and of their rays from the axis, rad.
+    """
+    out, cosine, tangent = pixel / radius[:, None], np.cos(angle), np.tan(angle)
+    slope = {"pinhole": 1.0, "equidistant fisheye": cosine**2, "orthographic fisheye": cosine**3}[kind]
+    along = ((error * out).sum(1) * (slope - radius / tangent))[:, None] * out
+    bent: np.ndarray = along + error * (radius / tangent)[:, None]
     return bent
 
 

@@ -60,8 +60,8 @@ class WindowSolution(NamedTuple):
     """Where the adjustment ended.
 
     state : as `Start`. error : (N, K, 2) px, NaN where not observed, infinite behind a camera. sigma_px : their robust
-    standard deviation. A, scores, E, h, g : second derivatives by poses and lens (C, C), first ones point by point
-    (N, C), mixed ones (N, C); of the points, second and first (N,).
+    standard deviation. A, scores, E, h, g : second derivatives by poses and lens (C, C), of which the lower half, first
+    ones point by point (N, C), mixed ones (N, C); of the points, second and first (N,).
     """
 
     state: Start
@@ -74,7 +74,7 @@ class WindowSolution(NamedTuple):
     g: np.ndarray
 
     def reduced(self) -> np.ndarray:
-        """Return the matrix (C, C) without the points."""
+        """Return the matrix (C, C) without the points, of which the lower half."""
         matrix: np.ndarray = self.A - self.E.T @ (self.E / self.h[:, None])
         return matrix
 
@@ -212,18 +212,21 @@ def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution
                     row[axis, 7] = (hx * x + hy * y) * depth * square / focal
                     row[axis, 7] -= (dx * px + dy * py) * (px * px + py * py) / w2
             weight = 1 / (1 + (ex * ex + ey * ey) / sigma_px**2 / _CAUCHY2) / sigma_px**2
-            for axis in range(2):
-                ax, ay, az = by_point[axis]
-                by_depth = ax * (X - T[0, 3]) + ay * (Y - T[1, 3]) + az * (Z - T[2, 3])
-                deep, off = weight * by_depth, weight * error[n, k, axis]
-                h[n] += deep * by_depth
-                g[n] += off * by_depth
-                for i in range(count):
-                    to = 6 * k + i if i < 6 else 6 * partners + i - 6
-                    E[n, to] += deep * row[axis, i]
-                    scores[n, to] += off * row[axis, i]
-                    for j in range(count):
-                        A[to, 6 * k + j if j < 6 else 6 * partners + j - 6] += weight * row[axis, i] * row[axis, j]
+            x0, y0, z0 = X - T[0, 3], Y - T[1, 3], Z - T[2, 3]
+            deep0 = weight * (by_point[0, 0] * x0 + by_point[0, 1] * y0 + by_point[0, 2] * z0)
+            deep1 = weight * (by_point[1, 0] * x0 + by_point[1, 1] * y0 + by_point[1, 2] * z0)
+            h[n] += (deep0 * deep0 + deep1 * deep1) / weight
+            g[n] += ex * deep0 + ey * deep1
+            for i in range(count):
+                to, by0, by1 = 6 * k + i if i < 6 else 6 * partners + i - 6, row[0, i], row[1, i]
+                E[n, to] += deep0 * by0 + deep1 * by1
+                by0, by1 = weight * by0, weight * by1
+                scores[n, to] += ex * by0 + ey * by1
+                # Poses of two partners have no derivative in common.
+                for j in range(min(i + 1, 6)):
+                    A[to, 6 * k + j] += by0 * row[0, j] + by1 * row[1, j]
+                for j in range(6, i + 1):
+                    A[to, 6 * partners + j - 6] += by0 * row[0, j] + by1 * row[1, j]
         off = (state.log_depth[n] - scene.expected[n]) / scene.sigma[n]
         held = 1 / (1 + off * off / _CAUCHY2) / scene.sigma[n] ** 2
         h[n] += held

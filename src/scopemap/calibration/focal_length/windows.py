@@ -11,11 +11,13 @@ import cv2
 import numpy as np
 
 from scopemap.cameras.rectification import Rectifier, working_camera, working_size
-from scopemap.config import Config
+from scopemap.config import Config, DepthSettings
+from scopemap.depth.anchor import depth_downscale
 from scopemap.depth.scopenet.estimator import ScopeNetDepth
 from scopemap.errors import InputError
 from scopemap.flow.corners import detect_corners, normalised_brightness
 from scopemap.frame import Frame, is_constant
+from scopemap.geometry.warp import resampled
 from scopemap.io.sequence import Sequence
 from scopemap.masking.mask_files import create_masks
 from scopemap.masking.masker import Masker
@@ -40,7 +42,7 @@ class Window:
 
     start : (N, 2) float64 px in the host, from the principal point. seen : (N, K, 2) the same in the partners, NaN
     where not observed. half_width_px : half the width of the image. aspect : fy over fx. log_distance : (N,) ln of the
-    estimated distance of the corners along their rays, mm; None: not estimated.
+    estimated distance of the corners along their rays, mm; None: not estimated. host : where it may be estimated.
     """
 
     start: np.ndarray
@@ -48,29 +50,34 @@ class Window:
     half_width_px: float
     aspect: float = 1.0
     log_distance: np.ndarray | None = None
+    host: Frame | None = None
 
 
-def windows_of(sequence: Sequence, config: Config) -> Iterator[Window]:
-    """Yield the windows of the first `MAX_FRAMES` frames, at the default working size or smaller.
+def frames_of_windows(sequence: Sequence, config: Config) -> Iterator[list[Frame]]:
+    """Yield a host and the frames after it, as soon as they are read, for each window of the first `MAX_FRAMES` frames.
 
-    A window ends where the host's corners are lost; one with less than two partners or 40 corners is left out.
+    They are of the default working size or smaller.
     """
-    frames, depth = _kept(_at_default_size(sequence), config), ScopeNetDepth(rays_known=False)
-    patterns = [normalised_brightness(frame.rgb) for frame in frames]
-    for number in range(0, len(frames) - 2, _HOST_EVERY):
-        some = slice(number, number + _MAX_GAP + 1)
-        window = _window(frames[some], patterns[some])
-        if window is not None:
-            yield replace(window, log_distance=_log_distance(window, depth, frames[number]))
+    frames, first = list[Frame](), 0
+    for frame in _kept(_at_default_size(sequence), config):
+        frames.append(frame)
+        if len(frames) > first + _MAX_GAP:
+            yield frames[first:]
+            first += _HOST_EVERY
+    for number in range(first, len(frames) - 2, _HOST_EVERY):
+        yield frames[number:]
 
 
-def _log_distance(window: Window, depth: ScopeNetDepth, host: Frame) -> np.ndarray:
-    """Return ln of the estimated distance of a window's corners in its host along their rays, mm, (N,)."""
-    camera = host.camera
-    column, row = np.rint(window.start + np.array([camera.cx, camera.cy])).astype(int).T
-    rays = camera.rays[row, column]
-    found: np.ndarray = np.log(depth.estimate(host).values[row, column] * np.linalg.norm(rays, axis=1))
-    return found
+def with_distance(window: Window) -> Window:
+    """Return a window with the distance of its corners as scopenet estimates it in the host, at its own size."""
+    host = window.host
+    if host is None:
+        return window
+    small = host.downscaled(depth_downscale(DepthSettings(), max(host.valid.shape)))
+    depth_mm = resampled(ScopeNetDepth(rays_known=False).estimate(small).values, host.camera)
+    column, row = np.rint(window.start + np.array([host.camera.cx, host.camera.cy])).astype(int).T
+    length = np.linalg.norm(host.camera.rays[row, column], axis=1)
+    return replace(window, log_distance=np.log(depth_mm[row, column] * length), host=None)
 
 
 def _at_default_size(sequence: Sequence) -> Sequence:
@@ -82,7 +89,7 @@ def _at_default_size(sequence: Sequence) -> Sequence:
     return replace(sequence, rectifier=Rectifier(source, working_camera(source, size)))
 
 
-def _kept(sequence: Sequence, config: Config) -> list[Frame]:
+def _kept(sequence: Sequence, config: Config) -> Iterator[Frame]:
     masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
     count = min(sequence.count or MAX_FRAMES, MAX_FRAMES)
     every = min(max(count // _MIN_KEPT, 1), _EVERY)
@@ -90,27 +97,32 @@ def _kept(sequence: Sequence, config: Config) -> list[Frame]:
     selection = slice(sequence.selection.start, sequence.selection.stop, step)
     # What is skipped here does not count as skipped in the run.
     some = replace(sequence, selection=selection, choice=replace(sequence.choice, skipped={}))
-    kept: list[Frame] = []
     with suppress(InputError):  # a video that breaks off at once; reading all of it says so
-        kept.extend(map(masker, islice(some.frames(), -(-MAX_FRAMES // every))))
-    return kept
+        yield from map(masker, islice(some.frames(), -(-MAX_FRAMES // every)))
 
 
-def _window(frames: list[Frame], patterns: list[np.ndarray]) -> Window | None:
-    """Return the window of the first of some frames; patterns : `normalised_brightness` of each."""
+def window_of(frames: list[Frame]) -> Window | None:
+    """Return the window of the first of some frames, which ends where its corners are lost.
+
+    A corner is not searched again after a partner that does not observe it. None where less than two partners observe
+    40 corners.
+    """
     host, camera = frames[0], frames[0].camera
     if is_constant(host.rgb):
         return None
     corners = detect_corners(replace(host, depth_mm=np.ones_like(host.valid, dtype=np.float32)), _CELL_PX)
-    seen: list[np.ndarray] = []
-    start = corners.astype(np.float32)
-    for partner, pattern in zip(frames[1:], patterns[1:], strict=True) if len(corners) else []:
-        pixels, good = _followed(patterns[0], pattern, corners, start)
+    if len(corners) < _MIN_CORNERS:
+        return None
+    pattern, seen = normalised_brightness(host.rgb), list[np.ndarray]()
+    kept, pixels = np.arange(len(corners)), corners.astype(np.float32)
+    for partner in frames[1:]:
+        pixels, good = _followed(pattern, normalised_brightness(partner.rgb), corners[kept], pixels)
         good &= _valid_at(pixels, partner.valid)
-        if good.sum() < _MIN_SHARE * len(corners):
+        kept, pixels = kept[good], pixels[good]
+        if len(kept) < _MIN_SHARE * len(corners) or len(kept) < _MIN_CORNERS:
             break
-        seen.append(np.where(good[:, None], pixels, np.nan).astype(np.float64))
-        start = np.where(good[:, None], pixels, corners + np.median((pixels - corners)[good], 0)).astype(np.float32)
+        seen.append(np.full((len(corners), 2), np.nan))
+        seen[-1][kept] = pixels
     if len(seen) < 2:
         return None
     chosen = np.unique(np.linspace(0, len(seen) - 1, _MAX_PARTNERS).round().astype(int))
@@ -119,7 +131,7 @@ def _window(frames: list[Frame], patterns: list[np.ndarray]) -> Window | None:
     if often.sum() < _MIN_CORNERS:
         return None
     axis = np.array([camera.cx, camera.cy])
-    return Window(corners[often] - axis, pixels[often] - axis, camera.width / 2, camera.fy / camera.fx)
+    return Window(corners[often] - axis, pixels[often] - axis, camera.width / 2, camera.fy / camera.fx, host=host)
 
 
 def _followed(
