@@ -162,7 +162,8 @@ class Backend:
         found, worlds = self._merged_and_adjusted(map_number, allowed, alone)
         correction = found.correction if len(worlds) > 1 else self._with_moving_tissue(found, worlds)
         if not correction.refused and correction.tissue is None:
-            correction = replace(correction, lens_residual=lens_residual(found.problem, found.rigid))
+            tested = found if alone.correction.refused else alone  # the main map tells enough of the lens
+            correction = replace(correction, lens_residual=lens_residual(tested.problem, tested.rigid))
         return replace(correction, S_common_map=worlds, tracked=tracked or {})
 
     def _merged_and_adjusted(
