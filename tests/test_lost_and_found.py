@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -12,8 +13,10 @@ from chosen_settings import chosen
 from plane_scene import CAMERA
 
 from scopemap.config import TrackingSettings
+from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.tracking import keyframe_alignment, relocalisation
 from scopemap.tracking.track import Track
 from scopemap.tracking.tracker import Tracker
 
@@ -32,13 +35,14 @@ def _blurred(frame: Frame) -> Frame:
     return replace(frame, rgb=cv2.GaussianBlur(frame.rgb, (0, 0), 5.0))
 
 
-def _tracked(frames: list[Frame], settings: TrackingSettings = SETTINGS) -> list[Track]:
-    tracker, tracks = Tracker(settings), []
+def _tracked(frames: list[Frame], settings: TrackingSettings = SETTINGS, tracker: Tracker | None = None) -> list[Track]:
+    """Tracks by measured depth, or by a tracker's corners."""
+    by_corners, tracker, tracks = tracker is not None, tracker or Tracker(settings), []
     for frame in frames:
         track = tracker.track(frame)
         tracks.append(track)
         if track.status != "lost" and tracker.needs_keyframe():
-            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=not by_corners)
     return tracks
 
 
@@ -119,6 +123,27 @@ def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_f
     turn, way_mm = _off(first, NEAR[first.index - 20])
     assert turn < np.radians(0.4)
     assert way_mm < 0.3
+
+
+def test_a_lost_frame_is_not_aligned_by_light_and_one_keyframe_finds_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[str] = []
+
+    def count(module: ModuleType, name: str) -> None:
+        call = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *arguments: [tried.append(name), call(*arguments)][1])
+
+    count(keyframe_alignment, "align")
+    count(relocalisation, "relative_pose_pnp")
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
+    there = [_elsewhere(8 + n, n) for n in range(3)]
+    tracker = Tracker(chosen(SETTINGS, min_keyframe_motion=0.0), DisFlow())
+    tracks = _tracked([*frames, *there], tracker=tracker)
+    assert [track.status for track in tracks] == ["initial"] + ["ok"] * 7 + ["lost"] * 3
+    # Of the keyframes 0, 3 and 6.
+    assert set(tried) == {"relative_pose_pnp"}
+    tried.clear()
+    assert tracker.track(plane_scene.frame(NEAR[4], 11)).status == "ok"
+    assert tried == ["relative_pose_pnp"]
 
 
 @pytest.mark.parametrize("unseen", ["dark", "smoked"])

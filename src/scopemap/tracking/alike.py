@@ -28,7 +28,7 @@ _RADIUS_PX = 2  # of the surroundings of which a keypoint has the highest score
 _TEMPERATURE = 0.1  # of the soft argmax
 # Local brightness that pictures are brought to, its width as a share of the picture's, and what is added to the dark.
 _EVEN_LEVEL, _EVEN_SHARE, _DARKEST, _LOW_RESOLUTION = 110.0, 1 / 16, 8.0, 4
-_MOST_KEPT = 8
+_MOST_KEPT = 32  # the keyframes in which a lost camera is searched among them
 
 
 class AlikeFeatures:

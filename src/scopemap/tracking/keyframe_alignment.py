@@ -107,14 +107,23 @@ class KeyframeAligner:
             self._matcher.set_keyframe(keyframe.frame if self.has_corners(keyframe) else None, frame, T_frame_keyframe)
 
     def align(self, keyframe: Keyframe, frame: Frame) -> tuple[Alignment, list[View] | None]:
-        """Return the alignment by corners, else the photometric one, and the frame's pyramid where it was needed."""
+        """Return the alignment by corners, else the photometric one, and the frame's pyramid where it was needed.
+
+        Where corners fail and features are searched next, predicted poses are judged, and only good ones are aligned.
+        """
         by_corners = self.by_corners(keyframe, frame, inverse(self._motion.T_world_last) @ keyframe.T_world_camera)
         if by_corners is not None and self.rejection(keyframe, by_corners) is None:
             return by_corners, None
         pyramid, starts = self.pyramid(keyframe, frame), self._motion.predictions()
         if self._settings.constants.start == "identity" and len(starts) == 1:
             starts = [keyframe.T_world_camera]
-        found = [align(keyframe.pyramid, pyramid, inverse(T) @ keyframe.T_world_camera, self._settings) for T in starts]
+        searched = self.has_corners(keyframe) and self._settings.constants.relocalisation_keyframes > 0
+        found = []
+        for T_start in (inverse(T) @ keyframe.T_world_camera for T in starts):
+            judged = judge(keyframe.pyramid, pyramid, Motion(T_start, np.array([1.0, 0.0])))
+            if not searched or self.rejection(keyframe, judged) is None:
+                judged = align(keyframe.pyramid, pyramid, T_start, self._settings)
+            found.append(judged)
         best = max(found, key=lambda alignment: alignment.agreement)
         return (best if by_corners is None else replace(best, coverage=by_corners.coverage)), pyramid
 

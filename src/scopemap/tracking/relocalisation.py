@@ -22,6 +22,7 @@ from scopemap.tracking.track import Track
 
 _MIN_INLIERS = 20
 _STRONGEST, _CANDIDATES = 128, 3  # descriptors by which keyframes are ranked; those that are tried, of either group
+_LEAST_SIMILARITY = 3.0  # of the keyframes that are tried: in less similar ones PnP hardly ever succeeds
 _MAX_APART, _NEARER = 0.3, 0.7  # distance of an earlier keyframe's view, at most, and over that of the current one
 _CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less is a close-up
 _EVERY_PX, _RANGE = 4, (5, 95)
@@ -156,9 +157,10 @@ class Relocaliser:
     ) -> tuple[Keyframe, Alignment] | None:
         """Return the keyframe with the best accepted alignment of a frame, and that alignment; None without any.
 
+        The most similar ones are tried, until the keyframe's corners confirm a pose.
         align : returns the alignment with a keyframe from its relative pose by features. near : keyframes
-        that are searched in any case. recent : whether the most similar ones of the current map are, too. other_maps :
-        whether those of other maps are, where none of these is found.
+        that are searched in any case. recent : whether the others of the current map are, too. other_maps : whether
+        those of other maps are, where none of these is found.
         """
         if self.settings.constants.relocalisation_keyframes == 0:
             return None
@@ -167,28 +169,24 @@ class Relocaliser:
         self._features = {index: known for index, known in self._features.items() if index in kept}
         numbers = {keyframe.frame.index for keyframe in near}
         others = [keyframe for keyframe in self._keyframes if recent and keyframe.frame.index not in numbers]
-        groups = [[*near, *self._most_similar(others, current)]]
-        groups += [self._most_similar(self._of_other_maps, current)] if other_maps else []
-        for keyframes in groups:
+        for keyframes in ([*near, *others], self._of_other_maps if other_maps else ()):
             found = []
-            for keyframe in keyframes:
+            for keyframe in self._most_similar(keyframes, current):
                 relative = relative_pose_pnp(self._known(keyframe), current, frame.camera, _MIN_INLIERS)
-                if relative is not None:
-                    alignment = align(keyframe, relative)
-                    if is_accepted(keyframe, alignment):
-                        found.append((keyframe, alignment))
+                if relative is not None and is_accepted(keyframe, alignment := align(keyframe, relative)):
+                    found.append((keyframe, alignment))
+                    if alignment.is_supported:
+                        break
             if found:
-                return max(found, key=lambda pair: pair[1].agreement)
+                return max(found, key=lambda pair: (pair[1].is_supported, pair[1].agreement))
         return None
 
     def _most_similar(self, keyframes: Iterable[Keyframe], current: Features) -> list[Keyframe]:
-        """Return the keyframes whose strongest features are most like those of a frame."""
+        """Return the keyframes whose strongest features are most like those of a frame, most similar first."""
         strongest = current.descriptors[:_STRONGEST]
-
-        def unlike(keyframe: Keyframe) -> float:
-            return -similarity(strongest, self._known(keyframe).descriptors[:_STRONGEST])
-
-        return sorted(keyframes, key=unlike)[:_CANDIDATES]
+        alike = [(similarity(strongest, self._known(k).descriptors[:_STRONGEST]), k) for k in keyframes]
+        likely = [pair for pair in alike if pair[0] >= _LEAST_SIMILARITY]
+        return [keyframe for _, keyframe in sorted(likely, key=lambda pair: -pair[0])[:_CANDIDATES]]
 
     def _known(self, keyframe: Keyframe) -> Features:
         """Return the features of a keyframe, detected on first use: most clips never need them."""
