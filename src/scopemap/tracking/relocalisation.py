@@ -22,7 +22,7 @@ from scopemap.tracking.track import Track
 
 _MIN_INLIERS = 20
 _STRONGEST, _CANDIDATES = 128, 3  # descriptors by which keyframes are ranked; those that are tried, of either group
-_LEAST_SIMILARITY = 3.0  # of the keyframes that are tried: in less similar ones PnP hardly ever succeeds
+_LEAST_SIMILARITY = 3.0  # of keyframes that are tried: in less similar ones of a colonoscopy PnP succeeded once
 _MAX_APART, _NEARER = 0.3, 0.7  # distance of an earlier keyframe's view, at most, and over that of the current one
 _CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less is a close-up
 _EVERY_PX, _RANGE = 4, (5, 95)
