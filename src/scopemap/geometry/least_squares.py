@@ -175,13 +175,13 @@ _RIDGE = 1e-9  # of the diagonal
 class PointBlock(NamedTuple):
     """Normal equations of n points that touch the same m camera unknowns.
 
-    columns : (m,) numbers of these. A : (m, m) their second derivative. scores : (n, m) the first, point by point.
-    points : numbers of the points. h, g : (n,) second and first derivative of the points. E : (n, m) of both.
+    columns : (m,) numbers of these. A : (m, m) their second derivative, b : (m,) the first. points : numbers of the
+    points. h, g : (n,) second and first derivative of the points. E : (n, m) of both.
     """
 
     columns: np.ndarray
     A: np.ndarray
-    scores: np.ndarray
+    b: np.ndarray
     points: slice
     h: np.ndarray
     g: np.ndarray
@@ -220,7 +220,7 @@ class SchurModel:
         """First derivative (cameras + points,); 0 for fixed unknowns."""
         cameras, points = np.zeros(self.cameras), np.zeros(self.points)
         for block in self.blocks[0]:
-            cameras[block.columns] += block.scores.sum(0)
+            cameras[block.columns] += block.b
             points[block.points] = block.g
         for prior in self.blocks[1]:
             cameras[prior.columns] += prior.b
@@ -254,7 +254,7 @@ class SchurModel:
             add(*prior)
         for block in self.blocks[0]:
             shrunk = block.E / block.h[:, None]
-            add(block.columns, block.A - block.E.T @ shrunk, block.scores.sum(0) - shrunk.T @ block.g)
+            add(block.columns, block.A - block.E.T @ shrunk, block.b - shrunk.T @ block.g)
         matrix[np.diag_indices_from(matrix)] *= 1 + _RIDGE
         return matrix, rhs[self.free]
 

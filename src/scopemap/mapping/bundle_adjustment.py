@@ -271,29 +271,29 @@ def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -
     keyframes = np.union1d(observations.keyframe[some], host)
     count, at = here.stop - here.start, int(np.searchsorted(keyframes, host))
     number, observer = observations.point[some] - here.start, np.searchsorted(keyframes, observations.keyframe[some])
-    A, scores, E, h, g = _summed(_Rows(*(part[some] for part in parts)), number, observer, at, count, len(keyframes))
+    A, b, E, h, g = _summed(_Rows(*(part[some] for part in parts)), number, observer, at, count, len(keyframes))
     # The prior of the estimated depth, up to the host's scale.
     off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], PER_KEYFRAME * at + 6
     held = cauchy((off / points.sigma[here]) ** 2, CAUCHY)[1] / points.sigma[here] ** 2
     E[:, column] -= held
     A[column, column] += held.sum()
-    scores[:, column] -= held * off
+    b[column] -= (held * off).sum()
     columns = (PER_KEYFRAME * keyframes[:, None] + np.arange(PER_KEYFRAME)).ravel()
     columns = np.append(columns, PER_KEYFRAME * len(state.T_camera_world) + np.arange(parts.by_lens.shape[2]))
-    return PointBlock(columns, A, scores, here, h + held, g + held * off, E)
+    return PointBlock(columns, A, b, here, h + held, g + held * off, E)
 
 
 @njit(cache=True, nogil=True)
 def _summed(
     rows: _Rows, point: np.ndarray, observer: np.ndarray, host: int, points: int, keyframes: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return A, scores, E, h and g of a `PointBlock`, summed over the observations of a host's points."""
+    """Return A, b, E, h and g of a `PointBlock`, summed over the observations of a host's points."""
     error, weight, by_camera, by_host, by_depth, by_lens = rows
     lens = by_lens.shape[2]
     last = PER_KEYFRAME * keyframes
     size = last + lens
     A = np.zeros((size, size))
-    scores, E = np.zeros((points, size)), np.zeros((points, size))
+    b, E = np.zeros(size), np.zeros((points, size))
     h, g = np.zeros(points), np.zeros(points)
     touched = np.empty(12 + lens, np.int64)
     touched[6:12] = PER_KEYFRAME * host + np.arange(6)
@@ -310,7 +310,7 @@ def _summed(
         for i in range(12 + lens):
             one, other, at = weighed[0, i], weighed[1, i], touched[i]
             E[point[k], at] += one * by_depth[k, 0] + other * by_depth[k, 1]
-            scores[point[k], at] += one * error[k, 0] + other * error[k, 1]
+            b[at] += one * error[k, 0] + other * error[k, 1]
             for j in range(i, 12 + lens):
                 A[at, touched[j]] += one * rows_of[0, j] + other * rows_of[1, j]
     # Of each pair of unknowns one product was added; an observer is never the host.
@@ -318,7 +318,7 @@ def _summed(
         for j in range(i):
             A[i, j] += A[j, i]
             A[j, i] = A[i, j]
-    return A, scores, E, h, g
+    return A, b, E, h, g
 
 
 def with_points(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> State:
