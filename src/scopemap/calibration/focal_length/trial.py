@@ -131,7 +131,8 @@ def _adjusted(window: Window, kind: str, focal_px: float, start: Start | None) -
     )
     begin = at_rest(scene) if start is None else start._replace(lens=lens)
     found = adjusted(scene, begin, _FIRST if start is None else _NEXT, _MIN_DECREASE)
-    bent = unit * _bent(kind, pixel[:, 1:][near], radius[:, 1:][near], angle[:, 1:][near], found.error[near])
+    with np.errstate(invalid="ignore"):  # errors of points behind the camera are infinite
+        bent = unit * _bent(kind, pixel[:, 1:][near], radius[:, 1:][near], angle[:, 1:][near], found.error[near])
     errors[near] = np.where(np.isfinite(found.error[near, 0]), np.hypot(*bent.T), _OUTSIDE_PX)
     return errors[is_seen], found.state
 
