@@ -249,7 +249,7 @@ class Backend:
             # Each map with all others: a wrong one hides among right ones that have more loops.
             some = [of == 2 for of, _ in own] + [of == 1 for of, number in own if number != main]
             sigma = [robust_sigma_2d(length_px[chosen]) if chosen.any() else math.nan for chosen in some]
-            return sigma[: len(own)], max(sigma[len(own) :], default=math.nan)
+            return sigma[: len(own)], float(np.max(sigma[len(own) :] or math.nan))  # NaN: a map has no loop
 
         graph = problem.begin
         (within, between_px), (before, _) = sigmas_px(found.state), sigmas_px(graph)
