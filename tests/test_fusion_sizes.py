@@ -109,14 +109,14 @@ def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
     for frame in frames:
         fusion.put(frame)
     assert (fusion.at_end, fusion.at_once) == (at_end, not at_end)
-    surface = fusion.fuse(fusion.store.frames(), {0, 1, 2})
+    surface = fusion.fuse(fusion.store.frames(), fusion.store.median_depth_mm())
     volume = TsdfVolume(FusionSettings(voxel_mm=1.0, constants=advanced))
     for frame in frames[::2]:
         volume.integrate(frame)
     assert len(surface.mesh.vertices) == pytest.approx(len(volume.extract_mesh().vertices), rel=0.05)
     assert surface.settings.voxel_mm == 1.0
     assert len(surface.notices) == (voxel_mm is None)
-    assert fusion.fuse([], ()).settings.voxel_mm in (voxel_mm, 1.0)
+    assert fusion.fuse([], None).settings.voxel_mm in (voxel_mm, 1.0)
 
 
 def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_voxels_grow_until_the_surface_is_within_the_limit(at_end: bool, tmp_pat
         fusion.coarser_beyond = limit
         for frame in frames:
             fusion.put(frame)
-        found = fusion.fuse(fusion.store.frames(), {0})
+        found = fusion.fuse(fusion.store.frames(), fusion.store.median_depth_mm({0}))
         meshes.append(found.mesh)
         counts.append((found.settings.voxel_mm, found.settings.truncation_mm, len(found.notices)))
     assert counts == [(0.5, 2.5, 0), (1.0, 5.0, 1), (4.0, 20.0, 1)] or counts[1][0] == 1.0 < counts[2][0]

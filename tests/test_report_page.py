@@ -249,7 +249,7 @@ def test_a_result_shows_itself_in_a_notebook_and_in_one_line(folder: Path) -> No
     result = drawn_result(name="<b>video</b>.mp4")
     assert repr(result) == in_one_line(result)
     assert repr(result) == (
-        "<Reconstruction, doubtful: 14 of 24 frames in one map; scale unknown; "
+        "<Reconstruction, doubtful: 14 of 24 frames in one map; beside it 1 submap (1 not usable); scale unknown; "
         "surface covers 94 % of its own pictures, not of the organ>"
     )
     assert "7 of 7 frames in one map" in repr(result.others[0])

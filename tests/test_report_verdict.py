@@ -102,6 +102,18 @@ def test_the_share_of_frames_in_the_result(inside: int, word: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("apart", "level", "word"), [(40, "doubtful", "good"), (40, "bad", "doubtful"), (29, "good", "doubtful")]
+)
+def test_submaps_of_three_seconds_that_are_usable_stand_for_their_part(apart: int, level: str, word: str) -> None:
+    """At ten frames a second; 40 of 80 frames are in the result."""
+    run = run_of([0] * 40 + [1] * apart + [LOST] * (40 - apart))
+    other = replace(run.others[0], provenance={"verdict": {"level": level}})
+    found = verdict(replace(run, others=[other]))
+    assert found.word == word
+    assert f"40 of 80 frames in one map; beside it 1 submap (1 {rules.WORDS[level]}); " in found.sentence
+
+
+@pytest.mark.parametrize(
     ("figures", "word"),
     [
         (surface(coverage_mean=0.8), "good"),

@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import plane_scene
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingConstants
+from scopemap.flow.dis import DisFlow
+from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import se3, so3_exp
 from scopemap.mapping import TrackedPose
+from scopemap.mapping.backend import Backend
 from scopemap.mapping.pose_graph import path_without_drift
 
 
@@ -43,6 +47,30 @@ def test_each_map_keeps_its_first_keyframe_and_has_a_drift_of_its_own() -> None:
     np.testing.assert_allclose(path.T_world_camera[1::2], [pose.T_world_camera for pose in mixed[1::2]])
     np.testing.assert_allclose(path.drift[1::2], 0, atol=1e-9)
     assert path.drift[-2] > 0.5 * drifting[-1]
+
+
+@pytest.mark.parametrize("anchored", [False, True])
+@pytest.mark.parametrize("refused", [False, True])
+def test_every_map_gets_the_millimetres_of_the_network(anchored: bool, refused: bool) -> None:
+    """Two maps apart: the chain of scales has come to 1.3 in the first, and begins with 6 in the second."""
+    constants = MappingConstants(max_sigma_px=1e-3 if refused else MappingConstants().max_sigma_px)
+    backend = Backend(MappingSettings(constants=constants), DisFlow(), anchored=anchored)
+    chained, poses = (1.3, 6.0), []
+    for n in range(12):
+        number = n // 6
+        true = plane_scene.pose(at_mm=(2.0 * (n % 6) + 40 * number, 0, 0), turn_rad=(0, 0, 0.01 * n))
+        T = Similarity(chained[number], np.eye(3), np.zeros(3)).transform_poses(true)
+        poses.append(TrackedPose(number, max(n - 1, 6 * number), T))
+        keyframe = plane_scene.frame(true, n, T, chained[number])
+        backend.add(replace(keyframe, depth_scale=chained[number]), poses[n])
+    for number in (0, 1):
+        correction = backend.adjust(number, among=())
+        assert bool(correction.refused) == refused
+        correction = replace(correction, tracked=dict(enumerate(poses)))
+        own, mm = range(6 * number, 6 * number + 6), 1.3 if anchored else 1.0
+        np.testing.assert_allclose([correction.depth_factor(n) * chained[number] for n in own], mm, rtol=0.02)
+        first, last = (correction.pose(n, poses[n].T_world_camera)[:3, 3] for n in (own[0], own[-1]))
+        np.testing.assert_allclose(np.linalg.norm(last - first), 10 * mm, rtol=0.03)
 
 
 def test_the_adjustment_does_not_bring_the_drift_back() -> None:

@@ -49,7 +49,8 @@ class Pipeline:
         tracker = tracker or Tracker(config.tracking, estimators.corner_flow, estimators.features)
         at_rest = {"method": "none"} if config.tracking.camera_at_rest else {}  # there is nothing to adjust
         mapping = config.mapping.model_copy(update=at_rest)
-        mapper = Mapper(mapping, estimators.keyframe_flow, store.table, estimators.features)
+        features, anchored = estimators.features, config.depth.is_anchored
+        mapper = Mapper(mapping, estimators.keyframe_flow, store.table, features, anchored)
         self.odometry = Odometry(config, tracker, mapper)
         self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.method != "none")
 

@@ -125,7 +125,7 @@ class RunFrames:
         frames = self.frames(fused)
         if (states := self.states) is not None:
             frames = (in_surface_state(frame, states) for frame in frames)
-        surface = fusion.fuse(frames, fused)
+        surface = fusion.fuse(frames, self._store.median_depth_mm(fused))
         return finished(surface.mesh, surface.settings)
 
     def frames(self, among: Collection[int] | None = None) -> Iterator[Frame]:

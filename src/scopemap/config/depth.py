@@ -74,6 +74,11 @@ class DepthSettings(StageSettings):
     )
     constants: DepthConstants = constants_of(DepthConstants(), DEPTH)
 
+    @property
+    def is_anchored(self) -> bool:
+        """Whether a range, another estimator or a factor fixes the millimetres of frame 1, not the estimate itself."""
+        return self.near_far_mm is not None or self.anchor not in ("auto", self.backend)
+
 
 @dataclass(frozen=True)
 class MapisConstants:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -241,11 +241,17 @@ class FrameStore:
             if among is None or int(entry["index"]) in among:
                 yield self._read(entry)
 
-    def median_depth_mm(self, among: Collection[int] | None = None) -> float | None:
-        """Return the median of the frames' median depths, mm, None where no depth is known; `among` as in `frames`."""
-        some = [e["median_depth_mm"] for e in self._index()[0] if among is None or int(e["index"]) in among]
-        medians_mm = [median_mm for median_mm in some if np.isfinite(median_mm)]
-        return float(np.median(medians_mm)) if medians_mm else None
+    def median_depth_mm(
+        self, among: Collection[int] | None = None, factor: Callable[[int], float] = lambda _: 1.0
+    ) -> float | None:
+        """Return the median of the frames' median depths, mm, None where no depth is known.
+
+        among : as in `frames`. factor : returns that of a frame's depth by its number.
+        """
+        entries = [entry for entry in self._index()[0] if among is None or int(entry["index"]) in among]
+        medians_mm = [factor(int(entry["index"])) * entry["median_depth_mm"] for entry in entries]
+        known_mm = [median_mm for median_mm in medians_mm if np.isfinite(median_mm)]
+        return float(np.median(known_mm)) if known_mm else None
 
     def close(self) -> None:
         """Close the files."""

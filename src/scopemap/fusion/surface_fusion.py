@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -241,14 +241,12 @@ class SurfaceFusion:
         while self.coarser_beyond is not None and sum(volume.block_count for volume in volumes) > self.coarser_beyond:
             max(volumes, key=lambda volume: volume.block_count).coarsen()
 
-    def fuse(self, frames: Iterable[Frame], main_frames: Collection[int], map_number: int = 0) -> FusedSurface:
+    def fuse(self, frames: Iterable[Frame], median_mm: float | None, map_number: int = 0) -> FusedSurface:
         """Return the surface of every n-th of the stored frames, all of which are consumed, or of those fused at once.
 
-        main_frames : numbers of those whose median depth the TSDF parameters follow. map_number : of those fused at
-        once.
+        median_mm : of the depth of those that the TSDF parameters follow. map_number : of those fused at once.
         """
         volume, settings = self._volumes.get(map_number), self.settings
-        median_mm = self.store.median_depth_mm(main_frames)
         if self.at_end and settings.enabled and (median_mm or settings.voxel_mm):
             volume = TsdfVolume(settings, choose_parameters(settings, median_mm))
         for number, frame in enumerate(frames):

@@ -30,7 +30,13 @@ from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
 from scopemap.mapping.map_merging import AdjustedMaps, Part, loop_support, merge_maps, split_maps
 from scopemap.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
-from scopemap.mapping.pose_graph import PathWithoutDrift, optimise_pose_graph, path_without_drift, tracked_pairs
+from scopemap.mapping.pose_graph import (
+    PathWithoutDrift,
+    optimise_pose_graph,
+    path_without_drift,
+    scale_by_network,
+    tracked_pairs,
+)
 from scopemap.mapping.pose_interpolation import FrameCorrection, TissueMotion, TrackedPose
 from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
@@ -51,7 +57,7 @@ class Backend:
 
     Feature tracks and loop closures are computed in another thread; no other one may use `flow` meanwhile. Before the
     bundle adjustment loop closures between maps merge them, the scale's drift is removed, and a pose graph spreads all
-    loop closures over the keyframes. table : where observations are stored until then.
+    loop closures over the keyframes. table : of observations until then. anchored : as `scale_by_network` takes it.
     """
 
     def __init__(
@@ -60,8 +66,9 @@ class Backend:
         flow: FlowEstimator,
         table: RowTable = rows_in_memory,
         features: FeatureDetector | None = None,
+        anchored: bool = False,
     ) -> None:
-        self.settings = settings.constants
+        self.settings, self._anchored = settings.constants, anchored
         self._frames: list[int] = []
         self._times_s: list[float] = []
         self._tracked: list[TrackedPose] = []
@@ -156,7 +163,7 @@ class Backend:
         # Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
         for share in (1.0, 0.0) if any(self._log_scales) else (0.0,):
             self._path = path_without_drift(self._tracked, share * np.array(self._log_scales))
-            alone = self._adjusted({map_number: Similarity.identity()}, map_number)
+            alone = self._adjusted({map_number: self._unit(map_number)}, map_number)
             if not alone.correction.refused:
                 break
         found, worlds = self._merged_and_adjusted(map_number, allowed, alone)
@@ -174,7 +181,7 @@ class Backend:
         alone : the map's own. Each map is tried with the main one and with that of the merged ones that it has most
         loops with, so that time grows with the number of maps, and all are adjusted together in the end.
         """
-        found, worlds, merged, refused = alone, {main: Similarity.identity()}, {main}, 0
+        found, worlds, merged, refused = alone, {main: self._unit(main)}, {main}, 0
         for number in [*self._merged(main, allowed)][1:]:
             few = {main, self._partner(number, merged), number}
             # Each try costs an adjustment: no more of them fail than maps are merged, and one.
@@ -218,10 +225,16 @@ class Backend:
         map_of = np.array([pose.map for pose in self._tracked])
         points, _ = self._tracks.collected(np.flatnonzero(map_of == map_number))
         if len(set(map_of.tolist())) < 2 or not len(points.log_depth):
-            return {map_number: Similarity.identity()}
+            return {map_number: self._unit(map_number)}
         chosen = np.flatnonzero(np.isin(map_of, [map_number, *allowed])).tolist()
         loops, T_world_camera = self._loops_among(chosen, -self._path.drift[chosen]), self._path.T_world_camera[chosen]
-        return merge_maps(T_world_camera, map_of[chosen].tolist(), loops, map_number, _median_depth_mm(points))
+        worlds = merge_maps(T_world_camera, map_of[chosen].tolist(), loops, map_number, points.median_mm)
+        return {number: self._unit(map_number).after(S) for number, S in worlds.items()}
+
+    def _unit(self, map_number: int) -> Similarity:
+        """Return the Sim(3) from a map to the millimetres that count."""
+        map_of, off = np.array([pose.map for pose in self._tracked]), np.array(self._log_scales) - self._path.drift
+        return Similarity(scale_by_network(off, map_of, map_number, self._anchored), np.eye(3), np.zeros(3))
 
     def _loops_among(self, chosen: list[int], log_unit: np.ndarray) -> list[Loop]:
         """Return the loops between these keyframes, numbered by their place; log_unit as `Loop.among` takes it."""
@@ -304,7 +317,7 @@ class Backend:
         loops = self._loops_among(chosen, log_unit)
         if not loops:
             return problem, np.zeros((0, 2), int)
-        graph = optimise_pose_graph(T_world_camera, pairs, loops, _median_depth_mm(points))
+        graph = optimise_pose_graph(T_world_camera, pairs, loops, points.median_mm)
         log_depth = points.log_depth + graph.log_scale[points.host]
         start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
         return replace(problem, start=start), graph.accepted
@@ -380,10 +393,6 @@ def contradiction(points: Points, found: BundleSolution, settings: MappingConsta
     if certain.sum() > _MIN_TEST_SHARE * len(certain) and np.median(change) > settings.max_depth_change:
         return f"depth would have to change by {100 * np.expm1(np.median(change)):.0f} %"
     return ""
-
-
-def _median_depth_mm(points: Points) -> float:
-    return float(np.exp(np.median(points.log_depth)))
 
 
 def _depth_change(points: Points, found: BundleSolution) -> np.ndarray:

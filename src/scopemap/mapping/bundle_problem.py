@@ -31,6 +31,11 @@ class Points:
     log_depth: np.ndarray
     sigma: np.ndarray
 
+    @property
+    def median_mm(self) -> float:
+        """Typical depth."""
+        return float(np.exp(np.median(self.log_depth)))
+
 
 @dataclass(frozen=True)
 class Observations:
@@ -92,7 +97,7 @@ class BundleProblem:
     @property
     def unit_mm(self) -> float:
         """Typical depth, the unit of translations."""
-        return float(np.exp(np.median(self.points.log_depth)))
+        return self.points.median_mm
 
     @property
     def tracked(self) -> State:

@@ -98,6 +98,18 @@ def _scale_drift(log_scale: np.ndarray) -> np.ndarray:
     return drift - drift[0]
 
 
+def scale_by_network(log_scale: np.ndarray, map_of: np.ndarray, number: int, anchored: bool) -> float:
+    """Return the factor of a map's millimetres that makes them those of the depth network, by most of its keyframes.
+
+    A map begins with the scale with which the one before has ended, so that drift adds up over maps, and the error of
+    the very first frame would scale them all. log_scale : (K,) as `path_without_drift` takes it, without its drift.
+    map_of : (K,) numbers of the maps. anchored : whether depth was fitted to something else on the first frame: its map
+    keeps its millimetres, and others get them by the network.
+    """
+    off = np.median(log_scale[map_of == number])
+    return float(np.exp((np.median(log_scale[map_of == map_of[0]]) if anchored else 0.0) - off))
+
+
 def tracked_pairs(frames: Sequence[int], tracked: Sequence[TrackedPose]) -> np.ndarray:
     """Return pairs (C, 2) int of keyframes between which the motion was tracked.
 

@@ -43,7 +43,7 @@ class Submap:
 
     Attributes
     ----------
-    main : number of its map with most frames, whose millimetres are kept. maps : numbers of all maps merged into it.
+    main : number of its map with most frames. maps : numbers of all maps merged into it.
     frames : numbers of the frames tracked in these. main_frames : of those tracked in the main map. correction : of
     poses and depth of these frames; None: they are as tracked.
     """
@@ -54,12 +54,17 @@ class Submap:
     main_frames: frozenset[int]
     correction: FrameCorrection | None = None
 
+    def depth_factor(self, index: int) -> float:
+        """Return the factor of the whole depth of the frame with this number."""
+        return 1.0 if self.correction is None else self.correction.depth_factor(index)
+
 
 class Mapper:
     """Takes every track and every keyframe, and returns the submaps after the last frame.
 
     flow : between keyframes, for the thread of the back end alone; "none" leaves all frames as tracked. table : where
     poses and observations are kept until the last frame. features : of keyframes, for loop closure; None: SIFT.
+    anchored : as `scale_by_network` takes it.
     """
 
     NOT_IN_CHECKPOINT = ("_read",)
@@ -71,9 +76,10 @@ class Mapper:
         flow: FlowEstimator,
         table: RowTable = rows_in_memory,
         features: FeatureDetector | None = None,
+        anchored: bool = False,
     ) -> None:
         links = settings.method != "none" and flow.name != "none"
-        self._backend = Backend(settings, flow, table, features) if links else None
+        self._backend = Backend(settings, flow, table, features, anchored) if links else None
         self._rows = table("tracked_poses", _TRACKED)
         self._last: tuple[int, TrackedPose] | None = None
         self._tracked: dict[int, TrackedPose] = {}

@@ -25,7 +25,15 @@ from scopemap.report.losses import losses
 from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
 from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.report.verdict import Result, frames_per_s, scale_is_known, scale_source, verdict
+from scopemap.report.verdict import (
+    WORDS,
+    Result,
+    frames_per_s,
+    level_of_submap,
+    scale_is_known,
+    scale_source,
+    verdict,
+)
 from scopemap.report.video_parts import video_parts
 from scopemap.trajectory.frame_table import NOT_USED
 from scopemap.trajectory.trajectory import Trajectory
@@ -74,6 +82,7 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
         "name": name or Path(source).name or source,
         "input": source,
         "verdict": asdict(found) | {"word": found.word},
+        "words": [WORDS[level_of_submap(submap)] for submap in run.submaps],
         "scale_known": scale_is_known(run.provenance),
         "scale_source": scale_source(run.provenance),
         "notes": [notice.text for notice in notices_of(run.provenance) if notice.level == "info"],

@@ -21,7 +21,9 @@ WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not u
 
 LEAST_FRAMES = 10
 GOOD_SHARE, LEAST_SHARE = 0.8, 0.3
-"""Share of the frames that are in the result."""
+"""Share of the frames that are in the result, or in submaps that stand for their part of the video."""
+LEAST_SEGMENT_S = 3.0
+"""Least length of a submap that stands for its part of the video."""
 GOOD_COVERAGE, LEAST_COVERAGE = 0.8, 0.5
 """Mean share of what the frames see that the surface covers."""
 GOOD_DISAGREEMENT, MOST_DISAGREEMENT = 0.05, 0.15
@@ -79,14 +81,20 @@ def verdict(run: Result) -> Verdict:
 
 
 def state_verdict(result: Reconstruction) -> None:
-    """Put the verdicts on a result and its other submaps into their provenance."""
-    for part in result.submaps:
+    """Put the verdicts on a result and its other submaps into their provenance; that on the result rests on theirs."""
+    for part in reversed(result.submaps):
         part.provenance["verdict"] = verdict(part).facts
 
 
 def frames_in_result(frames: FrameTable) -> tuple[int, int]:
     """Return how many frames are in the result, and of how many that were used."""
     return int(np.sum(frames.place == 0)), int(np.sum(frames.place != NOT_USED))
+
+
+def level_of_submap(submap: Result) -> Level:
+    """Return the level of the verdict on a submap by itself, as it was stated, or else found now."""
+    stated: Level | None = submap.provenance.get("verdict", {}).get("level")
+    return stated or verdict(submap).level
 
 
 def frames_per_s(result: Result) -> float | None:
@@ -135,6 +143,8 @@ def _sentence(run: Result) -> str:
     inside, used = frames_in_result(run.frames)
     surface = run.provenance.get("surface") or {}
     parts = [f"{inside} of {used} frames in one map"]
+    if judged := _submaps_in_words(run):
+        parts.append(f"beside it {judged}")
     known = "scale as you stated it" if _scale_is_stated(run.provenance) else "scale known"
     parts.append(known if scale_is_known(run.provenance) else "scale unknown")
     if not len(run.mesh.faces):
@@ -146,15 +156,35 @@ def _sentence(run: Result) -> str:
 
 def _of_frames(run: Result) -> Reason:
     inside, used = frames_in_result(run.frames)
-    share = inside / max(used, 1)
     if inside < LEAST_FRAMES:
         return Reason("frames-too-few", "bad", f"Only {inside} of {used} frames could be joined: too few for a shape.")
-    place = run.frames.place
-    lost_in_a_row = longest_segment(place[place != NOT_USED] != 0)
+    place = run.frames.place[run.frames.place != NOT_USED]
+    found = np.isin(place, [0, *_segments(run)])
+    share, apart = found.mean(), int(found.sum()) - inside
+    lost_in_a_row = longest_segment(~found)
     longest = f" Longest gap: {lost_in_a_row} frames." if lost_in_a_row else ""
     until = "" if run.provenance.get("interrupted_at_frame") is None else " until then"
-    text = f"{_percent(share)} of the frames{until} are in the result ({inside} of {used}).{longest}"
+    where, counted = "in the result", f"{inside} of {used}"
+    if apart:
+        where += f", or in submaps of {LEAST_SEGMENT_S:g} s and more that can be used by themselves"
+        counted = f"{inside} and {apart} of {used}"
+    text = f"{_percent(share)} of the frames{until} are {where} ({counted}).{longest}"
     return Reason("frames-in-result", _level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
+
+
+def _segments(run: Result) -> list[int]:
+    """Return the numbers of the submaps that stand for their part of the video."""
+    place, times_s = run.frames.place, run.frames["time_s"]
+    period_s = np.median(np.diff(times_s)) if len(times_s) > 1 else np.nan
+    long = (n for n in range(1, len(run.submaps)) if (place == n).sum() * period_s >= LEAST_SEGMENT_S)
+    return [number for number in long if level_of_submap(run.submaps[number]) != "bad"]
+
+
+def _submaps_in_words(run: Result) -> str:
+    """Return how many other submaps there are and how they are judged by themselves; "" where there are none."""
+    levels = [level_of_submap(submap) for submap in run.submaps[1:]]
+    judged = ", ".join(f"{levels.count(level)} {word}" for level, word in WORDS.items() if level in levels)
+    return f"{len(levels)} {'submap' if len(levels) == 1 else 'submaps'} ({judged})" if levels else ""
 
 
 def _of_maps(run: Result) -> list[Reason]:
@@ -162,9 +192,9 @@ def _of_maps(run: Result) -> list[Reason]:
     other = int(np.sum((frames.place > 0) | (frames.place == ELSEWHERE)))
     lost, rotated = frames.counts["lost"], frames.counts["rotation_only"]
     if other:
-        kept = len(run.submaps) - 1
-        shown = f"; {kept} {'submap is' if kept == 1 else 'submaps are'} shown below" if kept else ""
-        text = f"After losses {other} more frames form submaps of their own: their relative poses are unknown{shown}."
+        judged = _submaps_in_words(run)
+        saved = f"; saved and judged by themselves: {judged}" if judged else ""
+        text = f"After losses {other} more frames form submaps of their own: their relative poses are unknown{saved}."
         found.append(Reason("submaps", "note", text))
     doubt = doubt_words(submaps_in_time(frames))
     if doubt:

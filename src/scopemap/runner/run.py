@@ -207,7 +207,7 @@ class _Finishing:
             triangulated = None if depths is None else depths.depth
             corrected = in_thread(final.frames(triangulated, free_space.without), "correct")
             # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
-            median_mm = store.median_depth_mm(submap.main_frames)
+            median_mm = store.median_depth_mm(submap.main_frames, submap.depth_factor)
             moving = MovingTissue(block_edge_mm(median_mm))
             state, seen_at = None if states is None else SurfaceState(states), None
             if at_s is not None:
@@ -221,9 +221,7 @@ class _Finishing:
                 written = written if part is None else map(part.fused, written)
             seen = in_thread(written, "write")
             with closing(seen):
-                fused: FusedSurface = self.run.clock.timed(
-                    "fuse", pipeline.fusion.fuse, seen, submap.main_frames, submap.main
-                )
+                fused: FusedSurface = self.run.clock.timed("fuse", pipeline.fusion.fuse, seen, median_mm, submap.main)
         fused = replace(fused, mesh=self.run.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
         fused.mesh.vertex_attributes["moving"] = moving.shares(fused.mesh.vertices).astype(np.float32)
         looking, check = (checked.frames, states), partial(self.run.clock.timed, "check surface")

@@ -55,7 +55,7 @@ def _correct(rows: np.ndarray, places: np.ndarray, submap: Submap) -> None:
         if submap.correction is not None:
             index = int(row["index"])
             row["T_world_camera"] = submap.correction.pose(index, row["T_world_camera"])
-            row["depth_scale"] *= submap.correction.depth_factor(index)
+            row["depth_scale"] *= submap.depth_factor(index)
 
 
 def _rotate(rows: np.ndarray) -> None:

@@ -6,7 +6,8 @@ The first frames (--walk) of phantom colons, one a seed, are walked there and ba
 again, so that frames repeat. Between and over the walks lies what an examination holds: the room before and after it, a
 covered lamp, the wall touched, water, smoke, blur, a camera at rest, cuts. First table: what became of the frames, by
 what they show. Second: submaps of 3 s and more: the colon that most of their frames are of, frames of others (joined
-wrongly), ATE after a Sim(3) alignment. Then segments found, frames per second, memory, time per frame in the quarters.
+wrongly), ATE after a Sim(3) alignment, and that one's scale. Then segments found, frames per second, memory, time per
+frame in the quarters.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ def print_kinds(plan: list[Shown], frames: FrameTable, skipped: np.ndarray) -> N
 
 def print_submaps(plan: list[Shown], run: RunFolder, poses: list[np.ndarray]) -> None:
     """Print the submaps of 3 s and more against the truth."""
-    measuring.print_head("submap", "frames", "mostly of", "frames of anything else", "ATE mm")
+    measuring.print_head("submap", "frames", "mostly of", "frames of anything else", "ATE mm", "true size / its own")
     small = 0
     for number, submap in enumerate(run.submaps):
         own = submap.frames.only(submap.frames.tracked)
@@ -153,13 +154,14 @@ def print_submaps(plan: list[Shown], run: RunFolder, poses: list[np.ndarray]) ->
         if len(of) < _USABLE_S * FPS:
             small += 1
             continue
-        ate = ""
+        ate = size = ""
         if most != ROOM:
             inside = np.array([one == most for one in of])
             truth = np.stack([poses[one.colon][one.picture] for one in shown])[inside]
-            moved, _ = align_trajectories(own["T_world_camera"][inside], truth, "sim3")
+            moved, S_true_own = align_trajectories(own["T_world_camera"][inside], truth, "sim3")
             ate = f"{np.sqrt(((moved - truth)[:, :3, 3] ** 2).sum(1).mean()):.2f}"
-        measuring.print_row(number, len(of), most, len(of) - of.count(most), ate)
+            size = f"{S_true_own.scale:.2f}"
+        measuring.print_row(number, len(of), most, len(of) - of.count(most), ate, size)
     print(f"\n{small} further submaps of less than {_USABLE_S:g} s")
 
 

@@ -9,7 +9,7 @@ const BAND = { top: 78, height: 26 };
 // What a frame is, in words and as a colour; the same words are the same band.
 function whatIs(run, row) {
   const place = run.places[row], cause = run.causes[run.causeOf[row]];
-  if (place >= 0) return { text: place ? `submap ${place}` : "the result", tone: style(place ? "--other" : "--in"), place };
+  if (place >= 0) return { text: place ? `submap ${place}, by itself ${run.words[place]}` : "the result", tone: style(place ? "--other" : "--in"), place };
   if (place === OTHER_MAP) return { text: "submap too short to be kept", tone: style("--line") };
   if (place === NOT_USED) return { text: "left out: repeated, or beyond the rate", tone: style("--line") };
   return { text: `lost: ${cause || "no cause was kept"}`, tone: CAUSE_TONES[cause] || style(place === ROTATED ? "--rotated" : "--lost") };

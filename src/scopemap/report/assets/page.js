@@ -170,7 +170,7 @@ function writeSubmaps() {
     button.dataset.map = String(number);
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", number ? `Surface of submap ${number}` : "Surface of the result");
-    note.textContent = [`${map.frames} frames, ${partsInWords(run, number)}`, map.inliers].filter(Boolean).join(", ");
+    note.textContent = [`${number ? `by itself ${run.words[number]}, ` : ""}${map.frames} frames, ${partsInWords(run, number)}`, map.inliers].filter(Boolean).join(", ");
     const pair = document.createElement("span"), seen = run.pictures.filter((picture) => run.places[picture.row] === number);
     pair.className = "pair";
     pair.append(canvas);
