@@ -102,7 +102,7 @@ def test_the_pose_graph_removes_drift_of_poses_and_scale() -> None:
         T = inverse(POSES[new]) @ POSES[past]
         T[:3, 3] *= scale[past]
         loops.append(replace(_loop(past, new, T), log_ratio=float(np.log(scale[new] / scale[past]))))
-    graph = optimise_pose_graph(np.stack(tracked), LINE, loops, depth_mm=50.0)
+    graph = optimise_pose_graph(np.stack(tracked), LINE, loops, 50.0, np.ones(len(LINE), bool))
     before, after = (_off(poses[-1], POSES[-1])[1] for poses in (tracked, graph.T_world_camera))
     assert before > 5
     assert after < 0.05 * before
@@ -119,9 +119,20 @@ def test_one_false_loop_is_an_outlier() -> None:
     poses = np.stack(POSES)
     true = [_loop(k, COUNT - 1 - k, inverse(POSES[COUNT - 1 - k]) @ POSES[k]) for k in range(4)]
     false = se3_exp(np.array([0.0, 0.3, 0.0, 20.0, 0.0, 0.0])) @ true[0].T_new_past
-    graph = optimise_pose_graph(poses, LINE, [*true, _loop(0, COUNT - 1, false)], depth_mm=50.0)
+    graph = optimise_pose_graph(poses, LINE, [*true, _loop(0, COUNT - 1, false)], 50.0, np.zeros(len(LINE), bool))
     assert len(graph.accepted) == 4
     assert max(_off(a, b)[1] for a, b in zip(graph.T_world_camera, poses, strict=True)) < 1.0
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_false_loops_that_agree_tear_no_path_that_observations_confirm(confirmed: bool) -> None:
+    """Two loops put the last three keyframes 20 mm aside: one tracked motion against them is outvoted."""
+    poses, aside = np.stack(POSES), se3_exp(np.array([0.0, 0.0, 0.0, 20.0, 0.0, 0.0]))
+    false = [_loop(k, COUNT - 1 - k, inverse(aside @ POSES[COUNT - 1 - k]) @ POSES[k]) for k in range(2)]
+    graph = optimise_pose_graph(poses, LINE, false, 50.0, np.full(len(LINE), confirmed))
+    steps = [_off(inverse(T[a]) @ T[b], np.eye(4))[1] for T in (poses, graph.T_world_camera) for a, b in LINE]
+    torn = np.abs(np.subtract(*np.split(np.array(steps), 2))).max()
+    assert (torn < 4.0) == confirmed, torn
 
 
 @pytest.mark.parametrize("closing", [True, False])
@@ -149,6 +160,7 @@ def test_a_camera_at_rest_closes_few_loops_to_each_keyframe() -> None:
 
 def test_a_loop_that_drift_cannot_explain_is_not_accepted() -> None:
     poses = np.stack(OUT)
-    graph = optimise_pose_graph(poses, LINE[: len(OUT) - 1], [_loop(0, len(OUT) - 1, np.eye(4))], depth_mm=10.0)
+    pairs = LINE[: len(OUT) - 1]
+    graph = optimise_pose_graph(poses, pairs, [_loop(0, len(OUT) - 1, np.eye(4))], 10.0, np.zeros(len(pairs), bool))
     assert len(graph.accepted) == 0
     np.testing.assert_allclose(graph.T_world_camera, poses, atol=1e-9)
