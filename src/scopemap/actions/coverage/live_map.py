@@ -1,0 +1,169 @@
+"""What was not seen so far of a live session: its map, made again and again in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import queue
+import shutil
+import threading
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from scopemap.actions.coverage.coverage import coverage
+from scopemap.actions.coverage.unseen import MOST_FRAMES
+from scopemap.errors import InputError
+from scopemap.frame import Frame
+from scopemap.fusion.finish import finished
+from scopemap.io.depth_maps import DepthWriter
+from scopemap.odometry import Step
+from scopemap.reconstruction import Reconstruction
+from scopemap.runner.processes import ProcessLimits, run_in_processes
+from scopemap.runner.reconstructor import Reconstructor
+from scopemap.trajectory.frame_table import FrameTable
+
+_MOST_MAPS = 8  # whose depth is kept, as many as the session keeps surfaces of
+_EVERY_S, _MOST_SHARE = 5.0, 0.05  # between maps; of the session's time, for taking its surface
+_LONGEST_S, _NICE = 120.0, 10  # for one map, and its priority: idle time on a busy machine, but not none
+_FETCHED_S = 1.0  # until the page has fetched the last one
+
+
+class KeptDepth:
+    """Keeps depth and pose of every n-th tracked frame of each map, at most 200 of it; observes a live session.
+
+    n doubles where there would be more. Beside the present map those with most frames are kept. `folder` : below it
+    is depth/, as in a result; it is another one, below `parent`, after a reset.
+    """
+
+    def __init__(self, parent: Path) -> None:
+        self.folder, self._parent = parent, parent
+        self._of: Reconstructor | None = None
+        self._resets = 0
+
+    def observe(self, step: Step, reconstructor: Reconstructor) -> None:
+        """Keep a frame, or not; one whose depth cannot be written is not kept."""
+        if reconstructor is not self._of:
+            self._of, self._resets = reconstructor, self._resets + 1
+            self.folder = self._parent / str(self._resets)
+            self._write: DepthWriter = reconstructor.depth_writer(self.folder)
+            # By map: rows of the frames that are kept, n, and how many were tracked.
+            self._maps: dict[int, tuple[list[dict[str, Any]], int, int]] = {}
+        if step.frame.T_world_camera is not None and step.frame.depth_mm is not None:
+            self._put(step.frame, step.track.map)
+
+    def frames(self, number: int) -> FrameTable:
+        """Return the table of the frames that are kept of a map, as that of a result."""
+        return FrameTable.of(self._maps[number][0] if number in self._maps else [])
+
+    def move_to(self, folder: Path) -> None:
+        """Move the depth to a result's folder."""
+        if self._of is not None:
+            self._write.finish(scale_known=self._of.scale_known)
+            for part in self.folder.glob("depth*"):
+                shutil.move(part, folder)
+
+    def _put(self, frame: Frame, number: int) -> None:
+        rows, every, count = self._maps.get(number, ([], 1, 0))
+        if count % every == 0:
+            pose = {"status": "ok" if rows else "initial", "T_world_camera": frame.T_world_camera}
+            with suppress(InputError):
+                self._write(frame)
+                rows.append({"index": frame.index, "time_s": frame.time_s, "map": 0} | pose)
+        if len(rows) > MOST_FRAMES:
+            self._remove(rows[1::2])
+            rows, every = rows[::2], 2 * every
+        self._maps[number] = rows, every, count + 1
+        if len(self._maps) > _MOST_MAPS:
+            smallest = min(self._maps.keys() - {number}, key=lambda other: self._maps[other][2])
+            self._remove(self._maps.pop(smallest)[0])
+
+    def _remove(self, rows: list[dict[str, Any]]) -> None:
+        for row in rows:
+            for part in ("depth", "depth_sigma"):
+                (self.folder / part / f"{row['index']:06d}.png").unlink(missing_ok=True)
+
+
+class ShownMap(NamedTuple):
+    """A map as PNG, b"" where there is none, and what it says, or why there is none, in a sentence."""
+
+    png: bytes
+    words: str
+
+
+class LiveCoverage:
+    """Makes the map of the surface so far every five seconds or less often; context, and observer of a live session.
+
+    The session's threads take its surface and no more: the map is made by another process of the lowest priority. Where
+    that fails, `shown` says so, and the session goes on. `count` : of the maps until now.
+    """
+
+    def __init__(self, kept: KeptDepth) -> None:
+        self._kept, self._tasks = kept, queue.SimpleQueue[_Task | None]()
+        self.shown, self.count = ShownMap(b"", "What was not seen: a map comes after the first seconds."), 0
+        self._idle, self._next_s = threading.Event(), time.monotonic() + _EVERY_S
+        self._idle.set()
+        self._thread = threading.Thread(target=self._make, name="coverage", daemon=True)
+
+    def __enter__(self) -> LiveCoverage:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._tasks.put(None)
+        self._thread.join()
+
+    def observe(self, step: Step, reconstructor: Reconstructor) -> None:
+        """Ask for another map where one is due, after `KeptDepth.observe`."""
+        started_s = time.monotonic()
+        if step.frame.T_world_camera is None or started_s < self._next_s or not self._idle.is_set():
+            return
+        so_far = reconstructor.so_far(self._kept.frames(step.track.map))
+        now_s = time.monotonic()
+        self._next_s = now_s + max(_EVERY_S, (now_s - started_s) / _MOST_SHARE)
+        self._ask(_Task(self._kept.folder, f"map {step.track.map + 1} until {step.frame.time_s:.0f} s", so_far))
+
+    def finish(self, folder: Path) -> None:
+        """Make the map of the result in a folder, and wait for it and for the page."""
+        self._idle.wait()
+        self._ask(_Task(folder, "the result"))
+        self._idle.wait()
+        time.sleep(_FETCHED_S)
+
+    def _ask(self, task: _Task) -> None:
+        self._idle.clear()
+        self._task = task
+        self._tasks.put(task)
+
+    def _make(self) -> None:
+        """Have the maps made that are asked for, in the order of asking: the thread's work."""
+        for _, outcome in run_in_processes(_made, iter(self._tasks.get, None), ProcessLimits(1, _LONGEST_S)):
+            # Errors name the folder, which is none of the user's.
+            fault = outcome.fault.replace(str(self._task.folder), "so far")
+            self.shown = outcome.value or ShownMap(b"", f"No map of what was not seen in {self._task.of}: {fault}.")
+            self.count += 1
+            self._idle.set()
+
+
+class _Task(NamedTuple):
+    """A map to be made of a result's folder; `so_far` is written to it before. `of` : what it is of, in words."""
+
+    folder: Path
+    of: str
+    so_far: Reconstruction | None = None
+
+
+def _made(task: _Task) -> ShownMap:
+    """Return the map of a task."""
+    with suppress(AttributeError, OSError):  # Windows knows no priorities of this kind
+        os.nice(max(0, _NICE - os.nice(0)))
+    if task.so_far is not None:
+        mesh = finished(task.so_far.mesh, task.so_far.config.fusion)
+        replace(task.so_far, mesh=mesh).save(task.folder)
+    found = coverage(task.folder)
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "map.png"
+        found.draw(file)
+        return ShownMap(file.read_bytes(), f"Of {task.of}, {found.sentence}")
