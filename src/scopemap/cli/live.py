@@ -106,6 +106,7 @@ def live(
         stack.enter_context(_controls(session, covered, serve, seconds, silent=silent))
         reconstructor = session.run()
         result = finished(reconstructor, reading)
+        covered.settle()
         if folder is not None:
             result.save(folder)
             pictures.save(folder)
@@ -226,4 +227,4 @@ def _print(provenance: dict[str, Any], state: dict[str, Any], out: Path | None) 
     typer.echo(f"{provenance['tracked']} of {provenance['frames']} frames tracked, {provenance['lost']} lost")
     typer.echo(_line(state))
     if out is not None:
-        typer.echo(f"result in {out}, without depth maps; look at {out / 'report.html'}")
+        typer.echo(f"result in {out}, with the depth of some frames; look at {out / 'report.html'}")

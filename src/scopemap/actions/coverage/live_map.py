@@ -26,16 +26,18 @@ from scopemap.runner.reconstructor import Reconstructor
 from scopemap.trajectory.frame_table import FrameTable
 
 _MOST_MAPS = 8  # whose depth is kept, as many as the session keeps surfaces of
+_APART_S = 0.25  # frames that are kept, at first: writing the depth of one takes 9 ms
 _EVERY_S, _MOST_SHARE = 5.0, 0.05  # between maps; of the session's time, for taking its surface
 _LONGEST_S, _NICE = 120.0, 10  # for one map, and its priority: idle time on a busy machine, but not none
 _FETCHED_S = 1.0  # until the page has fetched the last one
 
 
 class KeptDepth:
-    """Keeps depth and pose of every n-th tracked frame of each map, at most 200 of it; observes a live session.
+    """Keeps depth and pose of tracked frames a quarter of a second apart, at most 200 of a map; observes a session.
 
-    n doubles where there would be more. Beside the present map those with most frames are kept. `folder` : below it
-    is depth/, as in a result; it is another one, below `parent`, after a reset.
+    Where there would be more, every second one is dropped, and the time between them doubles. Beside the present map
+    the longest are kept. `folder` : below it is depth/, as in a result; it is another one, below `parent`, after a
+    reset.
     """
 
     def __init__(self, parent: Path) -> None:
@@ -49,14 +51,14 @@ class KeptDepth:
             self._of, self._resets = reconstructor, self._resets + 1
             self.folder = self._parent / str(self._resets)
             self._write: DepthWriter = reconstructor.depth_writer(self.folder)
-            # By map: rows of the frames that are kept, n, and how many were tracked.
-            self._maps: dict[int, tuple[list[dict[str, Any]], int, int]] = {}
+            self._maps: dict[int, list[dict[str, Any]]] = {}
+            self._apart_s = dict[int, float]()
         if step.frame.T_world_camera is not None and step.frame.depth_mm is not None:
             self._put(step.frame, step.track.map)
 
     def frames(self, number: int) -> FrameTable:
         """Return the table of the frames that are kept of a map, as that of a result."""
-        return FrameTable.of(self._maps[number][0] if number in self._maps else [])
+        return FrameTable.of(self._maps.get(number, []))
 
     def move_to(self, folder: Path) -> None:
         """Move the depth to a result's folder."""
@@ -66,19 +68,20 @@ class KeptDepth:
                 shutil.move(part, folder)
 
     def _put(self, frame: Frame, number: int) -> None:
-        rows, every, count = self._maps.get(number, ([], 1, 0))
-        if count % every == 0:
-            pose = {"status": "ok" if rows else "initial", "T_world_camera": frame.T_world_camera}
-            with suppress(InputError):
-                self._write(frame)
-                rows.append({"index": frame.index, "time_s": frame.time_s, "map": 0} | pose)
+        rows = self._maps.setdefault(number, [])
+        apart_s = self._apart_s.setdefault(number, _APART_S)
+        if rows and frame.time_s < rows[-1]["time_s"] + apart_s:
+            return
+        pose = {"status": "ok" if rows else "initial", "T_world_camera": frame.T_world_camera}
+        with suppress(InputError):
+            self._write(frame)
+            rows.append({"index": frame.index, "time_s": frame.time_s, "map": 0} | pose)
         if len(rows) > MOST_FRAMES:
             self._remove(rows[1::2])
-            rows, every = rows[::2], 2 * every
-        self._maps[number] = rows, every, count + 1
+            self._maps[number], self._apart_s[number] = rows[::2], 2 * apart_s
         if len(self._maps) > _MOST_MAPS:
-            smallest = min(self._maps.keys() - {number}, key=lambda other: self._maps[other][2])
-            self._remove(self._maps.pop(smallest)[0])
+            shortest = min(self._maps.keys() - {number}, key=lambda n: len(self._maps[n]) * self._apart_s[n])
+            self._remove(self._maps.pop(shortest))
 
     def _remove(self, rows: list[dict[str, Any]]) -> None:
         for row in rows:
@@ -125,11 +128,14 @@ class LiveCoverage:
         self._next_s = now_s + max(_EVERY_S, (now_s - started_s) / _MOST_SHARE)
         self._ask(_Task(self._kept.folder, f"map {step.track.map + 1} until {step.frame.time_s:.0f} s", so_far))
 
+    def settle(self) -> None:
+        """Wait for the map that is being made."""
+        self._idle.wait()
+
     def finish(self, folder: Path) -> None:
         """Make the map of the result in a folder, and wait for it and for the page."""
-        self._idle.wait()
         self._ask(_Task(folder, "the result"))
-        self._idle.wait()
+        self.settle()
         time.sleep(_FETCHED_S)
 
     def _ask(self, task: _Task) -> None:
