@@ -25,7 +25,6 @@ from scopemap.io.depth_maps import DepthReader, DepthWriter
 from scopemap.reconstruction import Reconstruction
 from scopemap.trajectory.frame_table import FrameTable
 
-
 NO_SURFACE = "the run so far has no surface"
 
 
