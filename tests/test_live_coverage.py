@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -29,6 +30,16 @@ NO_SURFACE = "the run so far has no surface"
 
 
 @dataclass
+class Volume:
+    """The tube until `ahead_mm`."""
+
+    ahead_mm: float
+
+    def extract_mesh(self) -> trimesh.Trimesh:
+        return without(tube(), lambda points: points[:, 2] > self.ahead_mm)
+
+
+@dataclass
 class Drawn:
     """A reconstructor whose surface is the tube until `ahead_mm`."""
 
@@ -38,10 +49,10 @@ class Drawn:
     def depth_writer(self, folder: Path) -> DepthWriter:
         return DepthWriter(folder)
 
-    def so_far(self, frames: FrameTable) -> Reconstruction:
-        mesh = without(tube(), lambda points: points[:, 2] > self.ahead_mm) if self.ahead_mm else trimesh.Trimesh()
+    def so_far(self, frames: FrameTable) -> tuple[Reconstruction, Volume | None]:
         config = Config.load(settings={"fusion.voxel_mm": 0.8})
-        return replace(drawn_result(), frames=frames, mesh=mesh, config=config, others=[])
+        result = replace(drawn_result(), frames=frames, mesh=trimesh.Trimesh(), config=config, others=[])
+        return result, Volume(self.ahead_mm) if self.ahead_mm else None
 
 
 def step_of(index: int, number: int = 0) -> Any:
@@ -75,6 +86,18 @@ def test_the_map_grows_and_a_failure_is_a_sentence(tmp_path: Path, monkeypatch: 
             areas.append(found.total.area)
     assert live.count == 3
     assert areas[1] > 1.3 * areas[0]
+
+
+def test_a_session_without_processes_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_map, "_EVERY_S", 0.0)
+    monkeypatch.setattr(live_map, "run_in_processes", MagicMock(side_effect=OSError("no memory")))
+    kept, drawn = KeptDepth(tmp_path), Drawn(40.0)
+    with LiveCoverage(kept) as live:
+        for index in range(2):
+            kept.observe(step_of(index), drawn)  # type: ignore[arg-type]
+            live.observe(step_of(index), drawn)  # type: ignore[arg-type]
+        live.settle()
+    assert live.shown == (b"", "No map of what was not seen: no memory.")
 
 
 def test_depth_is_kept_of_few_frames_of_each_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from scopemap.estimators import OwnEstimators, largest_depth_mm
 from scopemap.flow.estimator import OwnFlow
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.io.depth_maps import DepthWriter
 from scopemap.io.opening import open_sequence
 from scopemap.io.run_input import stated_input
@@ -127,10 +128,14 @@ class Reconstructor:
         """
         return self._pipeline.fusion.surface(self._run.kept_maps.map)
 
-    def so_far(self, frames: FrameTable) -> Reconstruction:
-        """Return `surface` with a table of frames of the current map as a result; nothing is finished or adjusted."""
+    def so_far(self, frames: FrameTable) -> tuple[Reconstruction, TsdfVolume | None]:
+        """Return frames of the current map as a result without a surface, and a copy of the volume that extracts it.
+
+        Copying takes 1 ms where extracting takes 100. None: nothing is fused at once, or not yet.
+        """
         provenance = provenance_of(self._sequence, self._pipeline.estimators, {}, frames)
-        return Reconstruction(self.camera, frames, self.surface(), self.config, provenance)
+        volume = self._pipeline.fusion.copied(self._run.kept_maps.map)
+        return Reconstruction(self.camera, frames, trimesh.Trimesh(), self.config, provenance), volume
 
     def depth_writer(self, folder: Path) -> DepthWriter:
         """Return what writes the depth of frames to a result's folder, as `reconstruct` does."""

@@ -18,6 +18,7 @@ from scopemap.actions.coverage.unseen import MOST_FRAMES
 from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap.fusion.finish import finished
+from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.io.depth_maps import DepthWriter
 from scopemap.odometry import Step
 from scopemap.reconstruction import Reconstruction
@@ -27,7 +28,7 @@ from scopemap.trajectory.frame_table import FrameTable
 
 _MOST_MAPS = 8  # whose depth is kept, as many as the session keeps surfaces of
 _APART_S = 0.25  # frames that are kept, at first: writing the depth of one takes 9 ms
-_EVERY_S, _MOST_SHARE = 5.0, 0.05  # between maps; of the session's time, for taking its surface
+_EVERY_S = 5.0  # between maps
 _LONGEST_S, _NICE = 120.0, 10  # for one map, and its priority: idle time on a busy machine, but not none
 _FETCHED_S = 1.0  # until the page has fetched the last one
 
@@ -99,8 +100,8 @@ class ShownMap(NamedTuple):
 class LiveCoverage:
     """Makes the map of the surface so far every five seconds or less often; context, and observer of a live session.
 
-    The session's threads take its surface and no more: the map is made by another process of the lowest priority. Where
-    that fails, `shown` says so, and the session goes on. `count` : of the maps until now.
+    The session's thread copies the voxels and no more: another process, of lower priority, makes surface and map. Where
+    it fails, `shown` says so, and the session goes on. `count` : of the maps until now.
     """
 
     def __init__(self, kept: KeptDepth) -> None:
@@ -120,17 +121,16 @@ class LiveCoverage:
 
     def observe(self, step: Step, reconstructor: Reconstructor) -> None:
         """Ask for another map where one is due, after `KeptDepth.observe`."""
-        started_s = time.monotonic()
-        if step.frame.T_world_camera is None or started_s < self._next_s or not self._idle.is_set():
+        if step.frame.T_world_camera is None or time.monotonic() < self._next_s or not self._idle.is_set():
             return
+        self._next_s = time.monotonic() + _EVERY_S
         so_far = reconstructor.so_far(self._kept.frames(step.track.map))
-        now_s = time.monotonic()
-        self._next_s = now_s + max(_EVERY_S, (now_s - started_s) / _MOST_SHARE)
         self._ask(_Task(self._kept.folder, f"map {step.track.map + 1} until {step.frame.time_s:.0f} s", so_far))
 
     def settle(self) -> None:
         """Wait for the map that is being made."""
-        self._idle.wait()
+        while self._thread.is_alive() and not self._idle.wait(1):
+            pass
 
     def finish(self, folder: Path) -> None:
         """Make the map of the result in a folder, and wait for it and for the page."""
@@ -145,20 +145,23 @@ class LiveCoverage:
 
     def _make(self) -> None:
         """Have the maps made that are asked for, in the order of asking: the thread's work."""
-        for _, outcome in run_in_processes(_made, iter(self._tasks.get, None), ProcessLimits(1, _LONGEST_S)):
-            # Errors name the folder, which is none of the user's.
-            fault = outcome.fault.replace(str(self._task.folder), "so far")
-            self.shown = outcome.value or ShownMap(b"", f"No map of what was not seen in {self._task.of}: {fault}.")
-            self.count += 1
-            self._idle.set()
+        try:
+            for _, outcome in run_in_processes(_made, iter(self._tasks.get, None), ProcessLimits(1, _LONGEST_S)):
+                # Errors name the folder, which is none of the user's.
+                fault = outcome.fault.replace(str(self._task.folder), "so far")
+                self.shown = outcome.value or ShownMap(b"", f"No map of what was not seen in {self._task.of}: {fault}.")
+                self.count += 1
+                self._idle.set()
+        except OSError as error:  # no process can be started: no more maps
+            self.shown = ShownMap(b"", f"No map of what was not seen: {error}.")
 
 
 class _Task(NamedTuple):
-    """A map to be made of a result's folder; `so_far` is written to it before. `of` : what it is of, in words."""
+    """A map to be made of a result's folder; `so_far` is written to it before. `of` : what that is, in words."""
 
     folder: Path
     of: str
-    so_far: Reconstruction | None = None
+    so_far: tuple[Reconstruction, TsdfVolume | None] | None = None
 
 
 def _made(task: _Task) -> ShownMap:
@@ -166,8 +169,9 @@ def _made(task: _Task) -> ShownMap:
     with suppress(AttributeError, OSError):  # Windows knows no priorities of this kind
         os.nice(max(0, _NICE - os.nice(0)))
     if task.so_far is not None:
-        mesh = finished(task.so_far.mesh, task.so_far.config.fusion)
-        replace(task.so_far, mesh=mesh).save(task.folder)
+        result, volume = task.so_far
+        mesh = result.mesh if volume is None else finished(volume.extract_mesh(), result.config.fusion)
+        replace(result, mesh=mesh).save(task.folder)
     found = coverage(task.folder)
     with TemporaryDirectory() as folder:
         file = Path(folder) / "map.png"
