@@ -131,7 +131,7 @@ class Reconstructor:
     def so_far(self, frames: FrameTable) -> tuple[Reconstruction, TsdfVolume | None]:
         """Return frames of the current map as a result without a surface, and a copy of the volume that extracts it.
 
-        Copying takes 1 ms where extracting takes 100. None: nothing is fused at once, or not yet.
+        Copying takes far less time than extracting. None: nothing is fused at once, or not yet.
         """
         provenance = provenance_of(self._sequence, self._pipeline.estimators, {}, frames)
         volume = self._pipeline.fusion.copied(self._run.kept_maps.map)
