@@ -93,7 +93,7 @@ def test_a_session_without_processes_goes_on(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(live_map, "run_in_processes", MagicMock(side_effect=OSError("no memory")))
     kept, drawn = KeptDepth(tmp_path), Drawn(40.0)
     with LiveCoverage(kept) as live:
-        for index in range(2):
+        for index in range(12):
             kept.observe(step_of(index), drawn)  # type: ignore[arg-type]
             live.observe(step_of(index), drawn)  # type: ignore[arg-type]
         live.settle()

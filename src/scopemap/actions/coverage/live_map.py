@@ -22,6 +22,7 @@ from scopemap.fusion.surface_fusion import TsdfVolume
 from scopemap.io.depth_maps import DepthWriter
 from scopemap.odometry import Step
 from scopemap.reconstruction import Reconstruction
+from scopemap.report.verdict import LEAST_FRAMES
 from scopemap.runner.processes import ProcessLimits, run_in_processes
 from scopemap.runner.reconstructor import Reconstructor
 from scopemap.trajectory.frame_table import FrameTable
@@ -106,7 +107,7 @@ class LiveCoverage:
 
     def __init__(self, kept: KeptDepth) -> None:
         self._kept, self._tasks = kept, queue.SimpleQueue[_Task | None]()
-        self.shown, self.count = ShownMap(b"", "What was not seen: a map comes after the first seconds."), 0
+        self.shown, self.count = ShownMap(b"", f"What was not seen: a map comes after {LEAST_FRAMES} frames."), 0
         self._idle, self._next_s = threading.Event(), time.monotonic() + _EVERY_S
         self._idle.set()
         self._thread = threading.Thread(target=self._make, name="coverage", daemon=True)
@@ -123,8 +124,10 @@ class LiveCoverage:
         """Ask for another map where one is due, after `KeptDepth.observe`."""
         if step.frame.T_world_camera is None or time.monotonic() < self._next_s or not self._idle.is_set():
             return
-        self._next_s = time.monotonic() + _EVERY_S
-        so_far = reconstructor.so_far(self._kept.frames(step.track.map))
+        frames = self._kept.frames(step.track.map)
+        if len(frames) < LEAST_FRAMES:
+            return
+        self._next_s, so_far = time.monotonic() + _EVERY_S, reconstructor.so_far(frames)
         self._ask(_Task(self._kept.folder, f"map {step.track.map + 1} until {step.frame.time_s:.0f} s", so_far))
 
     def settle(self) -> None:
