@@ -6,11 +6,13 @@ import json
 import os
 import socket
 import struct
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
+from urllib.request import urlopen
 
 import av
 import cv2
@@ -174,6 +176,36 @@ def test_the_command_writes_a_result(clip: Path, tmp_path: Path, capfd: pytest.C
     facts = json.loads(capfd.readouterr().out)
     assert facts["live"]["read"] < 40
     assert "overwrite" in refused(capfd, "live", clip, "--out", out)
+
+
+def test_the_last_map_of_the_page_is_that_of_the_result(
+    clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    shown: list[tuple[dict[str, Any], bytes]] = []
+
+    def look() -> None:
+        while not (shown and shown[-1][0]["words"].startswith("Of the result")) and not ended.wait(0.1):
+            try:
+                state = json.load(urlopen(f"http://localhost:{port}/state", timeout=5))["coverage"]
+                picture = urlopen(f"http://localhost:{port}/coverage.png", timeout=5).read() if state["drawn"] else b""
+            except OSError:  # not yet
+                continue
+            shown.append((state, picture))
+
+    ended, looking = threading.Event(), threading.Thread(target=look)
+    looking.start()
+    assert call("live", clip, "--out", tmp_path / "out", "--set", "fusion.every=1", "--serve", port) == 0
+    time.sleep(0.3)
+    ended.set()
+    looking.join()
+    assert call("coverage", tmp_path / "out") == 0
+    assert shown[-1][1] == (tmp_path / "out" / "coverage" / "map.png").read_bytes()
+    share = json.loads((tmp_path / "out" / "coverage" / "coverage.json").read_text())["total"]["share"]
+    assert shown[-1][0]["words"].startswith(f"Of the result, {100 * share:.0f} % was not seen")
+    assert f"not seen: {share:.0%}" in capfd.readouterr().out
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")

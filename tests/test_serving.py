@@ -30,6 +30,7 @@ STATE = {
     **{"latency_ms": 71, "latency_p50_ms": 70, "latency_p95_ms": 99, "read": 40, "dropped": 2, "tracked": 30},
     **{"lost": 8, "map": 0, "path": [[0, 0, 0], [1, 0, 4], [3, 0, 9]], "scale_known": False, "snapshot": ""},
     "full": False,
+    "coverage": {"count": 2, "drawn": True, "words": "Of map 1 until 9 s, 31 % was not seen"},
 }
 
 
@@ -41,6 +42,7 @@ def served() -> Iterator[tuple[LocalServer, list[str]]]:
         "/": live_page,
         "/state": lambda: ("application/json", json.dumps(STATE).encode()),
         "/picture.jpg": lambda: ("image/jpeg", jpeg),
+        "/coverage.png": lambda: ("image/jpeg", jpeg),
         "/later": lambda: None,
     }
     server = LocalServer(pages, {f"/{name}": lambda name=name: done.append(name) for name in ("pause", "reset")})  # type: ignore[misc]
@@ -117,6 +119,8 @@ def test_the_live_page_shows_the_state_and_its_buttons_work(
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
         page.wait_for_timeout(300)
         assert page.evaluate("document.getElementById('picture').naturalWidth") == 80
+        assert page.evaluate("document.getElementById('map').naturalWidth") == 80
+        assert page.locator("#coverage").inner_text() == "Of map 1 until 9 s, 31 % was not seen"
         path = cv2.imdecode(np.frombuffer(page.locator("#path").screenshot(), np.uint8), cv2.IMREAD_COLOR)
         assert (np.abs(path.astype(int) - path[2, 2]).max(-1) > 60).sum() > 100  # the path is drawn
         page.click("#pause")

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,6 +20,7 @@ from scopemap.cli.interruption import Interruption
 from scopemap.cli.terminal_keys import terminal_keys
 
 if TYPE_CHECKING:
+    from scopemap.actions.coverage.live_map import LiveCoverage
     from scopemap.odometry import Step
     from scopemap.runner.live import LiveSession
     from scopemap.runner.reconstructor import Reconstructor
@@ -63,6 +65,7 @@ def live(
     Keys: p pauses, r forgets all and begins anew, s writes a snapshot, q ends. Ctrl-C ends it, too, and writes the
     result; a second Ctrl-C writes nothing.
     """
+    from scopemap.actions.coverage.live_map import KeptDepth, LiveCoverage
     from scopemap.config import Config
 
     chosen: dict[str, Any] = {"depth.near_far_mm": options.parse_near_far(near_far)} if near_far else {}
@@ -94,15 +97,23 @@ def live(
             if folder is not None:
                 pictures.observe(step)
 
+        kept = KeptDepth(Path(stack.enter_context(TemporaryDirectory())))
+        covered = stack.enter_context(LiveCoverage(kept))
+        observers = observe, *sender, *([] if out is None and serve is None else [kept.observe])
+        observers += () if serve is None else (covered.observe,)
         snapshots = (folder or Path("scopemap-live")) / "snapshots"
-        session = LiveSession(reading, sequence, config, observers=(observe, *sender), snapshots=snapshots)
-        stack.enter_context(_controls(session, serve, seconds, silent=silent))
+        session = LiveSession(reading, sequence, config, observers=observers, snapshots=snapshots)
+        stack.enter_context(_controls(session, covered, serve, seconds, silent=silent))
         reconstructor = session.run()
         result = finished(reconstructor, reading)
+        covered.settle()
         if folder is not None:
             result.save(folder)
             pictures.save(folder)
+            kept.move_to(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
+            if serve is not None:
+                covered.finish(folder)
     state = session.state()
     if out is not None:
         write_report(out)
@@ -143,13 +154,15 @@ def _sender(port: int | None, *, silent: bool) -> Iterator[tuple[Callable[[Step,
 
 
 @contextmanager
-def _controls(session: LiveSession, port: int | None, seconds: float | None, *, silent: bool) -> Iterator[None]:
+def _controls(
+    session: LiveSession, covered: LiveCoverage, port: int | None, seconds: float | None, *, silent: bool
+) -> Iterator[None]:
     """Context in which a session is shown, served, controlled by keys, and ended after some seconds."""
     keys = {"p": session.pause, "r": session.reset, "s": session.snapshot, "q": session.stop}
     ended = threading.Event()
     with ExitStack() as stack:
         if port is not None:
-            stack.callback(_served(session, port, silent=silent))
+            stack.callback(_served(session, covered, port, silent=silent))
         if seconds is not None:
             timer = threading.Timer(seconds, session.stop)
             timer.start()
@@ -165,13 +178,18 @@ def _controls(session: LiveSession, port: int | None, seconds: float | None, *, 
         yield
 
 
-def _served(session: LiveSession, port: int, *, silent: bool) -> Callable[[], None]:
+def _served(session: LiveSession, covered: LiveCoverage, port: int, *, silent: bool) -> Callable[[], None]:
     """Serve the session's page, and return what ends that."""
     from scopemap.report.serving import LocalServer, live_page
 
+    def state() -> dict[str, Any]:
+        shown = {"count": covered.count, "drawn": bool(covered.shown.png), "words": covered.shown.words}
+        return session.state() | {"coverage": shown}
+
     pages = {
         "/": live_page,
-        "/state": lambda: ("application/json", json.dumps(session.state()).encode()),
+        "/state": lambda: ("application/json", json.dumps(state()).encode()),
+        "/coverage.png": lambda: ("image/png", png) if (png := covered.shown.png) else None,
         "/picture.jpg": lambda: ("image/jpeg", jpeg) if (jpeg := session.picture()) else None,
     }
     actions = {"/pause": session.pause, "/reset": session.reset, "/snapshot": session.snapshot}
@@ -209,4 +227,4 @@ def _print(provenance: dict[str, Any], state: dict[str, Any], out: Path | None) 
     typer.echo(f"{provenance['tracked']} of {provenance['frames']} frames tracked, {provenance['lost']} lost")
     typer.echo(_line(state))
     if out is not None:
-        typer.echo(f"result in {out}, without depth maps; look at {out / 'report.html'}")
+        typer.echo(f"result in {out}, with the depth of some frames; look at {out / 'report.html'}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -220,6 +221,10 @@ class SurfaceFusion:
         """Return the surface of a map's frames fused at once so far, not finished; empty where there are none."""
         volume = self._volumes.get(map_number)
         return trimesh.Trimesh() if volume is None else volume.extract_mesh()
+
+    def copied(self, map_number: int) -> TsdfVolume | None:
+        """Return a copy of the volume of a map's frames fused at once; None where there is none."""
+        return deepcopy(self._volumes.get(map_number))
 
     def forget(self, map_number: int) -> None:
         """Drop the volume of a map's frames fused at once."""

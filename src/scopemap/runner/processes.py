@@ -10,7 +10,7 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -59,34 +59,35 @@ class ProcessLimits:
 
 def run_in_processes(
     call: Callable[[Any], Any],
-    tasks: Sequence[Any],
+    tasks: Iterable[Any],
     limits: ProcessLimits,
     started: Callable[[int], None] = lambda number: None,
 ) -> Generator[tuple[int, Outcome], None, None]:
     """Yield (number, outcome) of each task, as they end; each process does one task after the other.
 
-    call : a function of a module. started : called with the number of a task when a process begins it. One that
-    takes longer than its limit, or raises a `ScopemapError`, is not tried again. Closed early, or where this process
-    ends, all processes end.
+    call : a function of a module. tasks : taken one by one, as processes are free. started : called with the number of
+    a task when a process begins it. One that takes longer than its limit, or raises a `ScopemapError`, is not tried
+    again. Closed early, or where this process ends, all processes end.
     """
-    waiting = deque((number, NEW) for number in range(len(tasks)))
+    new, failed = ((number, task, NEW) for number, task in enumerate(tasks)), deque[tuple[int, Any, Outcome]]()
     idle: list[_Worker] = []
     busy: list[_Worker] = []
     try:
-        while waiting or busy:
-            while waiting and len(busy) < limits.processes:
+        while True:
+            while len(busy) < limits.processes and (due := next(new, None) or (failed and failed.popleft())):
                 worker = idle.pop() if idle else _Worker(call, threads_of_each(limits.processes))
-                number, before = waiting.popleft()
-                started(number)
-                worker.begin(number, tasks[number], before)
+                started(due[0])
+                worker.begin(*due)
                 busy.append(worker)
+            if not busy:
+                return
             for worker in _ready(busy, limits.seconds):
                 busy.remove(worker)
                 outcome, again = worker.end(limits.seconds)
                 if worker.process.is_alive():
                     idle.append(worker)
                 if again and limits.allow_another(outcome):
-                    waiting.append((worker.number, outcome))
+                    failed.append((worker.number, worker.task, outcome))
                 else:
                     yield worker.number, outcome
     finally:
@@ -120,6 +121,7 @@ class _Worker:
     def __init__(self, call: Callable[[Any], Any], threads: int) -> None:
         self.connection, theirs = _PROCESSES.Pipe()
         self.number, self.begun = 0, 0.0
+        self.task: Any = None
         self._before = NEW
         self.process = _PROCESSES.Process(target=_serve, args=(theirs, call, threads), daemon=True)
         with _environment({name: str(threads) for name in THREADS}):
@@ -128,7 +130,7 @@ class _Worker:
 
     def begin(self, number: int, task: Any, before: Outcome) -> None:
         """Give the process a task, with the outcome of the attempts before."""
-        self.number, self.begun, self._before = number, time.monotonic(), before
+        self.number, self.task, self.begun, self._before = number, task, time.monotonic(), before
         with suppress(BrokenPipeError):  # it has died: `end` says so
             self.connection.send(task)
 

@@ -14,10 +14,12 @@ from scopemap.cameras.rectification import Rectifier, working_camera, working_si
 from scopemap.config import Config
 from scopemap.depth.estimate import DepthEstimator
 from scopemap.errors import SettingsError
-from scopemap.estimators import OwnEstimators
+from scopemap.estimators import OwnEstimators, largest_depth_mm
 from scopemap.flow.estimator import OwnFlow
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.surface_fusion import TsdfVolume
+from scopemap.io.depth_maps import DepthWriter
 from scopemap.io.opening import open_sequence
 from scopemap.io.run_input import stated_input
 from scopemap.io.sequence import Sequence
@@ -28,8 +30,9 @@ from scopemap.reconstruction import Reconstruction
 from scopemap.report.verdict import state_verdict
 from scopemap.runner.memory import memory_plan
 from scopemap.runner.preparation import prepare
-from scopemap.runner.provenance import Limits, scale_facts
+from scopemap.runner.provenance import Limits, provenance_of, scale_facts
 from scopemap.runner.run import Clock, KeptMaps, Progress, Run, overlapped
+from scopemap.trajectory.frame_table import FrameTable
 
 
 class Reconstructor:
@@ -124,6 +127,19 @@ class Reconstructor:
         At once fuse the presets that need no back end, such as `realtime`; not while `steps` waits for a picture.
         """
         return self._pipeline.fusion.surface(self._run.kept_maps.map)
+
+    def so_far(self, frames: FrameTable) -> tuple[Reconstruction, TsdfVolume | None]:
+        """Return frames of the current map as a result without a surface, and a copy of the volume that extracts it.
+
+        Copying takes far less time than extracting. None: nothing is fused at once, or not yet.
+        """
+        provenance = provenance_of(self._sequence, self._pipeline.estimators, {}, frames)
+        volume = self._pipeline.fusion.copied(self._run.kept_maps.map)
+        return Reconstruction(self.camera, frames, trimesh.Trimesh(), self.config, provenance), volume
+
+    def depth_writer(self, folder: Path) -> DepthWriter:
+        """Return what writes the depth of frames to a result's folder, as `reconstruct` does."""
+        return DepthWriter(folder, largest_depth_mm(self.config, self._pipeline.estimators))
 
     @property
     def surface_is_full(self) -> bool:

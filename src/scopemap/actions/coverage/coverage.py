@@ -147,6 +147,12 @@ class Coverage:
         known = {"kind": self.layout.kind, "unit": self.unit, "along_unit": along, "scale": self.scale}
         return known | shares | {"blind_spots": spots}
 
+    @property
+    def sentence(self) -> str:
+        """The share not seen with its interval, as the end of a sentence."""
+        low, share, high = (f"{100 * value:.0f}" for value in (self.total.low, self.total.share, self.total.high))
+        return f"{share} % was not seen, with a probability of 90 % between {low} and {high} %: an estimate."
+
     def __str__(self) -> str:
         """The figures in a few lines: the whole, the segments, and the largest blind spots."""
         along, area = ("deg" if self.layout.kind == "cavity" else self.unit), f"{self.unit}2"
@@ -244,7 +250,7 @@ def _checked(folder: Path) -> RunFolder:
     run = RunFolder(folder).checked()
     if not len(run.mesh.faces):
         raise InputError(f"the run {folder} has no surface")
-    if not run.depth.present:
+    if not any(map(run.depth.has, run.frames["index"][run.frames.tracked].tolist())):
         raise InputError(f"the run {folder} kept no depth maps")
     if verdict(run).level == "bad":
         raise InputError(f"the run {folder} is not usable by its verdict: it says nothing about what was not seen")

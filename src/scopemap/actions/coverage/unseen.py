@@ -43,17 +43,18 @@ class Views:
 
 
 def views_of(run: RunFolder, surface: trimesh.Trimesh) -> Views:
-    """Return how the tracked frames of a run, at most 200 of them, see a surface, world mm."""
+    """Return how the tracked frames of a run whose depth it kept, at most 200 of them, see a surface, world mm."""
     centres, normals, camera = surface.triangles_center, surface.face_normals, run.camera
     cosine, share = np.zeros((2, len(centres)))
     jump, distance_mm = np.full((2, len(centres)), np.inf)
     tracked = run.frames.only(run.frames.tracked)
-    chosen = slice(None, None, -(-len(tracked) // MOST_FRAMES))
-    frames = [index for index in tracked["index"][chosen].tolist() if run.depth.has(index)]
+    frames = [index for index in tracked["index"].tolist() if run.depth.has(index)]
+    frames = frames[:: max(1, -(-len(frames) // MOST_FRAMES))]
     pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
     for index in frames:
         depth_mm, T_world_camera = run.depth.read(index), pose_of[index]
-        assert depth_mm is not None
+        if depth_mm is None:  # a live session has just removed it
+            continue
         points = transform(inverse(T_world_camera), centres)
         ahead = np.flatnonzero(points[:, 2] > 0)
         column, row = np.round(camera.project(points[ahead])).astype(int).T
