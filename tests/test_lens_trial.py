@@ -65,6 +65,7 @@ def _tried(kind: str, focal_px: float, **motion: object) -> LensTrial | None:
     ("kind", "focal_px", "motion"),
     [
         ("pinhole", 180.0, TURNING),
+        ("pinhole", 383.0, TURNING),  # laparoscopes of the Hamlyn videos: 45 degrees
         ("equidistant fisheye", 170.0, FORWARD),
         ("orthographic fisheye", 190.0, FORWARD),
     ],
@@ -104,6 +105,12 @@ def test_a_kind_of_endoscope_leaves_out_other_lenses() -> None:
     assert found is not None
     assert (found.kind, found.reason) == ("orthographic fisheye", "")
     assert abs(math.log(found.focal_px / 190.0)) < max(2 * found.share, 0.02)
+
+
+def test_what_is_expected_does_not_change_where_the_search_begins() -> None:
+    windows = [_window("pinhole", 229.0, seed, **TURNING) for seed in range(2)]  # type: ignore[arg-type]
+    found = [try_lenses(windows, prior) for prior in (SCOPES["laparoscope"], SCOPES["laparoscope"]._replace(focal=1.1))]
+    assert [abs(one.focal_px / 229.0 - 1) < 0.02 for one in found if one is not None] == [True, True]
 
 
 # ---- in a run
@@ -181,6 +188,47 @@ def test_the_lens_of_a_kind_of_endoscope_is_assumed_where_nothing_is_known(clip:
     assert getattr(lens, "distortion", ()) == pytest.approx(KINDS[SCOPES[scope].kinds[0]])
     assert sequence.focal_sigma_px == pytest.approx(SCOPES[scope].spread * SCOPES[scope].focal * 200)
     assert sequence.camera_source.startswith(f"assumed: as of a {scope}, fx {SCOPES[scope].focal:g} of the width")
+    assert [notice.code for notice in sequence.source.warnings if not isinstance(notice, str)] == ["camera-unknown"]
+
+
+UNCLEAR = dataclasses.replace(FISHEYE, share=0.1, reason="several lenses fit about as well")
+VAGUE = FocalEstimate(200.0, 0.15, 53.0, 4)
+
+
+@pytest.mark.parametrize(
+    ("motion", "said", "scope", "focal_px", "sigma_px", "fisheye"),
+    [
+        # The trial has weighed what is expected already.
+        (UNDETERMINED, UNCLEAR, "bronchoscope", 100.0, 10.0, True),
+        (VAGUE, UNCLEAR, "bronchoscope", 100.0, 10.0, True),
+        # Weights 4 to 1: 200 px to 15 %, 120 px to 30 %.
+        (VAGUE, None, "bronchoscope", 120 * (200 / 120) ** 0.8, 24.22, False),
+        # Of what is not expected, or bent, nothing is taken.
+        (VAGUE, None, "colonoscope", 113.0, 16.95, True),
+        (dataclasses.replace(VAGUE, distortion=0.3), None, "bronchoscope", 120.0, 36.0, False),
+    ],
+)
+def test_what_is_seen_is_weighed_with_what_is_expected_of_a_kind_of_endoscope(
+    clip: Path,
+    tried: list,
+    monkeypatch: pytest.MonkeyPatch,
+    motion: FocalEstimate,
+    said: LensTrial | None,
+    scope: str,
+    focal_px: float,
+    sigma_px: float,
+    fisheye: bool,
+) -> None:
+    tried.append(said)
+    window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
+    place = "scopemap.calibration.focal_length.from_motion.focal_from_motion"
+    monkeypatch.setattr(place, lambda *arguments: arguments[2].append(window) or motion)
+    config = Config.load(settings=LIGHT | {"input.scope": scope})
+    sequence, _ = with_focal_from_motion(open_sequence(clip, settings=config.input), config)
+    assert sequence.camera.fx == pytest.approx(focal_px)
+    assert sequence.focal_sigma_px == pytest.approx(sigma_px, rel=1e-3)
+    assert isinstance(sequence.rectifier.source, FisheyeCamera) == fisheye
+    assert sequence.camera_source.startswith(f"assumed: as of a {scope}")
     assert [notice.code for notice in sequence.source.warnings if not isinstance(notice, str)] == ["camera-unknown"]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from scopemap.calibration.focal_length.trial import LensTrial, try_lenses
 from scopemap.calibration.focal_length.window_adjustment import Scene, WindowSolution, adjusted, at_rest
 from scopemap.calibration.focal_length.windows import MAX_FRAMES, Window, frames_of_windows, window_of
-from scopemap.cameras.scopes import ANY_LENS, KINDS, SCOPES
+from scopemap.cameras.scopes import ANY_LENS, KINDS, SCOPES, LensPrior
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.frame import Frame
@@ -130,9 +130,9 @@ class FocalEstimate:
 def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence, list[Notice]]:
     """Return a sequence of unknown camera with the focal length estimated from its motion, and notices about the lens.
 
-    Where the estimate is not taken the focal length stays, and `camera_source` says why. `input.focal` "flow" takes any
-    estimate, "auto" one of small deviation that contradicts the assumed focal length. Raises `CalibrationError` where
-    there is no estimate for "flow".
+    Where the estimate is not taken the focal length stays, of a stated kind of endoscope weighed with what was seen,
+    and `camera_source` says why. `input.focal` "flow" takes any estimate, "auto" one of small deviation that
+    contradicts the assumed focal length. Raises `CalibrationError` where there is no estimate for "flow".
     """
     windows: list[Window] = []
     estimate, assumed_px = focal_from_motion(sequence, config, windows), sequence.camera.fx
@@ -146,7 +146,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         f"fx {estimate.focal_px:.0f} +- {max(estimate.sigma_px, 1):.0f} px, horizontal field of view "
         f"{estimate.fov_deg:.0f} deg"
     )
-    kept = ""
+    kept, found = "", None
     if estimate.reason:
         kept = f"the motion does not determine it: {estimate.reason}"
     elif not wanted and estimate.share > MAX_SHARE:
@@ -155,9 +155,10 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     if not wanted and (is_unknown or bends):
         # A run that adjusts nothing afterwards does not wait for windows to be adjusted.
         adjusts = config.mapping.method != "none"
-        tried = _agreeing(try_lenses(windows, scope), estimate, sequence, windows) if adjusts else None
+        found = try_lenses(windows, scope) if adjusts else None
+        tried = _agreeing(found, estimate, sequence, windows)
         if tried is not None and not tried.reason:
-            return _with_tried(sequence, tried, windows), []
+            return _with_tried(sequence, tried, windows, "estimated: by trial of lenses"), []
         if is_unknown:
             undecided = "too few of the first frames show a rigid scene" if tried is None else tried.reason
             kept += f"; a trial of lenses does not tell it either: {undecided}" if adjusts else ""
@@ -166,8 +167,12 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     if not kept and not wanted and not estimate.differs_from(assumed_px):
         kept = f"{assumed_px:.0f} px, consistent with the estimate from the motion: {described}"
     if kept and is_unknown and config.input.scope:
-        source, focal_px = f"{sequence.camera_source}; {kept}", scope.focal * sequence.camera.width
-        return sequence.with_focal(focal_px, source, scope.spread * focal_px, KINDS[scope.kinds[0]]), []
+        source = f"{sequence.camera_source}; {kept}"
+        if found is not None and found.reason:
+            # Its mean weighs what is expected against what was seen.
+            return _with_tried(sequence, found, windows, f"{source}; used: the likeliest of such lenses"), []
+        seen = estimate if "pinhole" in scope.kinds and not (estimate.reason or bends) else None
+        return _as_expected(sequence, scope, seen, source), []
     if kept:
         return replace(sequence, camera_source=f"{sequence.camera_source}; {kept}"), []
     distorted = Notice("camera-distorted", {"share": abs(estimate.distortion)})
@@ -187,15 +192,29 @@ def _agreeing(
     return replace(tried, reason=f"its pinhole of {tried.fov_deg:.0f} deg is not that of the motion")
 
 
-def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window]) -> Sequence:
-    """Return the sequence seen through the lens that a trial found."""
+def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window], how: str) -> Sequence:
+    """Return the sequence seen through the lens that a trial found, and `how` it is known."""
     scale = sequence.camera.width / (2 * windows[0].half_width_px)
     focal_px, sigma_px = scale * tried.focal_px, scale * tried.focal_px * tried.share
     source = (
-        f"estimated: by trial of lenses in {tried.windows} windows, {tried.kind}, fx {focal_px:.0f} +- "
+        f"{how} in {tried.windows} windows, {tried.kind}, fx {focal_px:.0f} +- "
         f"{max(sigma_px, 1):.0f} px, horizontal field of view {tried.fov_deg:.0f} deg"
     )
     return sequence.with_focal(focal_px, source, sigma_px, KINDS[tried.kind])
+
+
+def _as_expected(sequence: Sequence, scope: LensPrior, seen: FocalEstimate | None, source: str) -> Sequence:
+    """Return the sequence through the typical lens of a kind of endoscope; `seen`: weighed with an uncertain estimate.
+
+    The mean of both logarithms of a pinhole's focal length, each weighed by the inverse of its variance.
+    """
+    focal_px, share, kind = scope.focal * sequence.camera.width, scope.spread, scope.kinds[0]
+    if seen is not None:
+        weight = share**2 / (share**2 + seen.share**2)
+        focal_px *= (seen.focal_px / focal_px) ** weight
+        share, kind = share * math.sqrt(1 - weight), "pinhole"
+        source += f"; used: the mean of both, fx {focal_px:.0f} +- {share * focal_px:.0f} px"
+    return sequence.with_focal(focal_px, source, share * focal_px, KINDS[kind])
 
 
 def focal_from_motion(sequence: Sequence, config: Config, windows: list[Window] | None = None) -> FocalEstimate:
