@@ -11,6 +11,7 @@ import pytest
 from front_door import refused, warned
 from turning_clip import write_clip
 
+from scopemap.calibration.focal_length import trial
 from scopemap.calibration.focal_length.from_motion import FocalEstimate, with_focal_from_motion
 from scopemap.calibration.focal_length.trial import LensTrial, try_lenses
 from scopemap.calibration.focal_length.windows import Window
@@ -107,10 +108,12 @@ def test_a_kind_of_endoscope_leaves_out_other_lenses() -> None:
     assert abs(math.log(found.focal_px / 190.0)) < max(2 * found.share, 0.02)
 
 
-def test_what_is_expected_does_not_change_where_the_search_begins() -> None:
-    windows = [_window("pinhole", 229.0, seed, **TURNING) for seed in range(2)]  # type: ignore[arg-type]
-    found = [try_lenses(windows, prior) for prior in (SCOPES["laparoscope"], SCOPES["laparoscope"]._replace(focal=1.1))]
-    assert [abs(one.focal_px / 229.0 - 1) < 0.02 for one in found if one is not None] == [True, True]
+def test_the_search_begins_at_a_wide_lens_whatever_is_expected(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, adjusted = list[float](), trial._adjusted
+    monkeypatch.setattr(trial, "_adjusted", lambda *of: tried.append(of[2]) or adjusted(*of))
+    windows = [_window("pinhole", 272.0, seed, **TURNING) for seed in range(2)]  # type: ignore[arg-type]
+    assert try_lenses(windows, SCOPES["laparoscope"]) is not None
+    assert 0.5 < tried[0] / (2 * HALF_PX) < 0.6 < SCOPES["laparoscope"].focal
 
 
 # ---- in a run
