@@ -204,11 +204,8 @@ VAGUE = FocalEstimate(200.0, 0.15, 53.0, 4)
         # The trial has weighed what is expected already.
         (UNDETERMINED, UNCLEAR, "bronchoscope", 100.0, 10.0, True),
         (VAGUE, UNCLEAR, "bronchoscope", 100.0, 10.0, True),
-        # Weights 4 to 1: 200 px to 15 %, 120 px to 30 %.
-        (VAGUE, None, "bronchoscope", 120 * (200 / 120) ** 0.8, 24.22, False),
-        # Of what is not expected, or bent, nothing is taken.
-        (VAGUE, None, "colonoscope", 113.0, 16.95, True),
-        (dataclasses.replace(VAGUE, distortion=0.3), None, "bronchoscope", 120.0, 36.0, False),
+        # Windows in which no lens leaves a rigid scene say nothing of the motion's either.
+        (VAGUE, None, "bronchoscope", 120.0, 36.0, False),
     ],
 )
 def test_what_is_seen_is_weighed_with_what_is_expected_of_a_kind_of_endoscope(

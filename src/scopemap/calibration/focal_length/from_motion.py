@@ -19,7 +19,7 @@ import numpy as np
 from scopemap.calibration.focal_length.trial import LensTrial, try_lenses
 from scopemap.calibration.focal_length.window_adjustment import Scene, WindowSolution, adjusted, at_rest
 from scopemap.calibration.focal_length.windows import MAX_FRAMES, Window, frames_of_windows, window_of
-from scopemap.cameras.scopes import ANY_LENS, KINDS, SCOPES, LensPrior
+from scopemap.cameras.scopes import ANY_LENS, KINDS, SCOPES
 from scopemap.config import Config
 from scopemap.errors import CalibrationError
 from scopemap.frame import Frame
@@ -167,12 +167,11 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     if not kept and not wanted and not estimate.differs_from(assumed_px):
         kept = f"{assumed_px:.0f} px, consistent with the estimate from the motion: {described}"
     if kept and is_unknown and config.input.scope:
-        source = f"{sequence.camera_source}; {kept}"
+        source, focal_px = f"{sequence.camera_source}; {kept}", scope.focal * sequence.camera.width
         if found is not None and found.reason:
             # Its mean weighs what is expected against what was seen.
             return _with_tried(sequence, found, windows, f"{source}; used: the likeliest of such lenses"), []
-        seen = estimate if "pinhole" in scope.kinds and not (estimate.reason or bends) else None
-        return _as_expected(sequence, scope, seen, source), []
+        return sequence.with_focal(focal_px, source, scope.spread * focal_px, KINDS[scope.kinds[0]]), []
     if kept:
         return replace(sequence, camera_source=f"{sequence.camera_source}; {kept}"), []
     distorted = Notice("camera-distorted", {"share": abs(estimate.distortion)})
@@ -201,20 +200,6 @@ def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window], how
         f"{max(sigma_px, 1):.0f} px, horizontal field of view {tried.fov_deg:.0f} deg"
     )
     return sequence.with_focal(focal_px, source, sigma_px, KINDS[tried.kind])
-
-
-def _as_expected(sequence: Sequence, scope: LensPrior, seen: FocalEstimate | None, source: str) -> Sequence:
-    """Return the sequence through the typical lens of a kind of endoscope; `seen`: weighed with an uncertain estimate.
-
-    The mean of both logarithms of a pinhole's focal length, each weighed by the inverse of its variance.
-    """
-    focal_px, share, kind = scope.focal * sequence.camera.width, scope.spread, scope.kinds[0]
-    if seen is not None:
-        weight = share**2 / (share**2 + seen.share**2)
-        focal_px *= (seen.focal_px / focal_px) ** weight
-        share, kind = share * math.sqrt(1 - weight), "pinhole"
-        source += f"; used: the mean of both, fx {focal_px:.0f} +- {share * focal_px:.0f} px"
-    return sequence.with_focal(focal_px, source, share * focal_px, KINDS[kind])
 
 
 def focal_from_motion(sequence: Sequence, config: Config, windows: list[Window] | None = None) -> FocalEstimate:
