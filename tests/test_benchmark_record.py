@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from scopemap.cameras.scopes import SCOPES
 from scopemap_bench.scripts import record
+from scopemap_bench.scripts.unknown_lenses import ENDOSCOPES
 
 
 @pytest.fixture
@@ -73,6 +75,14 @@ def test_no_table_is_made_of_code_that_is_not_committed_or_by_a_command_that_fai
     assert not record.RESULTS.exists()
 
 
-def test_the_tables_are_nine_and_what_is_kept_is_theirs() -> None:
-    assert len(record.TABLES) == 9
+def test_the_tables_are_ten_and_what_is_kept_is_theirs() -> None:
+    assert len(record.TABLES) == 10
     assert {file.stem for file in record.RESULTS.glob("*.md")} <= set(record.TABLES)
+
+
+def test_unknown_lenses_are_of_every_kind_of_endoscope() -> None:
+    shares = {one.name: one.camera.central.fx / one.camera.width for one in ENDOSCOPES}
+    assert {one.kind for one in ENDOSCOPES} == set(SCOPES)
+    # A label of 140 degrees where one of 170 has the focal length of C3VD's lens.
+    assert shares["GIF-H190, label 140 deg"] == pytest.approx(0.5698 * 0.9962 / 0.9397, rel=1e-3)
+    assert shares["PillCam SB3, label 156 deg"] == pytest.approx(0.5**0.5 / 1.3614, rel=1e-3)

@@ -11,6 +11,7 @@ import pytest
 from front_door import refused, warned
 from turning_clip import write_clip
 
+from scopemap.calibration.focal_length import trial
 from scopemap.calibration.focal_length.from_motion import FocalEstimate, with_focal_from_motion
 from scopemap.calibration.focal_length.trial import LensTrial, try_lenses
 from scopemap.calibration.focal_length.windows import Window
@@ -65,6 +66,7 @@ def _tried(kind: str, focal_px: float, **motion: object) -> LensTrial | None:
     ("kind", "focal_px", "motion"),
     [
         ("pinhole", 180.0, TURNING),
+        ("pinhole", 383.0, TURNING),  # laparoscopes of the Hamlyn videos: 45 degrees
         ("equidistant fisheye", 170.0, FORWARD),
         ("orthographic fisheye", 190.0, FORWARD),
     ],
@@ -104,6 +106,14 @@ def test_a_kind_of_endoscope_leaves_out_other_lenses() -> None:
     assert found is not None
     assert (found.kind, found.reason) == ("orthographic fisheye", "")
     assert abs(math.log(found.focal_px / 190.0)) < max(2 * found.share, 0.02)
+
+
+def test_the_search_begins_at_a_wide_lens_whatever_is_expected(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, adjusted = list[float](), trial._adjusted
+    monkeypatch.setattr(trial, "_adjusted", lambda *of: tried.append(of[2]) or adjusted(*of))
+    windows = [_window("pinhole", 272.0, seed, **TURNING) for seed in range(2)]  # type: ignore[arg-type]
+    assert try_lenses(windows, SCOPES["laparoscope"]) is not None
+    assert 0.5 < tried[0] / (2 * HALF_PX) < 0.6 < SCOPES["laparoscope"].focal
 
 
 # ---- in a run
@@ -181,6 +191,44 @@ def test_the_lens_of_a_kind_of_endoscope_is_assumed_where_nothing_is_known(clip:
     assert getattr(lens, "distortion", ()) == pytest.approx(KINDS[SCOPES[scope].kinds[0]])
     assert sequence.focal_sigma_px == pytest.approx(SCOPES[scope].spread * SCOPES[scope].focal * 200)
     assert sequence.camera_source.startswith(f"assumed: as of a {scope}, fx {SCOPES[scope].focal:g} of the width")
+    assert [notice.code for notice in sequence.source.warnings if not isinstance(notice, str)] == ["camera-unknown"]
+
+
+UNCLEAR = dataclasses.replace(FISHEYE, share=0.1, reason="several lenses fit about as well")
+VAGUE = FocalEstimate(200.0, 0.15, 53.0, 4)
+
+
+@pytest.mark.parametrize(
+    ("motion", "said", "scope", "focal_px", "sigma_px", "fisheye"),
+    [
+        # The trial has weighed what is expected already.
+        (UNDETERMINED, UNCLEAR, "bronchoscope", 100.0, 10.0, True),
+        (VAGUE, UNCLEAR, "bronchoscope", 100.0, 10.0, True),
+        # Windows in which no lens leaves a rigid scene say nothing of the motion's either.
+        (VAGUE, None, "bronchoscope", 120.0, 36.0, False),
+    ],
+)
+def test_what_is_seen_is_weighed_with_what_is_expected_of_a_kind_of_endoscope(
+    clip: Path,
+    tried: list,
+    monkeypatch: pytest.MonkeyPatch,
+    motion: FocalEstimate,
+    said: LensTrial | None,
+    scope: str,
+    focal_px: float,
+    sigma_px: float,
+    fisheye: bool,
+) -> None:
+    tried.append(said)
+    window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
+    place = "scopemap.calibration.focal_length.from_motion.focal_from_motion"
+    monkeypatch.setattr(place, lambda *arguments: arguments[2].append(window) or motion)
+    config = Config.load(settings=LIGHT | {"input.scope": scope})
+    sequence, _ = with_focal_from_motion(open_sequence(clip, settings=config.input), config)
+    assert sequence.camera.fx == pytest.approx(focal_px)
+    assert sequence.focal_sigma_px == pytest.approx(sigma_px, rel=1e-3)
+    assert isinstance(sequence.rectifier.source, FisheyeCamera) == fisheye
+    assert sequence.camera_source.startswith(f"assumed: as of a {scope}")
     assert [notice.code for notice in sequence.source.warnings if not isinstance(notice, str)] == ["camera-unknown"]
 
 

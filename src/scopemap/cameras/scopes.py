@@ -35,10 +35,10 @@ SCOPES: dict[str, LensPrior] = {
     "colonoscope": LensPrior(0.565, 0.15, _FISHEYES, _COLONOSCOPE),
     "gastroscope": LensPrior(0.565, 0.25, _FISHEYES, f"a guess from colonoscopes, {_COLONOSCOPE}"),
     "bronchoscope": LensPrior(0.6, 0.3, _EVERY, "the first flexible ones, 80 deg"),
-    "laparoscope": LensPrior(0.85, 0.12, ("pinhole",), "calibrations of SCARED, 63 deg, and EndoNeRF, 59 deg"),
+    "laparoscope": LensPrior(0.85, 0.38, ("pinhole",), "calibrations of SCARED, 63 deg, EndoNeRF, 59 deg, and Hamlyn"),
     "cystoscope": LensPrior(0.5, 0.3, _EVERY, f"{_TELESCOPE}, and a flexible one of 140 deg"),
-    "ureteroscope": LensPrior(0.82, 0.3, ("pinhole",), "two that were measured, 63 deg"),
+    "ureteroscope": LensPrior(0.9, 0.3, ("equidistant fisheye", "pinhole"), "two that were measured, 63 deg"),
     "sinus": LensPrior(0.6, 0.3, _EVERY, f"a guess from {_TELESCOPE}"),
     "capsule": LensPrior(0.49, 0.25, _EVERY, "EndoSLAM's calibration, 91 deg"),
 }
-"""By name; docs/calibrate.md says where each figure is published. Spreads are guesses."""
+"""By name; docs/calibrate.md says where each figure is published. Spreads are guesses, but for the laparoscope's."""

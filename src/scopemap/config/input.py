@@ -38,7 +38,7 @@ class InputSettings(Settings):
     )
     scope: _Scope = Field(
         "",
-        description="kind of endoscope of an unknown camera, whose typical lens is assumed and tried first: "
+        description="kind of endoscope of an unknown camera, whose typical lens is expected: "
         "colonoscope, gastroscope, bronchoscope, laparoscope, cystoscope, ureteroscope, sinus, capsule",
     )
     stereo: str = Field(

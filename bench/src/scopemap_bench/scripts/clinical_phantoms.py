@@ -1,32 +1,21 @@
-"""What clinical video does to a run, on phantoms with exact truth; and what a run makes of an unknown lens.
+"""What clinical video does to a run, on phantoms with exact truth.
 
     python -m scopemap_bench.scripts.clinical_phantoms [--out FOLDER]
 
-First table: phantoms with one difficulty each, of 120 frames where nothing else is said; ATE is that of the largest
-submap after a Sim(3) alignment, whose scale is the path's. Second table: lenses of known kind and field of view, given
-as plain pictures, every fourth of 120 frames.
+One difficulty each, 120 frames where nothing else is said. ATE is that of the largest submap after a Sim(3) alignment,
+whose scale is the path's.
 """
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from scopemap.calibration.focal_length.from_motion import with_focal_from_motion
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import FisheyeCamera
-from scopemap.cameras.scopes import KINDS
-from scopemap.config import Config
 from scopemap.io.depth_maps import DepthReader
 from scopemap.io.opening import open_sequence
 from scopemap_bench.evaluation.depth import DepthFit, evaluate_depth
-from scopemap_bench.phantom.render import prepare, render_frame
-from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.scoring import true_pairs
 from scopemap_bench.scripts import measuring
 
@@ -56,19 +45,10 @@ PHANTOMS = {
         *("--set", "texture=0", "--set", "indirect=0.8", "--set", "h264_crf=36", *EXPOSURE),
     ),
 }
-SIZE, EVERY, LENS_FRAMES = (320, 256), 4, 120
-# Scene, kind of the lens, horizontal field of view in degrees, seed, whether tissue breathes.
-LENSES = (
-    ("laparoscopy", "pinhole", 60.0, 301, False),
-    ("laparoscopy", "equidistant fisheye", 75.0, 303, False),
-    ("laparoscopy", "orthographic fisheye", 100.0, 304, False),
-    ("colon", "pinhole", 75.0, 306, False),
-    ("laparoscopy", "pinhole", 90.0, 302, True),
-)
 
 
 def print_phantoms(folder: Path) -> None:
-    """Render, run, measure and print the first table."""
+    """Render, run, measure and print the table."""
     heads = ("phantom", "frames tracked", "frames in the largest submap", "submaps")
     errors = ("ATE RMSE mm", "ATE as tracked mm", "rotation mean / max deg", "mesh to truth mm")
     measuring.print_head(*heads, *errors, "scale drift", "scale spread", "worst tenth AbsRel")
@@ -103,43 +83,12 @@ def scale_cells(run: Path, source: Path, figures: dict[str, Any]) -> list[str]:
     return [f"{last - first:+.3f}", f"{logs.std():.3f}", f"{worst:.3f}"]
 
 
-def lens_of(kind: str, fov_deg: float) -> PinholeCamera | FisheyeCamera:
-    """Return a lens of a kind and a horizontal field of view for pictures of `SIZE`."""
-    radius = {"pinhole": math.tan, "equidistant fisheye": float, "orthographic fisheye": math.sin}[kind]
-    focal_px = SIZE[0] / 2 / radius(math.radians(fov_deg / 2))
-    plane = PinholeCamera(focal_px, focal_px, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2, *SIZE)
-    return FisheyeCamera(plane, KINDS[kind]) if KINDS[kind] else plane
-
-
-def print_lenses(folder: Path) -> None:
-    """Print how far the estimated focal length is off at the picture's centre, or that the run does not know."""
-    measuring.print_head("scene, lens", "true f / width", "fx off", "camera's source, as a run states it")
-    for scene, kind, fov_deg, seed, deform in LENSES:
-        camera, pictures = lens_of(kind, fov_deg), folder / f"lens-{seed}"
-        file = folder / f"lens-{seed}.yaml"
-        write_calibration(camera, file)
-        spec = PhantomSpec(scene=scene, frames=LENS_FRAMES, seed=seed, deform=deform, camera_file=file)
-        model = prepare(spec)
-        pictures.mkdir(exist_ok=True)
-        for index in range(0, LENS_FRAMES, EVERY):
-            cv2.imwrite(str(pictures / f"{index:06d}.png"), render_frame(model, index)[0][..., ::-1])
-        found, _ = with_focal_from_motion(open_sequence(pictures), Config())
-        true_share = camera.central.fx / SIZE[0]
-        off = found.camera.fx / (true_share * found.camera.width) - 1
-        knows = found.camera_source.startswith("estimated")
-        verdict = f"{off:+.1%}" if knows else f"unknown; assumed {off:+.0%}"
-        name = f"{scene}{', breathing' if deform else ''}, {kind}, {fov_deg:g} deg"
-        measuring.print_row(name, f"{true_share:.3f}", verdict, found.camera_source.split(";")[0])
-
-
 def main() -> None:
-    """Print both tables."""
+    """Print the table."""
     options = measuring.options_of(__doc__, out=True).parse_args()
     with measuring.folder_or_scratch(options.out) as folder:
         folder.mkdir(parents=True, exist_ok=True)
         print_phantoms(folder)
-        print()
-        print_lenses(folder)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The nine tables of bench/results/: made at one commit, and checked for being older than the code.
+"""The ten tables of bench/results/: made at one commit, and checked for being older than the code.
 
     python -m scopemap_bench.scripts.record --all --data FOLDER       make all; the commit must be whole
     python -m scopemap_bench.scripts.record NAME ... --data FOLDER    make some
@@ -32,6 +32,7 @@ TABLES: dict[str, tuple[str, str]] = {
     "overview": (f"{SCRIPT}.overview --data DATA --out OUT", ""),
     "surface": (f"{SCRIPT}.surface --data DATA --out OUT", ""),
     "clinical-phantoms": (f"{SCRIPT}.clinical_phantoms", ""),
+    "unknown-lenses": (f"{SCRIPT}.unknown_lenses", ""),
     "depth": (f"{SCRIPT}.depth_without_download --data DATA --size 320x256", ""),
     "methods": (f"{PLAN} real-and-phantom --data DATA --out OUT/methods", "methods/tables/overview.md"),
     "ablations": (f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations", "ablations/tables/overview.md"),

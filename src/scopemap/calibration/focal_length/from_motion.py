@@ -130,9 +130,9 @@ class FocalEstimate:
 def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence, list[Notice]]:
     """Return a sequence of unknown camera with the focal length estimated from its motion, and notices about the lens.
 
-    Where the estimate is not taken the focal length stays, and `camera_source` says why. `input.focal` "flow" takes any
-    estimate, "auto" one of small deviation that contradicts the assumed focal length. Raises `CalibrationError` where
-    there is no estimate for "flow".
+    Where the estimate is not taken the focal length stays, of a stated kind of endoscope weighed with what was seen,
+    and `camera_source` says why. `input.focal` "flow" takes any estimate, "auto" one of small deviation that
+    contradicts the assumed focal length. Raises `CalibrationError` where there is no estimate for "flow".
     """
     windows: list[Window] = []
     estimate, assumed_px = focal_from_motion(sequence, config, windows), sequence.camera.fx
@@ -146,7 +146,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         f"fx {estimate.focal_px:.0f} +- {max(estimate.sigma_px, 1):.0f} px, horizontal field of view "
         f"{estimate.fov_deg:.0f} deg"
     )
-    kept = ""
+    kept, found = "", None
     if estimate.reason:
         kept = f"the motion does not determine it: {estimate.reason}"
     elif not wanted and estimate.share > MAX_SHARE:
@@ -155,9 +155,10 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     if not wanted and (is_unknown or bends):
         # A run that adjusts nothing afterwards does not wait for windows to be adjusted.
         adjusts = config.mapping.method != "none"
-        tried = _agreeing(try_lenses(windows, scope), estimate, sequence, windows) if adjusts else None
+        found = try_lenses(windows, scope) if adjusts else None
+        tried = _agreeing(found, estimate, sequence, windows)
         if tried is not None and not tried.reason:
-            return _with_tried(sequence, tried, windows), []
+            return _with_tried(sequence, tried, windows, "estimated: by trial of lenses"), []
         if is_unknown:
             undecided = "too few of the first frames show a rigid scene" if tried is None else tried.reason
             kept += f"; a trial of lenses does not tell it either: {undecided}" if adjusts else ""
@@ -167,6 +168,9 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         kept = f"{assumed_px:.0f} px, consistent with the estimate from the motion: {described}"
     if kept and is_unknown and config.input.scope:
         source, focal_px = f"{sequence.camera_source}; {kept}", scope.focal * sequence.camera.width
+        if found is not None and found.reason:
+            # Its mean weighs what is expected against what was seen.
+            return _with_tried(sequence, found, windows, f"{source}; used: the likeliest of such lenses"), []
         return sequence.with_focal(focal_px, source, scope.spread * focal_px, KINDS[scope.kinds[0]]), []
     if kept:
         return replace(sequence, camera_source=f"{sequence.camera_source}; {kept}"), []
@@ -187,12 +191,12 @@ def _agreeing(
     return replace(tried, reason=f"its pinhole of {tried.fov_deg:.0f} deg is not that of the motion")
 
 
-def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window]) -> Sequence:
-    """Return the sequence seen through the lens that a trial found."""
+def _with_tried(sequence: Sequence, tried: LensTrial, windows: list[Window], how: str) -> Sequence:
+    """Return the sequence seen through the lens that a trial found, and `how` it is known."""
     scale = sequence.camera.width / (2 * windows[0].half_width_px)
     focal_px, sigma_px = scale * tried.focal_px, scale * tried.focal_px * tried.share
     source = (
-        f"estimated: by trial of lenses in {tried.windows} windows, {tried.kind}, fx {focal_px:.0f} +- "
+        f"{how} in {tried.windows} windows, {tried.kind}, fx {focal_px:.0f} +- "
         f"{max(sigma_px, 1):.0f} px, horizontal field of view {tried.fov_deg:.0f} deg"
     )
     return sequence.with_focal(focal_px, source, sigma_px, KINDS[tried.kind])

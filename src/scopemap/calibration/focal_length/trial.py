@@ -26,8 +26,8 @@ from scopemap.io.device import cpu_threads
 MAX_SHARE = 0.07
 """Standard deviation of ln fx above which a trial does not tell it, chosen with `_CORRELATED`."""
 
-# Focal lengths over the width: pinholes of 122 to 42 degrees, equidistant fisheyes of 150 and less.
-_COARSE = np.geomspace(0.28, 1.3, 10)
+# Focal lengths over the width: pinholes of 122 to 31 degrees, equidistant fisheyes of 150 and less.
+_COARSE = np.geomspace(0.28, 1.83, 12)
 _FINER = (_COARSE[1] / _COARSE[0]) ** np.array([-0.75, -0.5, -0.25, 0.25, 0.5, 0.75])
 _FARTHEST = 3.0  # spreads from the expected focal length
 _WIDEST_RAD = math.radians(86)  # farther out a straightened picture has no end
@@ -44,7 +44,7 @@ _LEAST_CERTAIN = 0.95
 _MOST_AT_END = 0.02  # of the probability, within a twentieth of the range of either end
 _MIN_WINDOWS = 2
 _MAX_RESIDUAL = 0.0008  # share of the width that the best lens may leave: tissue deforms where it is more
-_FINE = 200
+_FINE = 240
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class _Tried:
     """
 
     def __init__(self, prior: LensPrior, window: Window) -> None:
-        self.window, self.width_px, self.first = with_distance(window), 2 * window.half_width_px, prior.focal
+        self.window, self.width_px = with_distance(window), 2 * window.half_width_px
         self.errors: dict[tuple[str, float], np.ndarray] = {}
         self._states: dict[tuple[str, float], Start] = {}
         for kind in prior.kinds:
@@ -103,8 +103,8 @@ class _Tried:
 
     def at(self, kind: str, shares: np.ndarray) -> None:
         """Adjust the window through lenses of a kind, each from where a lens like it ended."""
-        # Small motion converges best through a wide lens.
-        for share in sorted(map(float, shares), key=lambda share: abs(math.log(share / self.first))):
+        # Small motion converges best through a wide lens, whatever is expected.
+        for share in sorted(map(float, shares), key=lambda share: abs(math.log(share / ANY_LENS.focal))):
             # Of its own kind where there is one, then of the nearest focal length.
             near = min(self._states, key=lambda key: (key[0] != kind, abs(math.log(key[1] / share))), default=None)
             start = None if near is None else self._states[near]
