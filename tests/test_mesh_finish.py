@@ -11,7 +11,8 @@ from front_door import call
 from tiny_phantom import write_tiny
 
 from scopemap.config import Config, FusionSettings
-from scopemap.fusion.finish import finished, simplified, smoothed, without_small_holes
+from scopemap.fusion.finish import finished, simplified, smoothed, with_normals_alone, without_small_holes
+from scopemap.fusion.mesh_files import ply_bytes
 
 
 def _plate(size: int = 40) -> trimesh.Trimesh:
@@ -150,3 +151,12 @@ def test_the_options_of_a_run(tmp_path: Path) -> None:
     fusion = Config.load(file=tmp_path / "run" / "config.toml").fusion
     assert (fusion.mesh_faces, fusion.mesh_smooth, fusion.colours, fusion.holes) == (900, 2, "raw", "small")
     assert 500 < len(trimesh.load(tmp_path / "run" / "mesh.ply", process=False).faces) <= 900
+
+
+def test_a_result_keeps_the_normals_of_its_mesh_and_none_of_their_computation() -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    mesh.vertex_attributes["confidence"] = np.ones(len(mesh.vertices), np.float32)
+    content = ply_bytes(mesh, ["mm"])
+    lean = with_normals_alone(mesh)
+    assert ply_bytes(lean, ["mm"]) == content
+    assert {"face_normals", "face_angles"} <= set(mesh._cache.cache) - set(lean._cache.cache)

@@ -6,6 +6,8 @@ half to the observations, half and what these leave to the volume with its mesh.
 
 from __future__ import annotations
 
+import ctypes
+from contextlib import suppress
 from dataclasses import dataclass
 
 from scopemap.config import Config
@@ -44,6 +46,12 @@ class MemoryPlan:
             return []
         values = {"observations": self.observations, "blocks": self.blocks, "ahead": self.ahead}
         return [Notice("memory-limited", values)]
+
+
+def give_back_freed() -> None:
+    """Give memory that was freed back to the system, which glibc does too late where large arrays come and go."""
+    with suppress(OSError, AttributeError, TypeError):  # another C library, or Windows
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def memory_plan(config: Config, sequence: Sequence) -> MemoryPlan:

@@ -16,7 +16,7 @@ from numba.core.event import TimingListener, register
 
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import surface_agreement, vertex_sigmas
-from scopemap.fusion.finish import finished
+from scopemap.fusion.finish import finished, with_normals_alone
 from scopemap.fusion.free_space import FreeSpace, views_among
 from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
 from scopemap.fusion.reference_state import SurfaceState
@@ -29,7 +29,7 @@ from scopemap.odometry import Step
 from scopemap.pipeline import Pipeline
 from scopemap.reconstruction import Reconstruction
 from scopemap.runner.backwards import track_backwards
-from scopemap.runner.memory import MemoryPlan
+from scopemap.runner.memory import MemoryPlan, give_back_freed
 from scopemap.runner.provenance import Limits, motion_notices, notices_of_end, provenance_of
 from scopemap.runner.submap_frames import check_tracked, frames_of_submap
 from scopemap.tracking.track import Track
@@ -195,6 +195,7 @@ class _Finishing:
 
     def _fused(self, number: int, submaps: list[Submap]) -> Reconstruction:
         """Correct, write and fuse the frames of a submap."""
+        give_back_freed()
         sequence, pipeline, submap = self.run.sequence, self.run.pipeline, submaps[number]
         config, store = pipeline.config, pipeline.fusion.store
         final = FinalFrames(submap, self._stored_poses(submap), store.frame)
@@ -244,7 +245,7 @@ class _Finishing:
         return Reconstruction(
             sequence.camera,
             frames,
-            fused.mesh,
+            with_normals_alone(fused.mesh),
             config,
             provenance,
             source_camera,
