@@ -238,7 +238,7 @@ class Backend:
         return {number: self._unit(map_number).after(S) for number, S in worlds.items()}
 
     def _unit(self, map_number: int) -> Similarity:
-        """Return the Sim(3) from a map to the millimetres that count."""
+        """Return the Sim(3) from a map as tracked to the same map in the millimetres of `scale_by_network`."""
         map_of, off = np.array([pose.map for pose in self._tracked]), np.array(self._log_scales) - self._path.drift
         return Similarity(scale_by_network(off, map_of, map_number, self._anchored), np.eye(3), np.zeros(3))
 

@@ -185,9 +185,9 @@ def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
 
 
 def confirmed_motions(problem: BundleProblem, pairs: np.ndarray, most_px: float) -> np.ndarray:
-    """Return of pairs (C, 2) of keyframes whether most observations of one in the other fit the tracked motion, (C,).
+    """Return for each pair (C, 2) of keyframes whether their observations confirm the tracked motion, (C,) bool.
 
-    most_px : reprojection error of one that fits.
+    Ten and more, and most, of the points of one that the other observes have a reprojection error below `most_px`.
     """
     host, observer, count = problem.points.host[problem.observations.point], problem.observations.keyframe, len(pairs)
     number = np.full((len(problem.T_camera_world),) * 2, -1)

@@ -33,7 +33,7 @@ class Points:
 
     @property
     def median_mm(self) -> float:
-        """Typical depth."""
+        """Median of the estimated depths, mm."""
         return float(np.exp(np.median(self.log_depth)))
 
 
