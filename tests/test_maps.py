@@ -132,6 +132,7 @@ def test_each_submap_of_a_run_is_exported_to_climb(result: Reconstruction, out: 
         assert (points <= one.mesh.bounds[1] + 1e-3).all()
 
 
+@pytest.mark.usefixtures("result")
 def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: Path) -> None:
     shutil.copytree(out, tmp_path / "out")
     short = with_true_depth(spliced, **LIGHT)
@@ -235,19 +236,6 @@ def test_a_map_is_split_where_nothing_supports_an_alignment_after_a_loss(far: bo
         poses = np.stack([correction.pose(n, plane_scene.pose(at_mm=(40 + n / 5, 0, 0))) for n in (40, 60)])
         np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-9)
         np.testing.assert_allclose(poses[1, :3, 3], [4, 0, 0], atol=0.1)
-
-
-def test_dirt_on_the_lens_merges_no_maps() -> None:
-    backend = Backend(MappingSettings(), DisFlow())
-    dirt = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(70, 90, 3)).astype(np.float32), (0, 0), 1.5)
-    for number in range(10):
-        at_mm = (-60.0 + 2 * number, 0.0, 0.0) if number < 5 else (45.0 + 2 * number, 0.0, 0.0)
-        frame, pose = _keyframe(number, at_mm, Similarity.identity(), 1.0)
-        frame.rgb[60:130, 80:170] = np.clip(100 + 30 * dirt / dirt.std(), 0, 255).astype(np.uint8)
-        backend.add(frame, pose._replace(map=int(number >= 5)))
-    assert list(backend.adjust().S_common_map) == [0]
-    with pytest.raises(ValueError, match="no keyframe"):
-        backend.adjust(2)
 
 
 @pytest.fixture(scope="module")

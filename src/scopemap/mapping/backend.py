@@ -18,13 +18,7 @@ from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import (
-    BundleSolution,
-    adjust_in_windows,
-    confirmed_motions,
-    errors_px,
-    lens_residual,
-)
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px, lens_residual
 from scopemap.mapping.bundle_problem import BundleProblem, Points, Priors, State
 from scopemap.mapping.depth_correction import (
     DepthCorrectionField,
@@ -323,8 +317,7 @@ class Backend:
         loops = self._loops_among(chosen, log_unit)
         if not loops:
             return problem, np.zeros((0, 2), int)
-        confirmed = confirmed_motions(problem, pairs, _MAX_PART_ERROR * camera.fx)
-        graph = optimise_pose_graph(T_world_camera, pairs, loops, points.median_mm, confirmed)
+        graph = optimise_pose_graph(T_world_camera, pairs, loops, points.median_mm)
         log_depth = points.log_depth + graph.log_scale[points.host]
         start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
         return replace(problem, start=start), graph.accepted
@@ -360,7 +353,7 @@ class Backend:
         assert self._camera is not None
         drift = self._path.drift[chosen]
         as_tracked = replace(points, log_depth=points.log_depth + drift[points.host])
-        error = found.depth_change(points), found.log_depth_sigma
+        error = _depth_change(points, found), found.log_depth_sigma
         return fit_depth_corrections(self._camera, as_tracked, len(drift), *error, step_sigma)
 
     def _depth_contradiction(
@@ -376,15 +369,17 @@ class Backend:
         before = [np.float32(worlds[self._tracked[k].map].scale) * grids[k] for k in chosen]
         log_scale = found.state.log_scale - self._path.drift[chosen]
         after = [np.exp(scale) * grid for scale, grid in zip(log_scale, before, strict=True)]
-        for k, field in enumerate(fields):
-            after[k] = np.exp(field.log_factor(before[k])) * after[k]
+        if fields:
+            factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
+            after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
         both = ((self._as_tracked(chosen, worlds), before), (inverse(found.state.T_camera_world), after))
         # Farther apart two keyframes may have a few pixels in common, which prove nothing.
         gaps = [gap for gap in self.settings.keyframe_gaps if gap <= MOST_RECENT]
         tracked, adjusted = (depth_disagreement(self._camera, T, grids, gaps) for T, grids in both)
         for was, now in zip(tracked, adjusted, strict=True):
             if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
-                return Notice("mapping-depth-disagrees", {"adjusted": float(now), "tracked": float(was), "merged": ""})
+                values = {"adjusted": float(now), "tracked": float(was), "merged": ""}
+                return Notice("mapping-depth-disagrees", values)
         return None
 
 
@@ -393,8 +388,13 @@ def contradiction(points: Points, found: BundleSolution, settings: MappingConsta
     if not found.sigma_px <= settings.max_sigma_px:
         return f"reprojection errors stay at {found.sigma_px:.2f} px (robust standard deviation)"
     certain = found.log_depth_sigma < _TEST_SIGMA
-    change = np.abs(found.depth_change(points)[certain])
+    change = np.abs(_depth_change(points, found)[certain])
     # Errors of networks are smaller almost everywhere; tissue that swells before a camera at rest looks like this.
     if certain.sum() > _MIN_TEST_SHARE * len(certain) and np.median(change) > settings.max_depth_change:
         return f"depth would have to change by {100 * np.expm1(np.median(change)):.0f} %"
     return ""
+
+
+def _depth_change(points: Points, found: BundleSolution) -> np.ndarray:
+    """Change of ln depth (P,) of each point, without its keyframe's scale."""
+    return found.state.log_depth - points.log_depth - found.state.log_scale[points.host]

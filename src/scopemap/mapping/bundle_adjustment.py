@@ -48,7 +48,6 @@ WINDOW = 300
 _RESIDUAL_SIGMA = np.array([0.3, 0.2, 0.2])  # prior standard deviations of ln f, and of the principal point over f
 _RESIDUAL_DEPTH = 3.0  # factor of the estimated depth's deviation there: errors of a network bend the lens, too
 _SIGNIFICANT = 5.0  # standard deviations: a right lens of a real clip had 3.4, the least noticed wrong one 6.7
-_LEAST_CONFIRMING = 10  # observations that confirm a tracked motion
 _HELD_SIGMA = 0.01  # least standard deviation of ln depth of points that an earlier window adjusted
 
 
@@ -68,10 +67,6 @@ class BundleSolution(NamedTuple):
     def sigma_px(self) -> float:
         """Robust standard deviation of the reprojection errors, px; NaN without observations."""
         return self.state.sigma_px
-
-    def depth_change(self, points: Points) -> np.ndarray:
-        """Return the change of ln depth (P,) of each point, without its keyframe's scale."""
-        return self.state.log_depth - points.log_depth - self.state.log_scale[points.host]
 
 
 class LensResidual(NamedTuple):
@@ -182,19 +177,6 @@ def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
         return np.zeros(0)
     reprojection = reproject(problem, state)
     return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
-
-
-def confirmed_motions(problem: BundleProblem, pairs: np.ndarray, most_px: float) -> np.ndarray:
-    """Return for each pair (C, 2) of keyframes whether their observations confirm the tracked motion, (C,) bool.
-
-    Ten and more, and most, of the points of one that the other observes have a reprojection error below `most_px`.
-    """
-    host, observer, count = problem.points.host[problem.observations.point], problem.observations.keyframe, len(pairs)
-    number = np.full((len(problem.T_camera_world),) * 2, -1)
-    number[pairs[:, 0], pairs[:, 1]] = number[pairs[:, 1], pairs[:, 0]] = np.arange(count)
-    of, fits = number[host, observer], errors_px(problem, problem.tracked) < most_px
-    good, bad = (np.bincount(of[some & (of >= 0)], minlength=count) for some in (fits, ~fits))
-    return (good >= _LEAST_CONFIRMING) & (good > bad)
 
 
 def weights(state: State, seen: Reprojection) -> np.ndarray:

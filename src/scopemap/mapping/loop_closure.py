@@ -1,4 +1,4 @@
-"""Loop closure: keyframes that observe the same place as one long before or of another map, verified by PnP."""
+"""Loop closure: keyframes that observe the same place as one long before or of another map, by features and PnP."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
 from scopemap.frame import Frame, RowTable, rows_in_memory
+from scopemap.mapping.loop_verification import VIEW, is_verified, small_view
 from scopemap.tracking.features import FeatureDetector, Features, SiftFeatures, relative_pose_pnp, similarity
 
 _STRONGEST_VALUES = 8192  # of the descriptors of the strongest features, by which candidates are ranked
@@ -79,8 +80,8 @@ class LoopFinder:
     """Takes keyframes one by one and returns the loops that each closes, to long before and to other maps.
 
     Candidates are the keyframes with the most similar features. A loop is accepted if PnP places the new keyframe with
-    at least `settings.constants.min_loop_inliers` inliers. table : where features are kept that only PnP needs.
-    detector : of features; None: SIFT.
+    at least `settings.constants.min_loop_inliers` inliers and both look alike there (`is_verified`). table : where is
+    kept what only this needs. detector : of features; None: SIFT.
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class LoopFinder:
         self._min_inliers, gaps = settings.constants.min_loop_inliers, settings.constants.keyframe_gaps
         self._max_gap = min(max(gaps), MOST_RECENT)
         self._features: dict[int, _KeptFeatures] = {}
-        self._rows = table("features", self._kind)
+        self._rows, self._views = table("features", self._kind), table("views", VIEW)
         self._map_of: dict[int, int] = {}
         self._count, self._every = 0, 1
         self._loops_to: defaultdict[int, list[int]] = defaultdict(list)
@@ -110,6 +111,7 @@ class LoopFinder:
         """Return the loops that a keyframe with depth closes."""
         new, loops = self._detector.detect(keyframe), []
         self._camera = keyframe.camera
+        self._views.append(small_view(keyframe))
         for past in self._candidates(new, map_number):
             loop = self._loop((past, self._count), self._of(past), new, self._map_of[past] != map_number)
             if loop is not None:
@@ -152,7 +154,7 @@ class LoopFinder:
         return loops
 
     def _loop(self, pair: tuple[int, int], old: Features, new: Features, other_map: bool) -> Loop | None:
-        """Return the loop between a past keyframe and a new one, by number; None where PnP does not verify it."""
+        """Return the loop between a past keyframe and a new one, by number; None where it is not verified."""
         assert self._camera is not None
         found = relative_pose_pnp(old, new, self._camera, self._min_inliers)
         if found is None:
@@ -168,6 +170,9 @@ class LoopFinder:
             log_z_past, log_z_new = np.log(old.points_mm[one, 2]), np.log(new.points_mm[other, 2])
             ratio = log_z_new - np.log(transformed_z)
         if np.isfinite(ratio).sum() < min(self._min_inliers, _MAX_PAIRS) // 2:
+            return None
+        old_view, new_view = (self._views.read(number, 1)[0] for number in pair)
+        if not is_verified(old_view, new_view, T_new_past, self._camera):
             return None
         log_ratio, pixels = float(np.nanmedian(ratio)), (old.pixels[one], new.pixels[other])
         return Loop(*pair, T_new_past, log_ratio, *pixels, log_z_past, log_z_new)

@@ -129,13 +129,12 @@ def tracked_pairs(frames: Sequence[int], tracked: Sequence[TrackedPose]) -> np.n
 
 
 def optimise_pose_graph(
-    T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list[Loop], depth_mm: float, confirmed: np.ndarray
+    T_world_camera: np.ndarray, neighbours: np.ndarray, loops: list[Loop], depth_mm: float
 ) -> PoseGraph:
     """Return the poses and scales that fit the tracked motions and the loops best; the first keyframe is held.
 
     T_world_camera : (K, 4, 4) as tracked. neighbours : (C, 2) int, pairs between which the motion was tracked.
-    depth_mm : typical depth, the unit of translations. confirmed : (C,) bool, whether observations confirm the motion:
-    then it is no tracking failure, and loops that agree with each other alone cannot tear the path there.
+    depth_mm : typical depth, the unit of translations.
     """
     count = len(T_world_camera)
     loops = [loop for loop in loops if _explained_by_drift(T_world_camera, loop, depth_mm)]
@@ -157,19 +156,13 @@ def optimise_pose_graph(
     def jacobian(x: np.ndarray) -> csr_matrix:
         return _jacobian(edges, *state(x), np.vstack([np.zeros(_UNKNOWNS), x.reshape(-1, _UNKNOWNS)])[:, :3])
 
-    certain = np.repeat(np.append(confirmed, np.zeros(len(loops), bool)), _UNKNOWNS)
-
-    def loss(square: np.ndarray) -> np.ndarray:
-        weight = np.where(certain, 1.0, 1 / (1 + square))
-        return np.stack([np.where(certain, square, np.log1p(square)), weight, np.where(certain, 0.0, -(weight**2))])
-
     x = np.zeros(_UNKNOWNS * (count - 1))
     for tolerance in _TOLERANCES:
         x = least_squares(
             errors,
             x,
             jacobian,
-            loss=loss,
+            loss="cauchy",
             f_scale=tolerance,
             ftol=1e-4,
             max_nfev=_MAX_EVALUATIONS,
