@@ -247,13 +247,8 @@ class Backend:
         chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
         map_of = np.array([self._tracked[k].map for k in chosen])
         problem, accepted = self._problem(chosen, worlds, self._camera)
-        points, observations, loops = problem.points, problem.observations, len(accepted)
-        found = adjust_in_windows(problem)
+        points, observations, found = problem.points, problem.observations, adjust_in_windows(problem)
         refused, fields = self._judged(chosen, problem, found, worlds)
-        if problem.start is not None and refused:
-            # Loop closures may be wrong: adjust without them.
-            found, loops = adjust_in_windows(replace(problem, start=None)), 0
-            refused, fields = self._judged(chosen, problem, found, worlds)
         host, observer = map_of[points.host[observations.point]], map_of[observations.keyframe]
 
         def sigmas_px(state: State) -> tuple[list[float], float]:
@@ -268,7 +263,7 @@ class Backend:
         (within, between_px), (before, _) = sigmas_px(found.state), sigmas_px(graph)
         index = np.array(self._frames)[chosen]
         if not refused:
-            correction = replace(self._correction(chosen, worlds, found), loops=loops, depth_fields=fields)
+            correction = replace(self._correction(chosen, worlds, found), loops=len(accepted), depth_fields=fields)
         elif len(worlds) > 1 and problem.start is not None:
             by_graph = found._replace(state=graph)
             correction = self._correction(chosen, worlds, by_graph)
