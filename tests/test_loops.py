@@ -15,8 +15,7 @@ from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingConstants
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping.loop_closure import Loop, LoopFinder
-from scopemap.mapping.loop_verification import is_verified, small_view
+from scopemap.mapping.loop_closure import Loop, LoopFinder, is_verified, small_view
 from scopemap.mapping.pose_graph import optimise_pose_graph
 
 # Out to the side and back again.
