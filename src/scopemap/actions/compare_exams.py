@@ -2,7 +2,8 @@
 
 Keyframes of the second are located in the map of the first. Matched features, with the depth of both, pair points of
 the two surfaces. In the view of each keyframe of the first, the similarity of the pairs in sight brings the second
-surface to the first one: drift, and a wall that is wider as a whole, are no change. Both are rendered there. A change
+surface to the first one: drift, and a wall that is wider as a whole, are no change. Both are rendered there, and smooth
+optical flow moves the second picture onto the first one, because features alone leave some pixels. A change
 is where shape or colour, beside what is around the place, differ by far more than they do in most places, in more than
 one view. Colours are those of the surfaces, without lamp and exposure: of them the ratio of red to green.
 """
@@ -13,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import trimesh
 from scipy.sparse import coo_matrix
@@ -24,15 +24,21 @@ from scopemap.actions.inputs import frames_again
 from scopemap.actions.locate import NOT_FOUND, PlaceMap
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.errors import AlignmentError, InputError
+from scopemap.flow.dis import DisFlow
+from scopemap.flow.estimator import FlowEstimator, pair_flow
 from scopemap.geometry.align import Similarity, umeyama
-from scopemap.geometry.rendering import render_mesh
+from scopemap.geometry.local_contrast import local_mean
+from scopemap.geometry.rendering import Rendering, render_mesh
 from scopemap.geometry.se3 import inverse, transform
+from scopemap.geometry.warp import pull
 from scopemap.io.run_folder import RunFolder
 
 _LEAST_PAIRS = 30  # in the view of a keyframe
 _OUTLIERS, _FITS = 2.5, 8  # pairs farther apart than so many medians are left out, so many times
 _HIDDEN = 0.15  # of depth: farther apart the surfaces are not the same wall
 _AROUND_SHARE = 0.1  # of the picture's width: standard deviation of what is around a place
+_CONSISTENCY_PX = 1.0  # of flow there and back
+_FLOW_SHARE = 0.05  # of the picture's width: standard deviation of its mean
 _BLOB_SHARE = 0.012  # of the median depth: standard deviation of the mean of a place
 _FARTHEST = 1.5  # of the median depth: farther away depth and colours tell little
 _ON_SURFACE = 0.02  # of depth: a vertex is not hidden
@@ -207,7 +213,7 @@ class _Difference(NamedTuple):
 def _differences(one: _Exam, second: trimesh.Trimesh, pairs: Correspondences3D) -> _Difference:
     """Return how the second surface differs from the first one in the views of the first one's keyframes."""
     mesh = one.run.mesh
-    views, total = np.zeros(len(mesh.vertices), int), np.zeros((3, len(mesh.vertices)))
+    views, total, flow = np.zeros(len(mesh.vertices), int), np.zeros((3, len(mesh.vertices))), DisFlow()
     for pose in one.poses.values():
         in_sight, _, _ = _pixels(one.run.camera, pose, pairs.first)
         if len(in_sight) < _LEAST_PAIRS:
@@ -219,9 +225,9 @@ def _differences(one: _Exam, second: trimesh.Trimesh, pairs: Correspondences3D) 
         aligned = second.copy()
         aligned.vertices = S.transform_points(np.asarray(second.vertices))
         own, there = (render_mesh(surface, one.run.camera, pose) for surface in (mesh, aligned))
-        with np.errstate(invalid="ignore"):
-            nearer = np.log(own.depth_mm / there.depth_mm)
-            same = (np.abs(nearer) < _HIDDEN) & (own.depth_mm < _FARTHEST * one.depth_mm)
+        there = _matched(own, there, flow)
+        nearer, same = _compared(own, there)
+        same &= own.depth_mm < _FARTHEST * one.depth_mm
         if not same.any():
             continue
         width_px = _BLOB_SHARE * one.depth_mm * one.run.camera.fx / float(np.median(own.depth_mm[same]))
@@ -232,6 +238,26 @@ def _differences(one: _Exam, second: trimesh.Trimesh, pairs: Correspondences3D) 
         views[seen[fine]] += 1
         total[:, seen[fine]] += [*(values[row[fine], column[fine]] for values in shown), z_mm[fine]]
     return _Difference(views, *(total / np.maximum(views, 1)))
+
+
+def _compared(own: Rendering, there: Rendering) -> tuple[np.ndarray, np.ndarray]:
+    """Return ln of own depth over the other one (H, W), and where both show the same wall, (H, W) bool."""
+    with np.errstate(invalid="ignore"):
+        nearer = np.log(own.depth_mm / there.depth_mm)
+    return nearer, np.abs(nearer) < _HIDDEN
+
+
+def _matched(own: Rendering, there: Rendering, flow: FlowEstimator) -> Rendering:
+    """Return the other picture moved onto the own one by smooth flow, so that what is new stays as it is.
+
+    Where the pictures have nothing in common flow is not consistent: there it counts as 0.
+    """
+    _, same = _compared(own, there)
+    weight, sigma_px = same.astype(np.float32), _FLOW_SHARE * same.shape[1]
+    found = pair_flow(flow, np.where(same[..., None], there.rgb, own.rgb), own.rgb, _CONSISTENCY_PX)
+    parts = np.moveaxis(np.where(found.consistent[..., None], found.to_previous, np.float32(0)), -1, 0)
+    smooth = np.stack([local_mean(part, sigma_px, weight) for part in parts], -1)
+    return Rendering(pull(there.depth_mm, smooth), pull(there.rgb, smooth))
 
 
 def _pixels(
@@ -253,13 +279,9 @@ def _redness(rgb: np.ndarray) -> np.ndarray:
 
 def _local_difference(values: np.ndarray, known: np.ndarray, width_px: float) -> np.ndarray:
     """Return a band-pass of values (H, W): the mean over a place less that around it; 0 where nothing is known."""
-
-    def mean(values: np.ndarray, sigma_px: float) -> np.ndarray:
-        weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), sigma_px)
-        total = cv2.GaussianBlur(np.where(known, values, 0).astype(np.float32), (0, 0), sigma_px)
-        return np.where(known, total / np.maximum(weight, 1e-3), np.float32(0))
-
-    return mean(values - mean(values, _AROUND_SHARE * values.shape[1]), width_px)
+    weight, kept = known.astype(np.float32), np.where(known, values, 0).astype(np.float32)
+    beside = kept - local_mean(kept, _AROUND_SHARE * values.shape[1], weight)
+    return np.where(known, local_mean(beside, width_px, weight), np.float32(0))
 
 
 def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> tuple[list[Change], np.ndarray]:
