@@ -2,10 +2,10 @@
 
 Keyframes of the second are located in the map of the first. Matched features, with the depth of both, pair points of
 the two surfaces. In the view of each keyframe of the first, the similarity of the pairs in sight brings the second
-surface to the first one: drift, and a wall that is wider as a whole, are no change. Both are rendered there, and smooth
-optical flow moves the second picture onto the first one, because features alone leave some pixels. A change
-is where shape or colour, beside what is around the place, differ by far more than they do in most places, in more than
-one view. Colours are those of the surfaces, without lamp and exposure: of them the ratio of red to green.
+surface to the first one: drift, and a wall that is wider as a whole, are no change. Both are rendered there. Features
+alone leave the two pictures some pixels apart, so smooth optical flow warps the second one onto the first. A change is
+where shape or colour, beside what is around the place, differ by far more than they do in most places, in more than one
+view. Colours are those of the surfaces, without lamp and exposure: of them the ratio of red to green.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _OUTLIERS, _FITS = 2.5, 8  # pairs farther apart than so many medians are left o
 _HIDDEN = 0.15  # of depth: farther apart the surfaces are not the same wall
 _AROUND_SHARE = 0.1  # of the picture's width: standard deviation of what is around a place
 _CONSISTENCY_PX = 1.0  # of flow there and back
-_FLOW_SHARE = 0.05  # of the picture's width: standard deviation of its mean
+_FLOW_SHARE = 0.05  # of the picture's width: standard deviation of the Gaussian that smooths flow
 _BLOB_SHARE = 0.012  # of the median depth: standard deviation of the mean of a place
 _FARTHEST = 1.5  # of the median depth: farther away depth and colours tell little
 _ON_SURFACE = 0.02  # of depth: a vertex is not hidden
@@ -248,7 +248,7 @@ def _compared(own: Rendering, there: Rendering) -> tuple[np.ndarray, np.ndarray]
 
 
 def _matched(own: Rendering, there: Rendering, flow: FlowEstimator) -> Rendering:
-    """Return the other picture moved onto the own one by smooth flow, so that what is new stays as it is.
+    """Return the other rendering, warped onto the own one by smooth flow, so that what is new keeps its shape.
 
     Where the pictures have nothing in common flow is not consistent: there it counts as 0.
     """
