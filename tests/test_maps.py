@@ -209,7 +209,7 @@ def test_the_pose_graph_merges_no_maps_whose_depths_then_disagree(zoom: float, m
         frame, pose = _keyframe(number, (2.0 * number, 0.5 * number, 0.0), Similarity.identity(), 1.0)
         backend.add(frame, pose._replace(map=number % 2))
     correction = backend.adjust(0)
-    assert correction.refused
+    assert correction.notice.code == "mapping-not-rigid"
     assert sorted(correction.S_common_map) == ([0] if zoom else [0, 1])
 
 

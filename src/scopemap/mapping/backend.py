@@ -265,7 +265,7 @@ class Backend:
         if not refused:
             correction = replace(self._correction(chosen, worlds, found), loops=len(accepted), depth_fields=fields)
         elif len(worlds) > 1 and problem.start is not None:
-            by_graph = found._replace(state=graph)
+            by_graph = found._replace(state=graph._replace(sigma_px=found.sigma_px))
             correction = self._correction(chosen, worlds, by_graph)
             correction = replace(correction, loops=len(accepted), refused=refused)
             if self._depth_contradiction(chosen, by_graph, (), worlds):
