@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from scopemap.actions.inputs import frames_again
 from scopemap.errors import InputError, reporting
-from scopemap.flow.corners import Correspondences2D3D
+from scopemap.flow.corners import Correspondences2D3D, KeyframeMatcher
+from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, transform
 from scopemap.io.opening import open_sequence
@@ -32,6 +33,10 @@ _LEAST_INLIERS, _LEAST_SUPPORT = 30, 10
 _AGREE_DEPTH, _AGREE_RAD = 0.1, 0.1  # of the poses by two keyframes
 _LEAST_SPREAD = 0.08  # standard deviation of the inliers, over the picture's width and height
 _DEPTH_SIGMA = 0.05
+_FLOW_KEYFRAMES, _FLOW_ROUNDS = (
+    3,
+    2,
+)  # keyframes whose corners flow finds in the frame, from a pose that is known better
 NOT_FOUND = "not found"
 
 
@@ -57,10 +62,10 @@ class LocatedFrame:
 
 
 class _Place(NamedTuple):
-    """A keyframe of a result: its submap, number, pose (4, 4), features with depth, and strongest descriptors."""
+    """A keyframe of a result: its submap, picture, pose (4, 4), features with depth, and strongest descriptors."""
 
     map: int
-    number: int
+    frame: Frame
     T_world_camera: np.ndarray
     features: Features
     strongest: np.ndarray
@@ -86,7 +91,7 @@ class PlaceMap:
         run = RunFolder(folder).checked()
         if not run.depth.present:
             raise InputError(f"the run {folder} kept no depth maps")
-        self._detector = detector or AlikeFeatures()
+        self._detector, self._flow, self._depth = detector or AlikeFeatures(), DisFlow(), run.depth
         self._places: list[_Place] = []
         poses: dict[int, tuple[int, np.ndarray]] = {}
         for number, submap in enumerate(run.submaps):
@@ -98,7 +103,8 @@ class PlaceMap:
             depth_mm = run.depth.read(frame.index)
             if depth_mm is not None:
                 features = self._detector.detect(replace(frame, depth_mm=depth_mm))
-                self._places.append(_Place(*_placed(frame.index, poses), features, features.descriptors[:_STRONGEST]))
+                number, T_world_camera = poses[frame.index]
+                self._places.append(_Place(number, frame, T_world_camera, features, features.descriptors[:_STRONGEST]))
 
     def __len__(self) -> int:
         """Return the number of keyframes."""
@@ -115,10 +121,32 @@ class PlaceMap:
             return missing
         agreeing = [match for match in found if _agree(match, best, frame)]
         points_mm, pixels = (np.concatenate([match[n] for match in agreeing]) for n in (2, 3))
-        pose, place = _by_all(frame, best, points_mm, pixels), best.place
+        pose, place = _by_all(frame, best.T_world_camera, points_mm, pixels), best.place
+        agreeing.sort(key=lambda match: -len(match.pixels))
+        pose = self._by_flow(frame, [match.place for match in agreeing[:_FLOW_KEYFRAMES]], pose)
         return LocatedFrame(
-            frame.index, frame.time_s, "found", place.map, place.number, len(pixels), pose, points_mm, pixels
+            frame.index, frame.time_s, "found", place.map, place.frame.index, len(pixels), pose, points_mm, pixels
         )
+
+    def _by_flow(self, frame: Frame, places: Sequence[_Place], T_world_camera: np.ndarray) -> np.ndarray:
+        """Return the pose by corners of keyframes, where flow from a pose (4, 4) finds them.
+
+        They are more than the features that match, and more exact, all the more so far from the keyframes.
+        """
+        matchers = [KeyframeMatcher(self._flow) for _ in places]
+        keyframes = [replace(place.frame, depth_mm=self._depth.read(place.frame.index)) for place in places]
+        for _ in range(_FLOW_ROUNDS):
+            points_mm, pixels = [], []
+            for matcher, keyframe, place in zip(matchers, keyframes, places, strict=True):
+                T_frame_keyframe = inverse(T_world_camera) @ place.T_world_camera
+                # Flow back begins at the keyframe's depth, too: the frame has none.
+                matcher.set_keyframe(keyframe, replace(frame, depth_mm=keyframe.depth_mm), T_frame_keyframe)
+                if found := matcher.match(frame):
+                    points_mm.append(transform(place.T_world_camera, found.points_mm))
+                    pixels.append(found.pixels)
+            if points_mm:
+                T_world_camera = _by_all(frame, T_world_camera, np.concatenate(points_mm), np.concatenate(pixels))
+        return T_world_camera
 
     def _matches(self, frame: Frame) -> list[_Match]:
         """Return the poses by the most similar keyframes."""
@@ -183,11 +211,6 @@ def write_located(frames: Sequence[LocatedFrame], file: Path) -> None:
             rows.writerow([one.index, f"{one.time_s:.6f}", one.status, *place, one.inliers, *pose])
 
 
-def _placed(index: int, poses: dict[int, tuple[int, np.ndarray]]) -> tuple[int, int, np.ndarray]:
-    number, T_world_camera = poses[index]
-    return number, index, T_world_camera
-
-
 def _agree(match: _Match, best: _Match, frame: Frame) -> bool:
     """Whether another keyframe of the same submap has a frame in about the same pose as the best one."""
     if match.place.map != best.place.map:
@@ -198,8 +221,8 @@ def _agree(match: _Match, best: _Match, frame: Frame) -> bool:
     return bool(near and rotation_angle_rad(T[:3, :3]) <= _AGREE_RAD)
 
 
-def _by_all(frame: Frame, best: _Match, points_mm: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4) by all matches: points (N, 3), world, and pixels (N, 2)."""
-    matches = Correspondences2D3D(transform(inverse(best.T_world_camera), points_mm), pixels, 1.0, best.place.number)
+def _by_all(frame: Frame, T_world_camera: np.ndarray, points_mm: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the pose (4, 4), near a known one, by all matches: points (N, 3), world, and pixels (N, 2)."""
+    matches = Correspondences2D3D(transform(inverse(T_world_camera), points_mm), pixels, 1.0, frame.index)
     T = pose_from_correspondences(matches, frame.camera, np.eye(4), _DEPTH_SIGMA)
-    return best.T_world_camera if T is None else best.T_world_camera @ inverse(T)
+    return T_world_camera if T is None else T_world_camera @ inverse(T)
