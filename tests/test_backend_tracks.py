@@ -30,11 +30,14 @@ class _Biased(DisFlow):
 
 
 class _FromZero(DisFlow):
-    """DIS flow that takes no start."""
+    """DIS flow that takes no start; started : how often one was given."""
+
+    started = 0
 
     def estimate_both_from(
         self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
+        self.started += 1
         return self.estimate_both(rgb_a, rgb_b)
 
 
@@ -100,6 +103,15 @@ def test_keyframes_that_are_far_apart_are_matched_from_depth_and_poses_as_tracke
     assert good > 1.5 * without
     assert np.median(along) < 0.25
     assert not len(_errors_px(DisFlow(), 12, 8.0))
+
+
+@pytest.mark.parametrize(("step_mm", "tried"), [(2.0, 3), (80.0, 0)])
+def test_farther_keyframes_are_tried_only_where_nearer_ones_have_corners_in_common(step_mm: float, tried: int) -> None:
+    flow = _FromZero()
+    tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2, 3))), flow)
+    for number in range(4):
+        tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(step_mm * number, 0.0, 0.0)), number))
+    assert flow.started == tried
 
 
 def test_patches_that_differ_are_no_observations() -> None:

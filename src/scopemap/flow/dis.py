@@ -34,7 +34,7 @@ class DisFlow(FlowEstimator):
 
     def estimate_both_from(self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair) -> FlowPair:
         """Return the flows a to b and b to a; the coarsest scale begins at `start`."""
-        return _computed(self._dis, rgb_a, rgb_b, start[0]), _computed(self._dis, rgb_b, rgb_a, start[1])
+        return _computed(self._near, rgb_a, rgb_b, start[0]), _computed(self._near, rgb_b, rgb_a, start[1])
 
     def provenance(self) -> dict[str, str]:
         """Return the name and OpenCV's version."""

@@ -33,8 +33,10 @@ from scopemap.mapping.loop_closure import MOST_RECENT, Loop
 _CELL_PX = 16  # one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.
 _MOST_MAPS = 20
+_COARSER = 2  # flow that is only a start is as much smaller
 _CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
 _LEAST_IN_COMMON = 0.15  # of either picture, by depth and poses as tracked
+_LEAST_MATCHED = 0.05  # of the corners of both (chance gives 0.03); below, keyframes before are tried no more
 
 
 @dataclass
@@ -99,28 +101,33 @@ class FeatureTracks:
         self._keyframe_count += 1
 
     def _match_with(self, recent: deque[_FlowKeyframe], new: _FlowKeyframe) -> None:
-        """Match a new keyframe both ways with recent ones of its map."""
+        """Match a new keyframe both ways with recent ones of its map, the latest first."""
         if not recent:
             return
         latest = recent[-1]
-        step = self._flow.estimate_both(latest.frame.rgb, new.frame.rgb)
-        for past in recent:
+        step, size = self._flow.estimate_both(latest.frame.rgb, new.frame.rgb), new.frame.valid.shape[::-1]
+        coarse = _resized(step, (size[0] // _COARSER, size[1] // _COARSER))
+        in_sight = True
+        for past in reversed(recent):
             gap = new.number_in_map - past.number_in_map
-            start: FlowPair | None = None
+            wanted = in_sight and gap in self.settings.keyframe_gaps
+            start: FlowPair | None = step
             if gap > MOST_RECENT:
                 past.composed = None
-                start = _expected_flows(past.frame, new.frame) if gap in self.settings.keyframe_gaps else None
+                start = _expected_flows(past.frame, new.frame) if wanted else None
             elif past is latest:
-                past.composed = step
+                past.composed = coarse
             elif past.composed is not None:
-                start = past.composed = _composed(past.composed[0], step[0]), _composed(step[1], past.composed[1])
-            else:
-                start = past.composed = self._flow.estimate_both(past.frame.rgb, new.frame.rgb)
-            if gap in self.settings.keyframe_gaps and (start is not None or past is latest):
+                past.composed = _composed(past.composed[0], coarse[0]), _composed(coarse[1], past.composed[1])
+                start = past.composed
+            elif in_sight:
+                start = self._flow.estimate_both(past.frame.rgb, new.frame.rgb)
+                past.composed = _resized(start, coarse[0].shape[1::-1])
+            if wanted and start is not None:
                 both = past.frame.rgb, new.frame.rgb
-                flows = step if start is None else self._flow.estimate_both_from(*both, start)
-                self._match(past, new, flows)
-                self._match(new, past, flows[::-1])
+                flows = step if past is latest else self._flow.estimate_both_from(*both, _resized(start, size))
+                found = self._match(past, new, flows) + self._match(new, past, flows[::-1])
+                in_sight = found >= _LEAST_MATCHED * (len(past.corners) + len(new.corners))
 
     def add_loop(self, loop: Loop) -> None:
         """Take the features of a loop closure: points of either keyframe that the other one observes."""
@@ -180,11 +187,12 @@ class FeatureTracks:
         centred: np.ndarray = (pixel - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
         return centred
 
-    def _match(self, host: _FlowKeyframe, other: _FlowKeyframe, flows: tuple[np.ndarray, np.ndarray]) -> None:
-        """Add the observations of the host's corners in another keyframe; `flows` : to the other one, and back."""
+    def _match(self, host: _FlowKeyframe, other: _FlowKeyframe, flows: FlowPair) -> int:
+        """Add the observations of the host's corners in another keyframe, and return how many; flows : there, back."""
         number, pixel = match_corners(host.corners, flows, other.frame.valid, _CONSISTENCY_PX)
         kept, pixel = refined_corners(host.pattern, other.pattern, host.corners[number], pixel, flows[0])
         self._add_matches(host.first_point + number[kept], other.number, pixel)
+        return len(kept)
 
 
 def _composed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -205,7 +213,10 @@ def _expected_flows(past: Frame, new: Frame) -> FlowPair | None:
     flows = expected_flow(past, T_new_past), expected_flow(new, inverse(T_new_past))
     if min(_share_inside(flow) for flow in flows) < _LEAST_IN_COMMON:
         return None
-    size = new.valid.shape[1], new.valid.shape[0]
+    return flows
+
+
+def _resized(flows: FlowPair, size: tuple[int, int]) -> FlowPair:
     return flow_at(flows[0], size), flow_at(flows[1], size)
 
 
