@@ -20,6 +20,7 @@ from tiny_phantom import SIZE, true_poses, with_true_depth
 from scopemap import Reconstruction, open_sequence, reconstruct
 from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingConstants
+from scopemap.depth.mapis import Mapis
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
@@ -161,6 +162,13 @@ def _keyframe(
         10 * number, number / 3, view.rgb, plane_scene.CAMERA, plane_scene.EVERYWHERE, depth_mm, T_world_camera
     )
     return frame, TrackedPose(int(factor != 1), 10 * max(number - 2, 0), T_world_camera)
+
+
+def test_each_map_begins_at_the_scale_of_the_depth(spliced: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[float] = []
+    monkeypatch.setattr(Mapis, "rescale", lambda _, scale: begun.append(scale))
+    found = reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT))
+    assert begun == [1.0] * len(found.submaps)
 
 
 def test_maps_of_the_same_place_are_merged() -> None:

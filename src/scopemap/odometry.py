@@ -85,6 +85,8 @@ class Odometry:
             return self._without_pose(preprocessed, track)
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()
+        if track.status == "initial":
+            self._mapis.rescale(1.0)  # drift of the maps before is none of a new one
         if np.isfinite(track.depth_ratio):
             self._mapis.rescale(track.depth_ratio)
         refined = refined or self._refine(preprocessed, motion_between(last, track))
