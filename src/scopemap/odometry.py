@@ -85,7 +85,7 @@ class Odometry:
             return self._without_pose(preprocessed, track)
         if track.status == "lost" or (last is not None and last.map != track.map):
             self._reset()
-        if track.status == "initial":
+        if track.status == "initial" and refined is None:
             self._mapis.rescale(1.0)  # drift of the maps before is none of a new one
         if np.isfinite(track.depth_ratio):
             self._mapis.rescale(track.depth_ratio)
