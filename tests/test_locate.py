@@ -77,7 +77,7 @@ def test_a_frame_is_located_in_the_submap_that_saw_its_place(places: PlaceMap, n
     assert found.inliers > 60
     wanted = T_OTHER_WORLD @ T if number else T
     error = inverse(wanted) @ found.T_world_camera
-    assert np.linalg.norm(error[:3, 3]) < 0.01 * PLANE_MM
+    assert np.linalg.norm(error[:3, 3]) < 0.0024 * PLANE_MM  # by features alone 0.0026 and 0.0030 in two of the four
     assert np.degrees(rotation_angle_rad(error[:3, :3])) < 0.5
 
 

@@ -33,10 +33,7 @@ _LEAST_INLIERS, _LEAST_SUPPORT = 30, 10
 _AGREE_DEPTH, _AGREE_RAD = 0.1, 0.1  # of the poses by two keyframes
 _LEAST_SPREAD = 0.08  # standard deviation of the inliers, over the picture's width and height
 _DEPTH_SIGMA = 0.05
-_FLOW_KEYFRAMES, _FLOW_ROUNDS = (
-    3,
-    2,
-)  # keyframes whose corners flow finds in the frame, from a pose that is known better
+_FLOW_KEYFRAMES, _FLOW_ROUNDS = 3, 2  # keyframes whose corners flow finds; how often, each time from a better pose
 NOT_FOUND = "not found"
 
 
