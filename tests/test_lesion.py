@@ -14,6 +14,7 @@ from front_door import call, refused
 
 from scopemap.actions.export.exported_run import read_exported
 from scopemap.actions.lesion import carried_masks, measure_lesion, shaft_width
+from scopemap.actions.measure import Known, known_scale
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.geometry.lesion_shape import LesionView, extents, view_shape
 from scopemap.geometry.rendering import render_mesh
@@ -45,8 +46,9 @@ def shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera = WIDE) 
 @pytest.mark.parametrize("aside_mm", [0.0, 8.0])
 def test_a_hemisphere_from_above(aside_mm: float) -> None:
     found = shape(*hemisphere(aside_mm, 0.0))
-    assert found.diameter == pytest.approx(2 * RADIUS_MM, rel=0.05)
-    assert found.cross == pytest.approx(2 * RADIUS_MM, rel=0.05)
+    # Beside its outline depth is what is farther inside, so nearer.
+    assert found.diameter == pytest.approx(2 * RADIUS_MM, rel=0.06)
+    assert found.cross == pytest.approx(2 * RADIUS_MM, rel=0.06)
     assert found.along == pytest.approx(np.pi * RADIUS_MM, rel=0.05)
     assert found.area == pytest.approx(2 * np.pi * RADIUS_MM**2, rel=0.08)
     assert found.height == pytest.approx(RADIUS_MM, rel=0.05)
@@ -55,12 +57,14 @@ def test_a_hemisphere_from_above(aside_mm: float) -> None:
 
 def test_a_slanted_view_is_less_certain() -> None:
     above, slanted = shape(*hemisphere(0.0, 0.0)), shape(*hemisphere(0.0, 0.8))
-    assert slanted.diameter == pytest.approx(2 * RADIUS_MM, rel=0.08)
+    # What stands out is taken to be smaller than it looks, for depth of a network is too smooth; this one is exact.
+    assert 0.85 * above.diameter < slanted.diameter < 0.97 * above.diameter
     assert slanted.height == pytest.approx(RADIUS_MM, rel=0.1)
     assert slanted.facing < above.facing
     disc = np.hypot(*np.moveaxis(WIDE.rays[..., :2], -1, 0)) < 0.1
     level, steep = (shape(disc, WALL_MM / (1 + lean * WIDE.rays[..., 0])) for lean in (0.0, 1.5))
     assert level.sigma < 0.01 < steep.sigma
+    assert level.diameter == pytest.approx(0.2 * WALL_MM, rel=0.012)
 
 
 def test_extents_of_a_box_are_its_diagonal_and_what_is_across_it() -> None:
@@ -119,6 +123,14 @@ def masks_of(folder: Path, frames: range) -> Path:
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
+
+
+def test_a_reference_beside_the_lesion_errs_less_than_its_frame(unknown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.actions.measure._depth_errors", lambda *of: np.full(2, 0.1))
+    scale = known_scale(read_exported(unknown), Known(0, np.array([[10.0, 20], [10, 44]]), 5.0))
+    of_frame, of_views = (np.log(draws).std() for draws in (scale.draws, scale.from_views))
+    picking = np.sqrt(2) / 24
+    assert np.hypot(picking, 0.3 * 0.1 / np.sqrt(2)) < of_views < 0.07 < of_frame
 
 
 def test_a_mask_is_carried_to_the_other_frames(known: Path) -> None:

@@ -28,18 +28,18 @@ from scopemap.io.decoding import by_number, read_decoded
 from scopemap.report.measured_surface import drawn
 
 _FIGURES = {
-    "diameter": ("largest diameter", 1, 0.07),
+    "diameter": ("largest diameter", 1, 0.04),
     "cross": ("diameter across it", 1, 0.12),
     "along": ("along the surface", 1, 0.12),
-    "area": ("area", 2, 0.12),
+    "area": ("area", 2, 0.14),
 }
 """Name, power of the unit, and the standard deviation, as a share of a length, that all frames have in common.
 
 It is by phantoms (docs/measure.md): local errors of depth, and that lesions are not round.
 """
-_LOWER, _HIGHER = 0.1, 0.5
+_LOWER, _HIGHER = 0.1, 0.7
 """A height is too large by no more than this share of the diameter, too small by no more than that: depth is smooth."""
-_OUTLINE_PX, _COMMON, _LEAST_FACING = 0.7, 0.5, 0.1
+_OUTLINE_PX, _LEAST_FACING = 0.5, 0.1
 _EDGE_PX, _LEAST_PX, _MOST_FRAMES = 2, 60, 60
 _IN_FRONT, _LEAST_LEFT = 0.1, 0.8
 _FIRST_ROW = 30  # of the drawn numbers, after those of the scale
@@ -262,9 +262,7 @@ def _combined(
     weights = _facing(views) ** 2 / (outline**2 + apart**2 + common**2)
     value = _weighted_median(values, weights)
     spread = 1.48 * _weighted_median(np.abs(np.log(values / value)), weights) / power
-    effective = weights.sum() ** 2 / (weights**2).sum()
-    own = spread**2 * (_COMMON + (1 - _COMMON) / effective)
-    return value, float(np.sqrt(own + np.average(outline**2 + apart**2, weights=weights) + common**2))
+    return value, float(np.sqrt(spread**2 + np.average(outline**2 + apart**2, weights=weights) + common**2))
 
 
 def _height(views: dict[int, LesionView], diameter: Measure, scale: KnownScale) -> Measure:

@@ -7,7 +7,7 @@ pixels themselves, of the focal length, and of the scale. Errors are drawn; what
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,11 @@ from scopemap.report.measured_surface import drawn, measure_errors, measured_dep
 
 _REFERENCE_ROW, _FIRST_ROW = 3, 9
 """Of the drawn numbers: 0 to 2 are what all share, then three for each point."""
+_BESIDE, _MOST_BESIDE = 0.3, 0.05
+"""Of a depth's error, what a length over another beside it has, at most so much: the surface is the mean of many views.
+
+By phantoms (docs/measure.md), as a share of the depth.
+"""
 
 
 @dataclass(frozen=True)
@@ -153,7 +158,9 @@ def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
         unit, words = "times the reference", f"two points of frame {known.frame}, whose distance in mm is not known"
     else:
         unit, words = "mm", f"two points of frame {known.frame}, taken to be {known.length_mm:g} mm apart"
-    from_views = draws * np.exp(picked.depth_error.mean() * errors.depth / np.sqrt(2)) / errors.focal
+    beside = replace(picked, depth_error=np.sqrt(2) * (_BESIDE * picked.depth_error).clip(max=_MOST_BESIDE))
+    own = replace(errors, depth=np.zeros_like(errors.depth))
+    from_views = 1 / _relative(run, beside, own, _straight, _REFERENCE_ROW) / errors.focal
     return KnownScale(length / (known.length_mm or 1.0), draws, from_views, unit, words, errors.sizes)
 
 

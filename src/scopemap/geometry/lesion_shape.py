@@ -18,6 +18,8 @@ _LEAST_KNOWN, _LEAST_PX = 0.7, 12
 # Standard deviations, as shares, by phantoms: of a lesion's diameter by that across the line of sight; of it by depth,
 # and what that grows by with the depth between its ends over what is across.
 _ROUND_ERROR, _DEPTH_ERROR, _SLANT_ERROR = 0.1, 0.06, 0.2
+# By phantoms, of the diameter's logarithm, along the wall: a far rim that hides, and the side of what stands out.
+_HIDDEN, _SIDE = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,8 @@ def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) ->
         return None
     smooth, outline = _smoothed(mask, depth_mm)
     v, u = np.nonzero(mask)
-    # A pixel is an area: its sides count.
-    sides = np.array([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
+    # A pixel is an area: the outline is this far beyond the middles of a mask's outermost, by ellipses.
+    sides = 0.25 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     pixels = (np.stack([u, v], -1)[:, None] + sides).reshape(-1, 2)
     rays = camera.unproject(pixels)
     points = rays * np.repeat(smooth[mask], len(sides))[:, None]
@@ -72,15 +74,17 @@ def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) ->
     weights = np.array([_DEPTH_ERROR**2 + (_SLANT_ERROR * slant) ** 2, _ROUND_ERROR**2]) ** -1
     both = np.log([largest, flat])
     diameter = float(np.exp(np.average(both, weights=weights)))
-    cross = min(extents(points)[1], diameter)
+    apart = float(np.sqrt(np.average((both - np.log(diameter)) ** 2, weights=weights)))
     height, facing = _height(mask, depth_mm, camera, points)
+    if np.isfinite(height):
+        diameter *= float(np.exp((1 - facing) * (_HIDDEN - _SIDE * np.clip(height / diameter, 0, 1))))
+    cross = min(extents(points)[1], diameter)
     rise = max(float(np.nan_to_num(height)), 1e-3 * diameter)
     radius = (diameter**2 / 4 + rise**2) / (2 * rise)
     along = 2 * radius * float(np.arctan2(diameter / 2, radius - rise))
     # Over the ellipse that is as long and wide, in the picture.
     length, width = extents(np.column_stack([pixels, np.zeros(len(pixels))]))
     base = diameter * cross * mask.sum() / (length * width)
-    apart = float(np.sqrt(np.average((both - np.log(diameter)) ** 2, weights=weights)))
     return LesionView(diameter, cross, along, float(base + np.pi * rise**2), height, facing, apart)
 
 

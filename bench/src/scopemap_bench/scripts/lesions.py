@@ -1,11 +1,11 @@
 """How large polyps of known size are by `scopemap measure --lesion`, on phantoms of unknown scale.
 
-    python -m scopemap_bench.scripts.lesions [--out FOLDER] [--seeds 301 302 303 304]
+    python -m scopemap_bench.scripts.lesions [--out FOLDER] [--seeds 401 402 ... 415]
 
 Colons of 48 frames with four polyps each, of 3 to 18 mm by the logarithm, run with `default`. Each polyp is measured by
 its masks in all frames, and by the mask of one frame, which is carried to the others. The scale is that of two points
 of the wall beside it, 5 to 15 mm apart in truth and across the view, in one frame that sees it whole. Seeds of the
-constants: 201 to 205.
+constants: 202 to 227 and 301 to 312, those that have room for four polyps.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scopemap.errors import InputError
 from scopemap.frame import Frame
 from scopemap_bench.scripts import measuring
 
-SEEDS, FRAMES, AT = (301, 302, 303, 304), 48, (8, 20, 32, 44)
+SEEDS, FRAMES, AT = (*range(401, 410), 411, 413, 415), 48, (8, 20, 32, 44)
 KINDS, LARGEST_MM = ("sessile", "flat", "pedunculated"), (18.0, 18.0, 10.0)
 LEAST_PX, EDGE_PX, BESIDE, TRIES = 150, 3, 1.5, 2000
 REFERENCE_MM, SAME_DEPTH, LEAST_REFERENCE_PX, LEVEL = (5.0, 15.0), 1.25, 20, 0.3
@@ -58,7 +58,7 @@ class Result(NamedTuple):
     @property
     def half(self) -> float:
         """Half of the interval over the value."""
-        return (self.high - self.low) / 2 / self.value
+        return (self.high - self.low) / 2 / self.value if self.value else np.inf
 
 
 def polyps_of(seed: int) -> str:
