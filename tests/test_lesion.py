@@ -142,6 +142,14 @@ def test_a_mask_is_carried_to_the_other_frames(known: Path) -> None:
     assert (carried[2] == patch(2)).all()
 
 
+def test_frames_to_which_a_part_is_carried_do_not_count(known: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    part = {n: patch(n) & (np.cumsum(patch(n).any(axis=0)) <= 5) for n in (0, 1)}
+    monkeypatch.setattr("scopemap.actions.lesion.carried_masks", lambda *of: part | {2: patch(2)})
+    monkeypatch.setattr("scopemap.actions.lesion._LEAST_PX", 20)
+    found = measure_lesion(known, patch(2), 2)
+    assert list(found.masks) == [2]
+
+
 def test_what_is_in_front_ends_a_mask(known: Path) -> None:
     run = read_exported(known)
     file = known / "depth" / "000005.png"
