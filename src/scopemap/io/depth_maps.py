@@ -43,7 +43,7 @@ class DepthWriter:
     def __call__(self, frame: Frame) -> None:
         """Write the depth of a frame, and its standard deviation where it has one."""
         depth_mm = np.asarray(frame.depth_mm)
-        units = np.nan_to_num(depth_mm / self._scale_mm, nan=0.0)
+        units = depth_mm / self._scale_mm
         image = np.where(units < _LARGEST_UNIT + 1, np.round(units), 0).astype(np.uint16)
         write_picture(self._folder / f"{frame.index:06d}.png", image)
         self._histogram += np.bincount(image[::4, ::4].ravel(), minlength=len(self._histogram))

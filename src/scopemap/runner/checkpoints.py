@@ -19,7 +19,7 @@ from scopemap.pipeline import Pipeline
 from scopemap.runner.provenance import package_versions
 
 # A checkpoint is due after so many seconds, and so long after the last one that they take a 50th of the time.
-_LEAST_S, _SHARE = 5.0, 0.02
+_LEAST_S, _SHARE = 10.0, 0.02
 _RUN = ("frames", "checked", "kept_maps", "writers")
 _SHOWN_DIFFERENCES = 4
 
