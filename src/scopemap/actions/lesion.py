@@ -41,7 +41,7 @@ _LOWER, _HIGHER = 0.1, 0.7
 """A height is too large by no more than this share of the diameter, too small by no more than that: depth is smooth."""
 _OUTLINE_PX, _LEAST_FACING = 0.5, 0.1
 _EDGE_PX, _LEAST_PX, _MOST_FRAMES = 2, 60, 60
-_IN_FRONT, _LEAST_LEFT, _LOST = 0.1, 0.8, np.log(1.5)
+_IN_FRONT, _LEAST_LEFT, _MOST_DIFFERENCE = 0.1, 0.8, np.log(1.5)
 _FIRST_ROW = 30  # of the drawn numbers, after those of the scale
 _OUTLINE_BGR, _OUTLINE_POINTS = (0, 255, 255), 60
 
@@ -87,8 +87,8 @@ def measure_lesion(
             "pixels, or its depth is unknown"
         )
     given = views.get(frame) if of_frames is None and frame is not None else None
-    if given is not None:  # elsewhere part of it may be lost
-        views = {n: view for n, view in views.items() if abs(np.log(view.diameter / given.diameter)) < _LOST}
+    if given is not None:  # a frame of another diameter shows a part of it
+        views = {n: view for n, view in views.items() if abs(np.log(view.diameter / given.diameter)) < _MOST_DIFFERENCE}
     found = []
     for row, (figure, (name, power, common)) in enumerate(_FIGURES.items(), start=_FIRST_ROW):
         value, sigma = _combined(views, shown, figure, common)

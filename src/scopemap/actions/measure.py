@@ -21,10 +21,10 @@ from scopemap.report.measured_surface import drawn, measure_errors, measured_dep
 
 _REFERENCE_ROW, _FIRST_ROW = 3, 9
 """Of the drawn numbers: 0 to 2 are what all share, then three for each point."""
-_BESIDE, _MOST_BESIDE = 0.3, 0.05
-"""Of a depth's error, what a length over another beside it has, at most so much: the surface is the mean of many views.
+_REFERENCE_SHARE, _MOST_SIGMA = 0.3, 0.05
+"""Share of the depth's standard deviation at a reference that does not cancel in lengths beside it, and its most.
 
-By phantoms (docs/measure.md), as a share of the depth.
+As a share of the depth, by phantoms (docs/measure.md): the surface is the mean of many views.
 """
 
 
@@ -158,7 +158,7 @@ def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
         unit, words = "times the reference", f"two points of frame {known.frame}, whose distance in mm is not known"
     else:
         unit, words = "mm", f"two points of frame {known.frame}, taken to be {known.length_mm:g} mm apart"
-    beside = replace(picked, depth_error=np.sqrt(2) * (_BESIDE * picked.depth_error).clip(max=_MOST_BESIDE))
+    beside = replace(picked, depth_error=np.sqrt(2) * (_REFERENCE_SHARE * picked.depth_error).clip(max=_MOST_SIGMA))
     own = replace(errors, depth=np.zeros_like(errors.depth))
     from_views = 1 / _relative(run, beside, own, _straight, _REFERENCE_ROW) / errors.focal
     return KnownScale(length / (known.length_mm or 1.0), draws, from_views, unit, words, errors.sizes)

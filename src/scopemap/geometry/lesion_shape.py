@@ -18,8 +18,8 @@ _LEAST_KNOWN, _LEAST_PX = 0.7, 12
 # Standard deviations, as shares, by phantoms: of a lesion's diameter by that across the line of sight; of it by depth,
 # and what that grows by with the depth between its ends over what is across.
 _ROUND_ERROR, _DEPTH_ERROR, _SLANT_ERROR = 0.1, 0.06, 0.2
-# By phantoms, of the diameter's logarithm, along the wall: a far rim that hides, and the side of what stands out.
-_HIDDEN, _SIDE = 0.1, 0.5
+# Correction of ln diameter in a slanted view, by phantoms: the far rim is occluded; what protrudes shows its side.
+_OCCLUSION, _PROTRUSION = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) ->
     apart = float(np.sqrt(np.average((both - np.log(diameter)) ** 2, weights=weights)))
     height, facing = _height(mask, depth_mm, camera, points)
     if np.isfinite(height):
-        diameter *= float(np.exp((1 - facing) * (_HIDDEN - _SIDE * np.clip(height / diameter, 0, 1))))
+        diameter *= float(np.exp((1 - facing) * (_OCCLUSION - _PROTRUSION * np.clip(height / diameter, 0, 1))))
     cross = min(extents(points)[1], diameter)
     rise = max(float(np.nan_to_num(height)), 1e-3 * diameter)
     radius = (diameter**2 / 4 + rise**2) / (2 * rise)

@@ -33,7 +33,7 @@ from scopemap.mapping.loop_closure import MOST_RECENT, Loop
 _CELL_PX = 16  # one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.
 _MOST_MAPS = 20
-_COARSER = 2  # flow that is only a start is as much smaller
+_DOWNSCALE = 2  # of flow that only starts a search
 _CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
 _LEAST_IN_COMMON = 0.15  # of either picture, by depth and poses as tracked
 _LEAST_MATCHED = 0.05  # of the corners of both (chance gives 0.03); below, keyframes before are tried no more
@@ -106,11 +106,11 @@ class FeatureTracks:
             return
         latest = recent[-1]
         step, size = self._flow.estimate_both(latest.frame.rgb, new.frame.rgb), new.frame.valid.shape[::-1]
-        coarse = _resized(step, (size[0] // _COARSER, size[1] // _COARSER))
-        in_sight = True
+        coarse = _resized(step, (size[0] // _DOWNSCALE, size[1] // _DOWNSCALE))
+        overlaps = True
         for past in reversed(recent):
             gap = new.number_in_map - past.number_in_map
-            wanted = in_sight and gap in self.settings.keyframe_gaps
+            wanted = overlaps and gap in self.settings.keyframe_gaps
             start: FlowPair | None = step
             if gap > MOST_RECENT:
                 past.composed = None
@@ -120,14 +120,14 @@ class FeatureTracks:
             elif past.composed is not None:
                 past.composed = _composed(past.composed[0], coarse[0]), _composed(coarse[1], past.composed[1])
                 start = past.composed
-            elif in_sight:
+            elif overlaps:
                 start = self._flow.estimate_both(past.frame.rgb, new.frame.rgb)
                 past.composed = _resized(start, coarse[0].shape[1::-1])
             if wanted and start is not None:
                 both = past.frame.rgb, new.frame.rgb
                 flows = step if past is latest else self._flow.estimate_both_from(*both, _resized(start, size))
                 found = self._match(past, new, flows) + self._match(new, past, flows[::-1])
-                in_sight = found >= _LEAST_MATCHED * (len(past.corners) + len(new.corners))
+                overlaps = found >= _LEAST_MATCHED * (len(past.corners) + len(new.corners))
 
     def add_loop(self, loop: Loop) -> None:
         """Take the features of a loop closure: points of either keyframe that the other one observes."""
