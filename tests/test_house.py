@@ -170,9 +170,9 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 165: submaps, loops.
-    "core": (lambda: _total(MODULES), 36_880),
-    "core, net": (lambda: _net(MODULES), 22_695),
+    # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 165: submaps, loops; 20: start, end.
+    "core": (lambda: _total(MODULES), 36_900),
+    "core, net": (lambda: _net(MODULES), 22_700),
     "bench": (lambda: _total(BENCH_MODULES), 14_280),  # 145: lenses; 445: polyps; 235: two runs; 1190: others
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
     "tests": (lambda: _total(TESTS), 35_185),  # 175: lesions, live map; of these; 230: a network at rest; 70: merging

@@ -5,6 +5,8 @@ A known error is one line and exit code 1, wrong usage exit code 2, anything els
 
 from __future__ import annotations
 
+import atexit
+import gc
 import io
 import sys
 
@@ -67,6 +69,9 @@ def _root(
 
 def main() -> None:
     """Run the command line."""
+    # Imports make many objects and no garbage, and Python would look through all of them again and again, also at exit.
+    gc.set_threshold(10_000)
+    atexit.register(gc.freeze)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             # A pipe on Windows has a code page that lacks most letters.

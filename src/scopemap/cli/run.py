@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -143,21 +145,25 @@ def run(
     chosen = {key: value for key, value in given.items() if value is not None} | options.parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)
 
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(import_module, "scopemap.runner.with_report")  # while the input is looked at
+
+        from scopemap.io.opening import open_sequence
+
+        sequence = open_sequence(
+            source,
+            dataset=dataset,
+            camera=camera,
+            fov_deg=fov,
+            size=options.parse_size(size) if size else None,
+            frames=frames,
+            settings=resolved.input,
+        )
     from scopemap.estimators import missing_weights
-    from scopemap.io.opening import open_sequence
     from scopemap.runner.checkpoints import check_resumable, discard_unfinished
     from scopemap.runner.network_cost import network_cost
     from scopemap.runner.with_report import reconstruct_with_report
 
-    sequence = open_sequence(
-        source,
-        dataset=dataset,
-        camera=camera,
-        fov_deg=fov,
-        size=options.parse_size(size) if size else None,
-        frames=frames,
-        settings=resolved.input,
-    )
     if resume:
         check_resumable(out, sequence, resolved)
     elif resume is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -11,6 +13,7 @@ import numpy as np
 from scopemap.errors import reporting
 from scopemap.io.decoding import read_decoded
 from scopemap.io.depth_maps import DepthReader, write_picture
+from scopemap.io.device import cpu_threads
 from scopemap.report.sheet import Sheet, picture_grid
 
 _CELL_PX = (300, 250)
@@ -34,15 +37,20 @@ def write_previews(folder: Path, range_mm: tuple[float, float], *, scale_known: 
     range_mm : depth at the ends of the colours, the same for all frames. What they mean is written below the map: mm,
     or multiples of the nearest depth where the scale is unknown. Raises `InputError` where nothing can be written.
     """
-    previews, legend = folder / "depth_preview", None
+    previews = folder / "depth_preview"
     with reporting(f"cannot write to {previews}"):
         previews.mkdir(exist_ok=True)
-    by_unit = _logarithmic(DepthReader(folder).scale_mm * np.arange(1 << 16).clip(1), range_mm)
-    by_unit[0] = 0
-    for file in sorted((folder / "depth").glob("*.png")):
-        picture = by_unit[read_decoded(file)]
-        legend = _depth_legend(picture.shape[1], range_mm, scale_known) if legend is None else legend
-        write_picture(previews / f"{file.stem}.jpg", np.vstack([picture, legend])[..., ::-1])
+    bgr_by_unit = _logarithmic(DepthReader(folder).scale_mm * np.arange(1 << 16).clip(1), range_mm)[:, ::-1].copy()
+    bgr_by_unit[0] = 0
+    legend_of = cache(lambda width: _depth_legend(width, range_mm, scale_known)[..., ::-1])
+
+    def write(file: Path) -> None:
+        picture = bgr_by_unit.take(np.asarray(read_decoded(file)), axis=0)
+        write_picture(previews / f"{file.stem}.jpg", np.vstack([picture, legend_of(picture.shape[1])]))
+
+    # All of it but the loop runs without Python's lock.
+    with ThreadPoolExecutor(cpu_threads()) as pool:
+        list(pool.map(write, sorted((folder / "depth").glob("*.png"))))
 
 
 def _logarithmic(depth_mm: np.ndarray, range_mm: tuple[float, float]) -> np.ndarray:
