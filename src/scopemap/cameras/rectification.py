@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -71,9 +72,15 @@ class Rectifier:
         if self.only_resizes:
             interpolation = cv2.INTER_AREA if self._shrink > 1 else cv2.INTER_LINEAR
             return cv2.resize(image, (self.target.width, self.target.height), interpolation=interpolation)
+        sigma_px, x, y = _BLUR_PER_SHRINK * self._shrink, self._x, self._y
+        if self._shrink > 2:
+            # The mean of 2 by 2 pixels blurs by half a pixel already, and leaves a quarter of the work.
+            height, width = (side // 2 for side in image.shape[:2])
+            image = cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+            sigma_px, x, y = math.sqrt(sigma_px**2 - 0.25) / 2, self._halved[0], self._halved[1]
         if self._shrink > 1:
-            image = cv2.GaussianBlur(image, (0, 0), _BLUR_PER_SHRINK * self._shrink)
-        rectified = cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            image = cv2.GaussianBlur(image, (0, 0), sigma_px)
+        rectified = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         rectified[~self._valid] = 0
         return rectified
 
@@ -105,6 +112,11 @@ class Rectifier:
         total = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         weight = cv2.remap(known.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.where(self._valid & (weight >= 0.5), total / np.maximum(weight, 0.5), np.nan).astype(np.float32)
+
+    @cached_property
+    def _halved(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the pixels are in a picture of half the source's size."""
+        return self._x / 2 - np.float32(0.25), self._y / 2 - np.float32(0.25)
 
     def _maps(self, array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         height, width = array.shape[:2]

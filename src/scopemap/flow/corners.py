@@ -232,7 +232,8 @@ def refined_corners(
         return np.zeros(0, int), np.zeros((0, 2))
     # What comes nearer grows: a patch that is only shifted lags behind. The other image is warped by the smooth flow.
     x, y = np.meshgrid(*(np.arange(side, dtype=np.float32) for side in image_from.shape[::-1]))
-    seen = cv2.GaussianBlur(flow, (0, 0), _WARP_SMOOTHING_PX) + np.stack([x, y], -1)
+    smooth = [local_mean(part, _WARP_SMOOTHING_PX, downscale=4) for part in cv2.split(flow)]
+    seen = np.stack([smooth[0] + x, smooth[1] + y], -1)
     warped = cv2.remap(image_to, seen[..., 0], seen[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     start = corners + pixels - seen[corners[:, 1], corners[:, 0]]
     there, found = _aligned(image_from, warped, corners, start, _THOROUGH)

@@ -29,6 +29,10 @@ class FlowEstimator(Protocol):
         """Return the flow (H, W, 2) float32, px (x, y), of two (H, W, 3) uint8 images of one size."""
         ...
 
+    def estimate_small(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
+        """Return the flow, as `estimate` does, of images that are nearly alike: an estimator may spend less on it."""
+        return self.estimate(rgb_from, rgb_to)
+
     def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> FlowPair:
         """Return the flows a to b and b to a; an estimator that can share work between them overrides this."""
         return self.estimate(rgb_a, rgb_b), self.estimate(rgb_b, rgb_a)

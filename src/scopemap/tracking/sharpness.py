@@ -49,7 +49,7 @@ class PictureQuality:
         height, width = valid.shape
         factor = min(1.0, _SMALL_PX / max(height, width))
         size = max(1, round(factor * width)), max(1, round(factor * height))
-        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if factor < 0.5 else cv2.INTER_LINEAR)
         valid = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         found = sharpness(rgb, valid), share, _saturation(rgb, valid)
         self._recent.append(found)
@@ -69,6 +69,7 @@ def _saturation(rgb: np.ndarray, valid: np.ndarray) -> float:
 def sharpness(rgb: np.ndarray, valid: np.ndarray) -> float:
     """Return the mean local contrast of an image (H, W, 3) uint8 over valid pixels (H, W), relative to brightness."""
     grey, valid = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), valid.astype(np.float32)
-    fine, coarse = (local_mean(grey, share * grey.shape[1], valid) for share in (_FINE, _COARSE))
+    fine = local_mean(grey, _FINE * grey.shape[1], valid)
+    coarse = local_mean(grey, _COARSE * grey.shape[1], valid, downscale=2)
     brightness = float((coarse * valid).sum())
     return float((np.abs(fine - coarse) * valid).sum()) / brightness if brightness > 0 else 0.0
