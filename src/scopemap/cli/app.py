@@ -69,9 +69,7 @@ def _root(
 
 def main() -> None:
     """Run the command line."""
-    # Imports make many objects and no garbage, and Python would look through all of them again and again, also at exit.
-    gc.set_threshold(10_000)
-    atexit.register(gc.freeze)
+    atexit.register(gc.freeze)  # else Python looks through all that the libraries made once more: .4 s
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             # A pipe on Windows has a code page that lacks most letters.

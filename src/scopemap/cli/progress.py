@@ -30,12 +30,12 @@ class RunProgress(NamedTuple):
 
 
 @contextmanager
-def run_progress(total: int | None, *, silent: bool) -> Iterator[RunProgress]:
-    """Yield what shows the progress of a run of `total` frames."""
+def run_progress(total: int | None, *, silent: bool, adjusts: bool = True) -> Iterator[RunProgress]:
+    """Yield what shows the progress of a run of `total` frames; adjusts : as of `RunState`."""
     if silent:
         yield RunProgress((), lambda doing, done, total: None)
         return
-    state = RunState(total)
+    state = RunState(total, adjusts=adjusts)
     with _display("tracking", "preparing") as show:
 
         def observe(step: Step) -> None:

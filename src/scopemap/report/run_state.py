@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from scopemap.odometry import Step
 
-# Time per frame after the last one (adjustment, fusion, writing) over that until then, typical of the default preset.
-_SHARE_AFTERWARDS = 0.5
+# Time per frame after the last one (adjustment, fusion, writing) over that until then: typical of the default preset,
+# and of one that adjusts nothing.
+_SHARE_AFTERWARDS, _SHARE_UNADJUSTED = 0.5, 0.05
 
 
 def of_all(total: int | None) -> str:
@@ -19,9 +20,13 @@ def of_all(total: int | None) -> str:
 
 
 class RunState:
-    """Counts the frames of a run as they pass; total : how many there are, None: nobody knows."""
+    """Counts the frames of a run as they pass; total : how many there are, None: nobody knows.
 
-    def __init__(self, total: int | None) -> None:
+    adjusts : whether keyframes are adjusted after the last frame, and frames fused then.
+    """
+
+    def __init__(self, total: int | None, *, adjusts: bool = True) -> None:
+        self._share_afterwards = _SHARE_AFTERWARDS if adjusts else _SHARE_UNADJUSTED
         self.started, self.done, self.lost, self.text = time.perf_counter(), 0, 0, ""
         self._total, self._first = total, 1
         self._maps = Counter[int]()
@@ -35,7 +40,7 @@ class RunState:
         if self.done <= self._first or not self._total:
             return ""
         rate = (self.done - self._first) / max(time.perf_counter() - self.started, 1e-9)
-        frames_left = max(self._total - self.done, 0) + _SHARE_AFTERWARDS * self._total
+        frames_left = max(self._total - self.done, 0) + self._share_afterwards * self._total
         return f"about {frames_left / rate:.0f} s left, "
 
     @property
