@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -84,6 +85,13 @@ class Sequence:
     def count(self) -> int | None:
         """Number of selected frames, skipped ones too, by a video's header; None where only reading on would tell."""
         return None if self.source.count is None else len(range(*self.selection.indices(self.source.count)))
+
+    @property
+    def used_count(self) -> int | None:
+        """About how many frames are used: those selected, thinned by the header's rate; repeats show on the way."""
+        rate_hz = self.source.rate_hz / (self.selection.step or 1)
+        share = 1.0 if self.choice.fps is None else min(1.0, self.choice.fps / rate_hz)
+        return None if self.count is None else math.ceil(share * self.count)
 
     @property
     def skipped(self) -> list[SkippedFrame]:

@@ -100,15 +100,15 @@ def _measure(part: _Part) -> dict[str, Any]:
     first = video.open(slice(start, min(stop, start + used * step), step))
     seen = (lambda step: times.append(time.perf_counter()),)
     reconstruct_with_report(first, video.config, folder, observers=seen, progress=progress)
-    ended, count = time.perf_counter(), whole.count
-    if count is None:
+    ended, count = time.perf_counter(), whole.used_count
+    if count is None or whole.count is None:
         return {}
     steady_s = (times[-1] - times[0]) / max(len(times) - 1, 1) + (written[0] - times[-1]) / len(times)
     fixed_s = times[0] - begun + ended - written[0]
     growing = sum(file.stat().st_size for file in folder.glob(_PER_FRAME))
     return {
         "frames": count,
-        "video_s": count * step / rate_hz,
+        "video_s": whole.count * step / rate_hz,
         "seconds": fixed_s + steady_s * count,
         "result_bytes": _bytes(folder) + int(growing * (count / len(times) - 1)),
     }

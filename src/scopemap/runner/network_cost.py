@@ -42,7 +42,7 @@ def network_cost(config: Config, sequence: Sequence) -> str:
     once_s = sum(_DEPTH_S.get(name, 0.0) for name in anchor)
     gb = _START_GB + _STAGES_GB * mpx + _FLOW_GB * mpx**2 * any(name in _FLOW_S for name in flows)
     gb += sum(_DEPTH_GB.get(name, 0.0) for name in {*anchor, *every_frame})
-    frames = sequence.count
+    frames = sequence.used_count
     all_s = "" if frames is None else f", {(once_s + frames * frame_s) / cores / 60:.0f} min for {frames} frames,"
     free_gb = _available_gb()
     free = "" if free_gb is None else f" of {free_gb:.1f} GB that are free"

@@ -71,7 +71,7 @@ def reconstruct(
     folder = None if out is None else Path(out)
     with ExitStack() as stack:
         if progress is None and in_notebook():
-            observe, progress = stack.enter_context(notebook_progress(sequence.count))
+            observe, progress = stack.enter_context(notebook_progress(sequence.used_count))
             observers += (observe,)
         progress = progress or (lambda doing, done, total: None)
         return _reconstruct(sequence, config, folder, overwrite, observers, progress, tracker)
