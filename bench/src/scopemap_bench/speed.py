@@ -155,14 +155,14 @@ def measure_speed(video: Path | None, config: Config, frames: int | None = None)
 
 def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Speed:
     sequence, clock = open_sequence(path, frames=slice(frames)), _Stopwatch()
-    calibrations = _calibrations_ms()
+    calibrations = calibrations_ms()
     started, cpu_started = time.perf_counter(), time.process_time()
     with clock.attached():
         result = reconstruct(sequence, config, out=out, overwrite=True)
     count = len(result.frames)
     cpu_ms = 1e3 * (time.process_time() - cpu_started) / count
     passed_ms = 1e3 * (time.perf_counter() - started) / count
-    calibration_ms = float(np.median(calibrations + _calibrations_ms()))
+    calibration_ms = float(np.median(calibrations + calibrations_ms()))
     size, stages = (sequence.camera.width, sequence.camera.height), clock.stages(count, calibration_ms)
     return Speed(sequence.name, count, config.preset, size, calibration_ms, cpu_ms, passed_ms, stages)
 
@@ -239,7 +239,7 @@ def resolved(place: str) -> tuple[Any, str]:
     return owner, name
 
 
-def _calibrations_ms() -> list[float]:
+def calibrations_ms() -> list[float]:
     """Return the processor times of OpenCV's DIS flow of a fixed pair of images, 320x256 px."""
     noise = np.random.default_rng(0).normal(size=(256, 340)).astype(np.float32)
     blurred = cv2.GaussianBlur(noise, (0, 0), 2.5)

@@ -3,7 +3,8 @@
     python -m scopemap_bench.scripts.overview --data FOLDER [--out FOLDER] [--only NAME ...] [--repeat N]
 
 A row is a run of the command line by a preset (`realtime` on five clips), measured by `scopemap evaluate` after a
-Sim(3) alignment. Frames per second are those of the whole command, the median of `--repeat`.
+Sim(3) alignment. Frames per second are those of the whole command, the median of `--repeat`; the time of a frame in DIS
+flows of 320x256 px, measured before each run, compares machines.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from scopemap_bench.scripts import measuring
+from scopemap_bench.speed import calibrations_ms
 
 PHANTOMS = {
     "colon phantom": ("--scene", "colon", "--frames", 120, "--seed", 11),
@@ -25,6 +27,7 @@ PHANTOMS = {
     "colon phantom, breathing": ("--scene", "colon", "--frames", 120, "--seed", 14, "--deform"),
 }
 CONSISTENCY = "true depth / depth in the path's scale: median / least / most"
+SPEED = ("frames per s", "DIS flows a frame")
 REALTIME = ("C3VD cecum_t1_a", "colon phantom", "laparoscopy phantom", "colonoscopy video", "laparoscopy video")
 
 
@@ -83,8 +86,9 @@ def drawn(clip: Clip) -> Clip:
 
 def measure(clip: Clip, preset: str, out: Path, repeat: int) -> None:
     """Run a clip `repeat` times and print its row."""
-    run, elapsed_s = clip.run_folder(out, preset), []
+    run, elapsed_s, flows_ms = clip.run_folder(out, preset), [], []
     for _ in range(repeat):
+        flows_ms += calibrations_ms()
         shutil.rmtree(run, ignore_errors=True)
         started = time.perf_counter()
         measuring.scopemap("run", clip.source, "--out", run, "--preset", preset, "--quiet", *clip.arguments)
@@ -93,7 +97,7 @@ def measure(clip: Clip, preset: str, out: Path, repeat: int) -> None:
     if clip.has_truth:
         truth = clip.truth(out / "truth" / run.name)
         figures = measuring.evaluated(run, "--truth", truth, "--align", "sim3", "--depth", "median")
-    frames = facts["frames"]
+    frames, elapsed = facts["frames"], statistics.median(elapsed_s)
     rpe = [measuring.cell(figures, ".3f", name) for name in ("rpe_10_mm", "rpe_10_deg")]
     measuring.print_row(
         clip.name if preset == "default" else f"{clip.name}, `{preset}`",
@@ -105,7 +109,8 @@ def measure(clip: Clip, preset: str, out: Path, repeat: int) -> None:
         measuring.cell(depth := figures.get("depth", {}), ".3f", "abs_rel"),
         measuring.cell(depth.get("metric_consistency", {}), ".3f", "median", "least", "most"),
         measuring.cell(figures, ".2f", "mesh_accuracy_mm"),
-        f"{frames / statistics.median(elapsed_s):.1f}",
+        f"{frames / elapsed:.1f}",
+        f"{1e3 * elapsed / frames / statistics.median(flows_ms):.1f}",
     )
 
 
@@ -117,7 +122,7 @@ def main() -> None:
     options = parser.parse_args()
     with measuring.folder_or_scratch(options.out) as out:
         heads = ("clip", "frames in the result", "submaps", "ATE RMSE mm", "rotation mean / max deg")
-        measuring.print_head(*heads, "RPE 10 mm / deg", "depth AbsRel", CONSISTENCY, "mesh to truth mm", "frames per s")
+        measuring.print_head(*heads, "RPE 10 mm / deg", "depth AbsRel", CONSISTENCY, "mesh to truth mm", *SPEED)
         known = clips(options.data, out)
         wanted = [name for name in known if any(fnmatch(name, pattern) for pattern in options.only)]
         rows = [(name, "default") for name in wanted] + [(name, "realtime") for name in wanted if name in REALTIME]
