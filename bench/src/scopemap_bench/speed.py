@@ -45,7 +45,8 @@ STAGES: dict[str, tuple[str, ...]] = {
     "correspondence": ("depth.mapis:DenseMatcher.match",),
     "perceptual distance": ("depth.perceptual:StructureDistance.compare", "depth.perceptual:LpipsAlex.compare"),
     "flow": (
-        *("flow.dis:DisFlow.estimate", "flow.dis:DisFlow.estimate_checked", "flow.dis:DisFlow.estimate_both_from"),
+        *("flow.dis:DisFlow.estimate", "flow.dis:DisFlow.estimate_small"),
+        *("flow.dis:DisFlow.estimate_checked", "flow.dis:DisFlow.estimate_both_from"),
         *("flow.raft:RaftFlow.estimate", "flow.raft:RaftFlow.estimate_both"),
     ),
     "tracking": ("tracking.tracker:Tracker.track",),

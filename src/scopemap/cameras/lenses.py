@@ -14,6 +14,7 @@ from typing import Self
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from scipy.optimize.elementwise import find_root
 
 from scopemap.cameras.camera import CameraModel, PinholeCamera
 
@@ -258,8 +259,6 @@ def _while_increasing(function: _Function, grid: np.ndarray, most: float = np.in
 
 def _invert_increasing(function: _Function, grid: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return x with function(x) = values (any shape), NaN outside the range of `function` over `grid` (ascending)."""
-    from scipy.optimize.elementwise import find_root  # loaded in a quarter of a second, and seldom needed
-
     table = function(grid)
     inside = (values >= table[0]) & (values <= table[-1])
     values = np.where(inside, values, table[0])

@@ -145,11 +145,11 @@ def run(
     chosen = {key: value for key, value in given.items() if value is not None} | options.parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)
 
+    from scopemap.io.opening import open_sequence
+
+    # The rest is loaded while the input is looked at, which loads nothing of it: imports in two threads can lock up.
     with ThreadPoolExecutor(1) as pool:
-        pool.submit(import_module, "scopemap.runner.with_report")  # while the input is looked at
-
-        from scopemap.io.opening import open_sequence
-
+        pool.submit(import_module, "scopemap.runner.with_report")
         sequence = open_sequence(
             source,
             dataset=dataset,
