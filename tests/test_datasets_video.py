@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -84,6 +85,17 @@ def test_pictures_are_turned_as_they_are_to_be_shown(
     for frame, wanted in zip(source.frames(slice(None)), expected, strict=True):
         assert np.abs(frame.rgb.astype(int) - wanted).mean() < 2
     assert all(one.shape == expected[0].shape for one in source.samples(4))
+
+
+def test_pictures_that_were_read_do_not_wait_for_the_garbage_collector(tmp_path: Path) -> None:
+    source = VideoFile(encode(tmp_path / "v.mp4", [tissue(number, (160, 96)) for number in range(12)]))
+    gc.collect()
+    gc.disable()
+    try:
+        assert sum(1 for _ in source.frames(slice(None))) == 12
+        assert sum(isinstance(one, av.VideoFrame) for one in gc.get_objects()) <= 1
+    finally:
+        gc.enable()
 
 
 def _times(file: Path) -> tuple[list[float], list[str]]:

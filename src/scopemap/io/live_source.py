@@ -11,6 +11,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.video.reformatter import VideoReformatter
 
 from scopemap.errors import InputError
 from scopemap.io.opening import open_source
@@ -138,7 +139,8 @@ def _camera(address: str) -> _Pictures:
 def _stream(address: str) -> _Pictures:
     try:
         with av.open(address, options=_STREAM_OPTIONS, timeout=_TIMEOUT_S) as container:
+            reformatter = VideoReformatter()
             for frame in container.decode(video=0):
-                yield None, frame.to_ndarray(format="rgb24")
+                yield None, reformatter.reformat(frame, format="rgb24").to_ndarray()
     except (av.FFmpegError, IndexError) as error:
         raise InputError(f"reading {address}: {error}") from None

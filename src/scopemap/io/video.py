@@ -13,6 +13,7 @@ import av
 import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
+from av.video.reformatter import VideoReformatter
 
 from scopemap.errors import InputError
 from scopemap.io.decoding import limit_in_words, most_pixels
@@ -52,8 +53,9 @@ class VideoFile(Source):
             raise InputError(f"reading the video {path}: it holds one frame, two are needed")
         if not first:
             raise InputError(f"reading the video {path}: it holds no readable frame, or pictures of {limit_in_words()}")
-        self.height, self.width = _shown(first[0]).shape[:2]
-        matrix = _display_matrix(first[0])
+        # Of one frame: a frame whose side data was looked at refers to itself, and waits for the garbage collector.
+        self._matrix = matrix = _display_matrix(first[0])
+        self.height, self.width = self._shown(first[0], VideoReformatter()).shape[:2]
         with self._opened() as container:
             stream = container.streams.video[0]
             rate_hz = float(stream.average_rate or stream.guessed_rate or 0)
@@ -76,20 +78,21 @@ class VideoFile(Source):
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames."""
+        reformatter = VideoReformatter()  # one for all frames: setting it up costs more than a frame
         for index, time_s, frame in islice(self._decoded(), *self._bounds(selection)):
-            rgb = _shown(frame)
+            rgb = self._shown(frame, reformatter)
             self._check_size(rgb, f"the video {self.path}: frame {index}")
             yield SourceFrame(index, time_s, rgb)
 
     def samples(self, count: int) -> list[np.ndarray]:
         """Return about `count` pictures (h, w, 3) uint8 from all parts of the video, where it can be entered."""
-        found: dict[int | None, np.ndarray] = {}
+        found, reformatter = dict[int | None, np.ndarray](), VideoReformatter()
         with suppress(av.FFmpegError, StopIteration), self._opened() as container:
             start, length = container.start_time or 0, container.duration or 0
             for part in range(count):
                 container.seek(start + length * part // count)
                 frame = next(container.decode(container.streams.video[0]))
-                found[frame.pts] = _shown(frame)
+                found[frame.pts] = self._shown(frame, reformatter)
         pictures = [rgb for rgb in found.values() if rgb.shape[:2] == (self.height, self.width)]
         if len(pictures) >= count // 2:
             return pictures
@@ -150,6 +153,11 @@ class VideoFile(Source):
             follow = f"these frames follow those before them at {self.rate_hz:g} frames/s"
             self._warn(f"{video} has {wrong}, first at frame {stamps.first_repaired}; {follow}")
 
+    def _shown(self, frame: VideoFrame, reformatter: VideoReformatter) -> np.ndarray:
+        """Return the picture (h, w, 3) uint8, sRGB, in the orientation in which it is to be shown."""
+        rgb = reformatter.reformat(frame, format="rgb24").to_ndarray()
+        return rgb if self._matrix is None else upright(rgb, self._matrix)
+
     def _bounds(self, selection: slice) -> tuple[int | None, int | None, int | None]:
         """Return bounds that count from the start; the header's claim serves only those from the end."""
         if all(bound is None or bound >= 0 for bound in (selection.start, selection.stop)):
@@ -157,12 +165,6 @@ class VideoFile(Source):
         if self.count is None:
             raise InputError(f"reading the video {self.path}: its length is unknown, so count frames from the start")
         return selection.indices(self.count)
-
-
-def _shown(frame: VideoFrame) -> np.ndarray:
-    """Return the picture (h, w, 3) uint8, sRGB, in the orientation in which it is to be shown."""
-    rgb, matrix = frame.to_ndarray(format="rgb24"), _display_matrix(frame)
-    return rgb if matrix is None else upright(rgb, matrix)
 
 
 def upright(rgb: np.ndarray, matrix: Sequence[int]) -> np.ndarray:
