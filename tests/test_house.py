@@ -170,8 +170,8 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 230: submaps, speed.
-    "core": (lambda: _total(MODULES), 36_945),
+    # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 235: submaps, speed.
+    "core": (lambda: _total(MODULES), 36_950),
     "core, net": (lambda: _net(MODULES), 22_725),
     "bench": (lambda: _total(BENCH_MODULES), 14_285),  # 145: lenses; 445: polyps; 235: two runs; 1195: others
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),

@@ -7,6 +7,8 @@ import numpy as np
 
 from scopemap.flow.estimator import FlowEstimator, FlowPair
 
+_MEDIUM = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM
+
 
 class DisFlow(FlowEstimator):
     """OpenCV's DIS flow on grey values, preset "medium"."""
@@ -15,15 +17,16 @@ class DisFlow(FlowEstimator):
     enough_px = 160
 
     def __init__(self) -> None:
-        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        # Flow that begins near the truth needs fewer steps, flow that checks another, or is small, fewer patches and
-        # refinements. A coarser finest scale would let wrong matches pass: poses from frame to frame were a sixth
-        # worse. Fewer refinements of all flow made the poses of a colon phantom a sixth worse.
-        self._near, self._check = (cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM) for _ in range(2))
-        for dis in (self._near, self._check):
+        self._dis = cv2.DISOpticalFlow.create(_MEDIUM)
+        # Flow that begins near the truth needs fewer steps; what checks, or is small, fewer patches; what is
+        # small fewer refinements: of all, they made a phantom's poses a sixth worse, of what checks, they lost a
+        # place seen again. A coarser finest scale lets wrong matches pass: poses from frame to frame a sixth worse.
+        self._near, self._check, self._small = (cv2.DISOpticalFlow.create(_MEDIUM) for _ in range(3))
+        for dis in (self._near, self._check, self._small):
             dis.setGradientDescentIterations(12)
         self._check.setPatchStride(5)
-        self._check.setVariationalRefinementIterations(3)
+        self._small.setPatchStride(5)
+        self._small.setVariationalRefinementIterations(3)
 
     def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
         """Return the flow (H, W, 2) float32, px, of two (H, W, 3) uint8 images of one size."""
@@ -31,7 +34,7 @@ class DisFlow(FlowEstimator):
 
     def estimate_small(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
         """Return the flow of images that are nearly alike, by fewer patches."""
-        return _computed(self._check, rgb_from, rgb_to)
+        return _computed(self._small, rgb_from, rgb_to)
 
     def estimate_checked(self, rgb_from: np.ndarray, rgb_to: np.ndarray, start: FlowPair | None = None) -> FlowPair:
         """Return the flow there, and back by fewer patches; the coarsest scale begins at `start`."""
