@@ -142,6 +142,7 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
     [
         ({"camera": {"origin": "assumed"}}, "lens is a guess"),
         (notices(Notice("mapping-not-rigid", {"merged": "", "reason": "0.98 px"})), "one rigid shape"),
+        (notices(Notice("mapping-none")), "not adjusted: no other view confirms"),
         (notices(Notice("camera-at-rest")), "hardly moves"),
         (notices(Notice("camera-distorted", {"share": 0.12})), "bends straight lines"),
         (notices(Notice("input-interlaced")), "is interlaced"),

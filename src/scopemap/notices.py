@@ -115,6 +115,11 @@ KINDS: dict[str, _Kind] = {
         "frame {most}: {share:.0%}, around {x:.2f} of the width and {y:.2f} of the height",
         "Tissue moves on its own in {frames} of {measured} frames",
     ),
+    "mapping-none": _Kind(
+        "doubtful",
+        "mapping: poses are as tracked; keyframes were not adjusted (--set mapping.method=light adjusts them)",
+        "Keyframes were not adjusted: no other view confirms depth and path",
+    ),
     "mapping-adjusted": _Kind(
         "info",
         "mapping: {keyframes} keyframes adjusted, rotations by up to {rotation_deg:.1f} deg, {loops} loops closed in "

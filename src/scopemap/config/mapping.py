@@ -40,6 +40,7 @@ MAPPING: dict[str, dict[str, Any]] = {
     "no-loops": {"min_loop_inliers": 0},
     "no-triangulation": {"triangulate_depth": False},
     "previous-keyframe-only": {"keyframe_gaps": (1,)},
+    "light": {"triangulate_depth": False, "min_loop_inliers": 0, "keyframe_gaps": (1, 2)},
     "fixed-depth": {"scale_sigma": 1e-3},
     "rigid": {"moving_tissue": False},
     "always-adjusted": {"max_sigma_px": 99.0, "max_depth_change": 9.0, "moving_tissue": False},

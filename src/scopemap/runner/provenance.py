@@ -41,9 +41,13 @@ class Limits:
     blocks: int | None = None
 
 
-def motion_notices(frames: FrameTable, config: Config) -> list[Notice]:
-    """Return whether the camera was stated to be at rest, and where and how often tissue moves on its own."""
-    found = [Notice("camera-at-rest-stated")] if config.tracking.camera_at_rest else []
+def motion_notices(frames: FrameTable, config: Config, *, confirmed: bool) -> list[Notice]:
+    """Return whether the camera was stated to be at rest, and where and how often tissue moves on its own.
+
+    confirmed : whether depth was measured, or keyframes were adjusted.
+    """
+    found = [] if confirmed else [Notice("mapping-none")]
+    found = [Notice("camera-at-rest-stated")] if config.tracking.camera_at_rest else found
     measured = frames.only(frames.tracked & (frames["moving_share"] >= 0))
     moving = int((measured["moving_share"] > _MOVING_SHARE).sum())
     if not moving:

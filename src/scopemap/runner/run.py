@@ -229,7 +229,8 @@ class _Finishing:
         agreement = check(surface_agreement, fused.mesh, fused.settings, *looking)
         fused.mesh.vertex_attributes["sigma_mm"] = check(vertex_sigmas, fused.mesh, *looking)
         provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
-        notices = self.notices + motion_notices(frames, config)
+        confirmed = pipeline.mapper.adjusts or pipeline.estimators.anchor.is_measured
+        notices = self.notices + motion_notices(frames, config, confirmed=confirmed)
         notices += [] if submap.correction is None else submap.correction.notices
         notices += [part.notice for part in (state, seen_at, depths) if part is not None] + fused.notices
         notices += [] if free_space.notice is None else [free_space.notice]
