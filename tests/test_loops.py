@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import cv2
 import numpy as np
@@ -138,6 +138,26 @@ def test_the_pose_graph_removes_drift_of_poses_and_scale() -> None:
     assert graph.log_scale[0] == 0
     np.testing.assert_allclose(graph.log_scale[-1], -np.log(scale[-1]), atol=0.05)
     np.testing.assert_array_equal(graph.T_world_camera[0], tracked[0])
+
+
+def test_drift_of_a_long_way_there_and_back_is_removed_beside_false_loops() -> None:
+    rng, turns = np.random.default_rng(0), np.arange(60)
+    steps = np.zeros((60, 6))
+    steps[:, 0], steps[:, 1], steps[:, 5] = 0.02 * np.sin(turns / 9), 0.03 * np.cos(turns / 13), 1.5
+    out = list(accumulate(map(se3_exp, steps), np.matmul, initial=np.eye(4)))
+    true, errors = np.stack([*out, *out[-2::-1]]), rng.normal(0, np.repeat([0.003, 0.03], 3), (120, 6))
+    moves = inverse(true[:-1]) @ true[1:] @ np.stack([se3_exp(error) for error in errors])
+    log_scale = np.append(0.0, np.cumsum(rng.normal(0.002, 0.012, 120)))
+    moves[:, :3, 3] *= np.exp(log_scale[:-1, None])
+    tracked = np.stack(list(accumulate(moves, np.matmul, initial=np.eye(4))))
+    line = np.column_stack([np.arange(120), np.arange(1, 121)])
+    ends = [(k, 120 - k) for k in range(0, 50, 5)]
+    loops = [replace(_loop(k, n, np.eye(4)), log_ratio=log_scale[n] - log_scale[k]) for k, n in ends]
+    false = [_loop(k, 90 - k, se3_exp(rng.normal(0, np.repeat([0.3, 8.0], 3)))) for k in (10, 20)]
+    graph = optimise_pose_graph(tracked, line, [*loops, *false], depth_mm=20.0)
+    before, after = (np.linalg.norm((T - true)[60:, :3, 3], axis=1).mean() for T in (tracked, graph.T_world_camera))
+    assert len(graph.accepted) == len(loops)
+    assert after < 0.4 * before
 
 
 def _loop(past: int, new: int, T_new_past: np.ndarray) -> Loop:

@@ -19,14 +19,15 @@ smooth part (Whittaker, "On a new method of graduation", 1923).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.sparse import bsr_matrix, csr_matrix, identity
-from scipy.sparse.linalg import spsolve
+from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags, identity
+from scipy.sparse.linalg import splu, spsolve
 from scipy.spatial.transform import Rotation
 
+from scopemap.geometry.least_squares import Options, Problem, cauchy, minimise
 from scopemap.geometry.se3 import inverse, se3
 from scopemap.mapping.loop_closure import Loop
 from scopemap.mapping.pose_interpolation import TrackedPose
@@ -37,7 +38,9 @@ _TRACKED_SIGMA = (0.01, 0.02, 0.03)
 _LOOP_SIGMA = (0.02, 0.03, 0.05)
 # Of Cauchy's loss, in standard deviations. Wide at first: after much drift a true loop has errors as large as a false.
 _TOLERANCES = (100.0, 10.0, 1.0)
-_MAX_EVALUATIONS = 20
+# Factored, not by conjugate gradients: long chains are stiff, and their steps end far too early beside false loops.
+_OPTIONS = Options(np.inf, min_step=0.0)
+_RIDGE = 1e-9  # of the unit matrix
 _MAX_LOOP_ERROR = 3.0  # root mean square, in standard deviations, of an accepted loop
 # A loop whose error as tracked exceeds this share of path length plus depth cannot be drift.
 _MAX_DRIFT_SHARE = 0.5
@@ -59,6 +62,22 @@ class PoseGraph(NamedTuple):
     T_world_camera: np.ndarray
     log_scale: np.ndarray
     accepted: np.ndarray
+
+
+class _GraphModel(NamedTuple):
+    """Model of the cost: many unknowns, of which few have edges in common."""
+
+    cost: float
+    gradient: np.ndarray
+    hessian: csc_matrix
+
+    def gauss_newton_step(self) -> np.ndarray:
+        """Return the step (n,) to the minimum."""
+        return np.asarray(splu(self.hessian).solve(-self.gradient))
+
+    def curvature(self, step: np.ndarray) -> float:
+        """Return step^T H step."""
+        return float(step @ (self.hessian @ step))
 
 
 class _Edges(NamedTuple):
@@ -153,23 +172,16 @@ def optimise_pose_graph(
         scale = s[edges.j] - s[edges.i] - edges.log_ratio
         return (np.column_stack([rotation, translation, scale]) / edges.sigma).ravel()
 
-    def jacobian(x: np.ndarray) -> csr_matrix:
-        return _jacobian(edges, *state(x), np.vstack([np.zeros(_UNKNOWNS), x.reshape(-1, _UNKNOWNS)])[:, :3])
+    def linearise(tolerance: float, x: np.ndarray) -> _GraphModel:
+        J = _jacobian(edges, *state(x), np.vstack([np.zeros(_UNKNOWNS), x.reshape(-1, _UNKNOWNS)])[:, :3])
+        error = errors(x)
+        cost, weight = cauchy(error**2, tolerance)
+        hessian = J.T @ diags(weight) @ J + _RIDGE * identity(len(x))
+        return _GraphModel(float(cost.sum()), J.T @ (weight * error), hessian.tocsc())
 
     x = np.zeros(_UNKNOWNS * (count - 1))
     for tolerance in _TOLERANCES:
-        x = least_squares(
-            errors,
-            x,
-            jacobian,
-            loss="cauchy",
-            f_scale=tolerance,
-            ftol=1e-4,
-            max_nfev=_MAX_EVALUATIONS,
-            tr_solver="lsmr",
-            # Long chains are stiff: with lsmr's own tolerances steps end far too early.
-            tr_options={"atol": 1e-12, "btol": 1e-12, "maxiter": 1000},
-        ).x
+        x = minimise(Problem(partial(linearise, tolerance), np.add), x, _OPTIONS).state
     R, p, s = state(x)
     poses = [se3(rotation, depth_mm * position) for rotation, position in zip(R.as_matrix(), p, strict=True)]
     loop_error = np.linalg.norm(errors(x).reshape(-1, _UNKNOWNS)[len(neighbours) :], axis=1) / np.sqrt(_UNKNOWNS)
