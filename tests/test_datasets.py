@@ -78,10 +78,10 @@ def test_frames_are_decoded_one_at_a_time(tmp_path: Path) -> None:
 
 def test_an_unknown_camera_is_assumed_from_the_field_of_view_and_can_be_bettered(tmp_path: Path) -> None:
     for i in range(2):
-        save(tmp_path / f"{i}.png", picture(i, (800, 480)))
+        save(tmp_path / f"{i}.png", picture(i, (800, 600)))
     sequence = open_sequence(tmp_path, fov_deg=90.0)
     found = sequence.camera
-    np.testing.assert_allclose([found.fx, found.fy, found.cx, found.cy], [200.0, 200.0, 199.5, 119.5])
+    np.testing.assert_allclose([found.fx, found.fy, found.cx, found.cy], [200.0, 200.0, 199.5, 149.5])
     assert "90 deg" in sequence.camera_source
     assert any("field of view" in note for note in sequence.notes)
     better = sequence.with_focal(300.0, "estimated by a network")
@@ -104,7 +104,7 @@ def test_a_calibration_file_wins_and_is_said(tmp_path: Path) -> None:
 def test_the_working_size_is_chosen_or_given(tmp_path: Path) -> None:
     for i in range(2):
         save(tmp_path / f"{i}.png", picture(i, (800, 600)))
-    assert open_sequence(tmp_path).size_source == "372x279 px chosen for input of 800x600 px"
+    assert open_sequence(tmp_path).size_source == "400x300 px chosen for input of 800x600 px"
     given = open_sequence(tmp_path, size=(200, 150))
     assert (given.camera.width, given.camera.height) == (200, 150)
     assert "given" in given.size_source

@@ -13,18 +13,13 @@ from scopemap.cameras.camera import CameraModel, PinholeCamera, source_pixel
 from scopemap.errors import CalibrationError, check_shape
 
 LONGEST_SIDE_PX = 400
-_MOST_SHARE = 0.65  # of the longest side's square: most pixels, so that a square picture costs as much as any other
 _BLUR_PER_SHRINK = 0.4
 
 
 def working_size(width: int, height: int, longest_side_px: int = LONGEST_SIDE_PX) -> tuple[int, int]:
-    """Return (width, height) divided by the least whole number that brings both to the longest side, rounded down.
-
-    What would still have more than 0.65 of that side's square of pixels is divided by more, to so many. 0: the same.
-    """
+    """Return (width, height) divided, rounded down, by the least whole number that brings both to the longest side."""
     divisor = -(-max(width, height) // longest_side_px) if longest_side_px else 1
-    shrink = max(divisor, math.sqrt(width * height / (_MOST_SHARE * longest_side_px**2 or math.inf)))
-    return int(width / shrink), int(height / shrink)
+    return width // divisor, height // divisor
 
 
 def working_camera(source: CameraModel, size: tuple[int, int], zoom: float = 1.0) -> PinholeCamera:

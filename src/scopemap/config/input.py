@@ -58,8 +58,7 @@ class InputSettings(Settings):
         400,
         ge=0,
         description="longest side of the working size unless that is given (--size): the input's is divided by the "
-        "smallest whole number that brings it to this, px, and what still has more than 0.65 of its square of "
-        "pixels is made smaller, to so many; 0: the input's size",
+        "smallest whole number that brings it to this, px; 0: the input's size",
     )
     fps: float | None = Field(None, gt=0, description="maximum frames per second, by the time stamps")
     skip_duplicates: bool = Field(

@@ -84,8 +84,9 @@ def _at_default_size(sequence: Sequence) -> Sequence:
     """Return the sequence at the default working size or smaller: larger images cost more and add little."""
     source = sequence.rectifier.source
     size = working_size(source.width, source.height)
-    smaller = max(size) < max(sequence.camera.width, sequence.camera.height)
-    return replace(sequence, rectifier=Rectifier(source, working_camera(source, size))) if smaller else sequence
+    if max(size) >= max(sequence.camera.width, sequence.camera.height):
+        return sequence
+    return replace(sequence, rectifier=Rectifier(source, working_camera(source, size)))
 
 
 def _kept(sequence: Sequence, config: Config) -> Iterator[Frame]:
