@@ -94,6 +94,8 @@ def phantom_cases() -> list[Case]:
         lens = stated(160 / np.tan(np.radians(view_deg / 2)))
         changes.append(("another lens's field of view", f"view{view_deg}", lens))
     changes += [("frames dropped", f"every{step}", ("--frames", f"::{step}")) for step in (4, 6)]
+    fast = ("--preset", "realtime")
+    changes += [("realtime", "fast", fast), ("realtime, light", "light", (*fast, "--set", "mapping.method=light"))]
     changes.append(("calibration of another size", "small", stated(160 / 1.5)))
     changes.append(("calibration of another size", "large", stated(320, 319.5, 255.5)))
     for (group, name, words), scene, seed in product(changes, SCENES, SEEDS):
