@@ -170,14 +170,14 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 255: submaps, speed, graph
-    "core": (lambda: _total(MODULES), 36_970),
-    "core, net": (lambda: _net(MODULES), 22_735),
+    # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 265: submaps, speed, graph
+    "core": (lambda: _total(MODULES), 36_980),
+    "core, net": (lambda: _net(MODULES), 22_745),
     "bench": (lambda: _total(BENCH_MODULES), 14_285),  # 145: lenses; 445: polyps; 235: two runs; 1195: others
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 35_220),  # 190: lesions, live map; of these; 230: a network at rest; 70: merging
+    "tests": (lambda: _total(TESTS), 35_235),  # 190: lesions, live map; of these; 230: a network at rest; 70: merging
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 103),
-    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 15_205),
+    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 15_215),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),
     "settings": (lambda: len(setting_names()), 46),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from scopemap.config import MappingSettings
 from scopemap.config.mapping import MappingConstants
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import REGIONS, Frame, rows_in_memory
-from scopemap.fusion.frame_store import FrameStore
+from scopemap.fusion.frame_store import FrameStore, SpreadFrames
 from scopemap.mapping import Backend
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.submaps import Mapper
@@ -80,6 +81,18 @@ def test_a_frame_leaves_little_in_memory(tmp_path: Path) -> None:
 
     # Measures of sharpness, 24 bytes, in an array that grows by a quarter.
     assert _bytes_each(put, 3000, 1000) < 100
+
+
+def test_frames_kept_to_check_the_surface_of_a_map_leave_little_in_memory(tmp_path: Path) -> None:
+    store, maps, view = FrameStore(tmp_path), list[SpreadFrames](), plane_scene.frame(plane_scene.pose())
+
+    def put(number: int) -> None:
+        maps.append(SpreadFrames())
+        for k in range(20):
+            maps[-1].put(replace(view, index=20 * number + k), store)
+
+    assert _bytes_each(put, 30, 10) < 0.1 * view.rgb.nbytes
+    assert [frame.index for frame in maps[1].frames(store)] == list(range(20, 40, 2))
 
 
 def test_a_keyframe_leaves_little_in_memory(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from scopemap.frame import REGIONS, Frame, Rows
 _LOG_STEP, _MIN_MM = 3e-4, 1e-4
 _MAX_CODE = 65535
 _CHECKED_AT_ONCE = 1 << 20
+_MOST_SPREAD = 16  # frames of a submap at which its surface is rendered again
 # Colours only paint the mesh: JPEG takes a fifth of the time and half of the space of a lossless format.
 _COLOUR_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
@@ -291,6 +292,30 @@ class FrameStore:
             nonrigidity=entry["nonrigidity"].copy(),
             quality=float(entry["quality"]),
         )
+
+
+class SpreadFrames:
+    """Every n-th of the frames with a pose that are put in, at most `_MOST_SPREAD`; n doubles as they grow more."""
+
+    def __init__(self) -> None:
+        self._kept: list[Frame | int] = []
+        self._every, self._count = 1, 0
+
+    def put(self, frame: Frame, store: FrameStore | None = None) -> None:
+        """Keep or skip a frame; store : where it is kept, as those of many maps fill the memory."""
+        if frame.T_world_camera is None:
+            return
+        if self._count % self._every == 0:
+            if store is not None:
+                store.put(frame)
+            self._kept.append(frame if store is None else frame.index)
+        self._count += 1
+        if len(self._kept) > _MOST_SPREAD:
+            self._kept, self._every = self._kept[::2], 2 * self._every
+
+    def frames(self, store: FrameStore) -> list[Frame]:
+        """Return the frames that are kept, in memory or in the store."""
+        return [store.frame(one) if isinstance(one, int) else one for one in self._kept]
 
 
 def _median_depth_mm(frame: Frame) -> float:

@@ -17,6 +17,7 @@ from numba.core.event import TimingListener, register
 from scopemap.frame import Frame
 from scopemap.fusion.agreement import surface_agreement, vertex_sigmas
 from scopemap.fusion.finish import finished, with_normals_alone
+from scopemap.fusion.frame_store import SpreadFrames
 from scopemap.fusion.free_space import FreeSpace, views_among
 from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
 from scopemap.fusion.reference_state import SurfaceState
@@ -42,7 +43,6 @@ Progress = Callable[[str, int, int], None]
 """Called with what is done outside of tracking (such as "fusing"), frames done, and all frames; 0: not in frames."""
 FrameWriter = Callable[[Frame], None]
 """Writes something of a frame whose depth is final."""
-_CHECKED_FRAMES = 16  # most frames of a submap at which its surface is rendered again
 _Item = TypeVar("_Item")
 _END = object()
 _COMPILING = TimingListener()
@@ -140,7 +140,7 @@ class Run:
             for write in self.writers:
                 write(step.frame)
         if fusion.at_once:
-            self.checked[step.track.map].put(step.frame)
+            self.checked[step.track.map].put(step.frame, fusion.store if limits.maps is None else None)
         self.frames.append(step.row)
         for number in self.kept_maps.beyond(step.track, is_full=fusion.is_full):
             fusion.forget(number)
@@ -188,7 +188,8 @@ class _Finishing:
         submaps, notices = clock.timed("back end", pipeline.mapper.submaps)
         results = [self._fused(number, submaps) for number in range(len(submaps))]
         submapped = {index for submap in submaps for index in submap.frames}
-        for frame in pipeline.fusion.store.frames(set(frames["index"].tolist()) - submapped):
+        apart = set(frames["index"].tolist()) - submapped if pipeline.fusion.at_end else set()
+        for frame in pipeline.fusion.store.frames(apart):
             self._write(frame)  # as tracked
         results[0].provenance["notices"] += [notice.as_json() for notice in pipeline.notices + notices]
         return replace(results[0], others=results[1:])
@@ -208,7 +209,7 @@ class _Finishing:
             triangulated = None if depths is None else depths.depth
             corrected = in_thread(final.frames(triangulated, free_space.without), "correct")
             # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
-            median_mm = store.median_depth_mm(submap.main_frames, submap.depth_factor)
+            median_mm = store.median_depth_mm(submap.main_frames if pipeline.fusion.at_end else (), submap.depth_factor)
             moving = MovingTissue(block_edge_mm(median_mm))
             state, seen_at = None if states is None else SurfaceState(states), None
             if at_s is not None:
@@ -225,7 +226,7 @@ class _Finishing:
                 fused: FusedSurface = self.run.clock.timed("fuse", pipeline.fusion.fuse, seen, median_mm, submap.main)
         fused = replace(fused, mesh=self.run.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
         fused.mesh.vertex_attributes["moving"] = moving.shares(fused.mesh.vertices).astype(np.float32)
-        looking, check = (checked.frames, states), partial(self.run.clock.timed, "check surface")
+        looking, check = (checked.frames(store), states), partial(self.run.clock.timed, "check surface")
         agreement = check(surface_agreement, fused.mesh, fused.settings, *looking)
         fused.mesh.vertex_attributes["sigma_mm"] = check(vertex_sigmas, fused.mesh, *looking)
         provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
@@ -299,24 +300,6 @@ def _states(submap: Submap, tracked: FrameTable, at_s: float | None) -> TissueSt
     curves = np.column_stack([np.interp(index, correction.index, curve) for curve in motion.basis.T])
     states = TissueStates(motion.nodes, motion.modes, index, tracked["time_s"], curves, curves[0])
     return states.with_reference(at_s)
-
-
-class SpreadFrames:
-    """Every n-th of the frames with a pose that are put in, at most `_CHECKED_FRAMES`; n doubles as they grow more."""
-
-    def __init__(self) -> None:
-        self.frames: list[Frame] = []
-        self._every, self._count = 1, 0
-
-    def put(self, frame: Frame) -> None:
-        """Keep or skip a frame."""
-        if frame.T_world_camera is None:
-            return
-        if self._count % self._every == 0:
-            self.frames.append(frame)
-        self._count += 1
-        if len(self.frames) > _CHECKED_FRAMES:
-            self.frames, self._every = self.frames[::2], 2 * self._every
 
 
 class Clock:
