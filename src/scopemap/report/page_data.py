@@ -218,8 +218,8 @@ def _pose_of(submap: RunFolder) -> dict[int, np.ndarray]:
 
 
 def _pictures(run: RunFolder) -> list[_Picture]:
-    used = {index: row for row, index in enumerate(run.frames["index"].tolist()) if run.frames.place[row] != NOT_USED}
-    found = []
+    rows = np.flatnonzero(run.frames.place != NOT_USED)
+    used, found = dict(zip(run.frames["index"][rows].tolist(), rows.tolist(), strict=True)), []
     for index in run.pictured:
         picture, mask = run.picture_file(index), run.mask_file(index)
         if index in used and mask.is_file():
