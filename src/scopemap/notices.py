@@ -117,7 +117,7 @@ KINDS: dict[str, _Kind] = {
     ),
     "mapping-none": _Kind(
         "doubtful",
-        "mapping: poses are as tracked; keyframes were not adjusted (--set mapping.method=light adjusts them)",
+        "mapping: poses are as tracked; keyframes were not adjusted (--set mapping.method=light adjusts them, by flow)",
         "Keyframes were not adjusted: no other view confirms depth and path",
     ),
     "mapping-adjusted": _Kind(
