@@ -117,8 +117,17 @@ KINDS: dict[str, _Kind] = {
     ),
     "mapping-none": _Kind(
         "doubtful",
-        "mapping: poses are as tracked; keyframes were not adjusted (--set mapping.method=light adjusts them, by flow)",
+        "mapping: poses are as tracked; keyframes were not adjusted (--set mapping.method=local adjusts them, by flow)",
         "Keyframes were not adjusted: no other view confirms depth and path",
+    ),
+    "mapping-local": _Kind(
+        "info", "mapping: {adjusted} keyframes adjusted as they came, each with those before it; {refused} as tracked"
+    ),
+    "mapping-local-not-rigid": _Kind(
+        "doubtful",
+        "mapping: {adjusted} keyframes adjusted as they came, {refused} as tracked: there the scene is not rigid or "
+        "the focal length is wrong",
+        "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed",
     ),
     "mapping-adjusted": _Kind(
         "info",

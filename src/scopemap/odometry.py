@@ -11,7 +11,9 @@ from scopemap.config import Config
 from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.faults import StageFaults
 from scopemap.frame import Frame
+from scopemap.mapping.local_adjustment import LocalAdjustment
 from scopemap.mapping.submaps import Mapper
+from scopemap.notices import Notice
 from scopemap.preprocessing import PreprocessedFrame, with_depth, with_unknown_depth, without_depth
 from scopemap.tracking.relocalisation import RotationFollower
 from scopemap.tracking.smoothing import Wema
@@ -44,16 +46,21 @@ class Step:
 
 
 class Odometry:
-    """Tracks frames, in order, each once, and hands keyframes to the mapper."""
+    """Tracks frames, in order, each once, and hands keyframes to the mapper.
+
+    local : adjusts keyframes of predicted depth as they come; None: they are as tracked.
+    """
 
     STATE: ClassVar = (
         *("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_last_frame"),
-        *("faults", "_rotation"),
+        *("faults", "_rotation", "_local"),
     )
     """What changes from frame to frame."""
 
-    def __init__(self, config: Config, tracker: FrameTracker, mapper: Mapper) -> None:
-        self._config, self._tracker, self.mapper = config, tracker, mapper
+    def __init__(
+        self, config: Config, tracker: FrameTracker, mapper: Mapper, local: LocalAdjustment | None = None
+    ) -> None:
+        self._config, self._tracker, self.mapper, self._local = config, tracker, mapper, local
         self._mapis = Mapis(config.mapis)
         self._smooth = Wema(config.smoothing)
         self._rotation = RotationFollower()
@@ -95,7 +102,7 @@ class Odometry:
         if preprocessed.kind == "depth":  # disparity has a scale of its own in every frame
             frame = replace(frame, depth_scale=refined.scale)
         self._add_last_keyframe(track)
-        track = self._with_keyframe(track, frame, preprocessed)
+        track, frame = self._with_keyframe(track, frame, preprocessed)
         if track.status == "lost":
             self._reset()
         else:
@@ -118,6 +125,10 @@ class Odometry:
         unknown_mm = np.asarray(with_unknown_depth(preprocessed.small).depth_mm)
         refined, frame = RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm), preprocessed.frame
         return Step(frame, track, np.asarray(frame.depth_mm), refined, preprocessed.skipped)
+
+    def notices(self, map_number: int) -> list[Notice]:
+        """Return what was adjusted of a map as it came; [] where nothing was."""
+        return [] if self._local is None else self._local.notices(map_number)
 
     def new_tracker(self) -> FrameTracker | None:
         """Return a tracker that has seen no frame, to track lost frames anew; None where the tracker cannot."""
@@ -144,25 +155,40 @@ class Odometry:
         """Hand on the frame that was tracked last where the tracker made it the keyframe of this one."""
         if track.status == "ok" and self._last_frame is not None and self._last_frame[1].index == track.keyframe:
             self.mapper.add_keyframe(*self._last_frame)
+            if self._local is not None:
+                self._local.take_over(track.keyframe, self._last_frame[1].keyframe)
             self._last_frame = None
 
-    def _with_keyframe(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> Track:
-        """Make a frame the keyframe where one is due; the first one of a map that cannot be one is lost."""
+    def _with_keyframe(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> tuple[Track, Frame]:
+        """Make a frame the keyframe where one is due; return both, adjusted where keyframes are, as they come.
+
+        The first frame of a map that cannot be a keyframe is lost.
+        """
         if track.status == "lost":
-            return track
-        keyframe, kind = replace(frame, T_world_camera=track.T_world_camera), preprocessed.kind
-        if not self._tracker.needs_keyframe():
+            return track, frame
+        kind, due, number = preprocessed.kind, self._tracker.needs_keyframe(), track.keyframe
+        keyframe = replace(frame, T_world_camera=track.T_world_camera)
+        if self._local is not None and kind != "measured":
+            local = self._local
+            keyframe = local.adjusted(keyframe, number, track.map) if due else local.corrected(keyframe, number)
+        frame, track = replace(keyframe, T_world_camera=None), replace(track, T_world_camera=_pose(keyframe))
+        if not due:
             if kind != "measured" and self._tracker.remember(keyframe):
                 self._last_frame = keyframe, track
-            return track
+            return track, frame
         measured = kind == "measured" and not self._mapis.needs_previous(kind)  # not after MAPIS changed it
         inserted = self._tracker.insert_keyframe(keyframe, measured=measured)
         if inserted and kind != "measured":  # with measured depth tracking alone is better
             self.mapper.add_keyframe(keyframe, track)
         if track.status == "initial" and not inserted:
             unknown = preprocessed.depth_note or "too little of its depth is known to start from (black or constant?)"
-            return replace(track, status="lost", reason=unknown, cause=LossCause.OTHER)
-        return track
+            return replace(track, status="lost", reason=unknown, cause=LossCause.OTHER), frame
+        return track, frame
+
+
+def _pose(keyframe: Frame) -> np.ndarray:
+    assert keyframe.T_world_camera is not None
+    return keyframe.T_world_camera
 
 
 def _motion(correspondence: DenseCorrespondence | None) -> float:

@@ -18,6 +18,7 @@ from scopemap.faults import notices_of_faults
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
 from scopemap.fusion.surface_fusion import SurfaceFusion
+from scopemap.mapping.local_adjustment import LocalAdjustment
 from scopemap.mapping.submaps import Mapper
 from scopemap.notices import Notice
 from scopemap.odometry import Odometry, Step
@@ -51,8 +52,10 @@ class Pipeline:
         mapping = config.mapping.model_copy(update=at_rest)
         features, anchored = estimators.features, config.depth.is_anchored
         mapper = Mapper(mapping, estimators.keyframe_flow, store.table, features, anchored)
-        self.odometry = Odometry(config, tracker, mapper)
-        self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.method != "none")
+        local = mapping.constants.local_window and estimators.keyframe_flow.name != "none"
+        adjustment = LocalAdjustment(mapping, estimators.keyframe_flow) if local else None
+        self.odometry = Odometry(config, tracker, mapper, adjustment)
+        self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.at_end)
 
     @property
     def stages(self) -> dict[str, Preprocessing | Matching | Odometry]:

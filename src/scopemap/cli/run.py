@@ -170,7 +170,7 @@ def run(
         discard_unfinished(out)
     if not (quiet or as_json or missing_weights(resolved)) and (cost := network_cost(resolved, sequence)):
         typer.echo(cost, err=True)
-    shows = run_progress(sequence.used_count, silent=quiet or as_json, adjusts=resolved.mapping.method != "none")
+    shows = run_progress(sequence.used_count, silent=quiet or as_json, adjusts=resolved.mapping.at_end)
     with shows as shown, Interruption() as interruption:
         seen = (*shown.observers, interruption.observe)
         result = reconstruct_with_report(

@@ -19,6 +19,9 @@ class MappingConstants:
     # False: depth as predicted, corrected at the keyframes' corners.
     triangulate_depth: bool = True
     keyframe_gaps: tuple[int, ...] = (1, 2, 3, 5, 8, 16, 32)  # a keyframe's corners are matched in those so many before
+    # Keyframes that each new one is adjusted with, itself among them, before frames are tracked against it; 0: all are
+    # adjusted after the last frame.
+    local_window: int = 0
     # So many observations count as one: errors of flow are alike at neighbouring corners.
     correlated_observations: float = 4.0
     depth_sigma_share: float = 0.2  # standard deviation that every estimated depth has at least, over the depth
@@ -40,7 +43,7 @@ MAPPING: dict[str, dict[str, Any]] = {
     "no-loops": {"min_loop_inliers": 0},
     "no-triangulation": {"triangulate_depth": False},
     "previous-keyframe-only": {"keyframe_gaps": (1,)},
-    "light": {"triangulate_depth": False, "min_loop_inliers": 0, "keyframe_gaps": (1, 2)},
+    "local": {"triangulate_depth": False, "min_loop_inliers": 0, "keyframe_gaps": (1, 2), "local_window": 5},
     "fixed-depth": {"scale_sigma": 1e-3},
     "rigid": {"moving_tissue": False},
     "always-adjusted": {"max_sigma_px": 99.0, "max_depth_change": 9.0, "moving_tissue": False},
@@ -53,10 +56,16 @@ class MappingSettings(StageSettings):
     METHODS = MAPPING
     method: str = Field(
         "full",
-        description="none: poses as tracked, frame by frame; full: all keyframes adjusted at the end, where depth is "
-        "predicted (measured depth tracks as well or better without)",
+        description="none: poses as tracked, frame by frame; local: each keyframe adjusted as it comes, with those "
+        "before it; full: all adjusted at the end. Where depth is predicted: measured depth tracks as well or better "
+        "without",
     )
     constants: MappingConstants = constants_of(MappingConstants(), MAPPING)
+
+    @property
+    def at_end(self) -> bool:
+        """Whether keyframes are adjusted after the last frame."""
+        return self.method != "none" and not self.constants.local_window
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fusion.truncation_mm": 5.0,
         "fusion.max_depth_mm": 100.0,
         "fusion.every": 2,
-        "mapping.method": "none",
+        "mapping.method": "local",
     },
 }

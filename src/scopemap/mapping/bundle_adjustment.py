@@ -48,7 +48,8 @@ WINDOW = 300
 _RESIDUAL_SIGMA = np.array([0.3, 0.2, 0.2])  # prior standard deviations of ln f, and of the principal point over f
 _RESIDUAL_DEPTH = 3.0  # factor of the estimated depth's deviation there: errors of a network bend the lens, too
 _SIGNIFICANT = 5.0  # standard deviations: a right lens of a real clip had 3.4, the least noticed wrong one 6.7
-_HELD_SIGMA = 0.01  # least standard deviation of ln depth of points that an earlier window adjusted
+HELD_SIGMA = 0.01
+"""Least standard deviation of ln depth of points that an earlier window adjusted."""
 
 
 class BundleSolution(NamedTuple):
@@ -113,7 +114,7 @@ def _with_window(problem: BundleProblem, found: BundleSolution, first: int, end:
     place[keyframes] = np.arange(len(keyframes))
     known, log_scale = points.host[own] < first, state.log_scale[points.host[own]]
     log_depth = np.where(known, state.log_depth[own] - log_scale, points.log_depth[own])
-    sigma = np.where(known, np.clip(found.log_depth_sigma[own], _HELD_SIGMA, points.sigma[own]), points.sigma[own])
+    sigma = np.where(known, np.clip(found.log_depth_sigma[own], HELD_SIGMA, points.sigma[own]), points.sigma[own])
     part = replace(
         problem,
         T_camera_world=problem.T_camera_world[keyframes],

@@ -10,9 +10,10 @@ surface must agree on it (`depth_disagreement`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import cv2
 import numpy as np
@@ -87,7 +88,8 @@ def fit_depth_correction(
     variance, target = sigma[known] ** 2 + _MIN_SIGMA**2, error[known]
     prior, weight = _prior(step_sigma), 1 / variance
     for _ in range(_ITERATIONS):
-        values = np.linalg.solve((prior + at.T @ sparse.diags(weight) @ at).toarray(), at.T @ (weight * target))
+        normal = prior + (at.T @ at.multiply(weight[:, None])).toarray()
+        values = np.linalg.solve(normal, at.T @ (weight * target))
         residual = at @ values - target
         weight = 1 / (variance + (residual / _CAUCHY) ** 2)
     return DepthCorrectionField(np.clip(values, -MAX_LOG_FACTOR, MAX_LOG_FACTOR).reshape(_SHAPE), nearest, farthest)
@@ -180,15 +182,16 @@ def _interpolation(position: np.ndarray, level: np.ndarray) -> sparse.csr_matrix
     coordinates = (y * (ROWS - 1), x * (COLUMNS - 1), level)
     below = [np.minimum(c.astype(int), nodes - 2) for c, nodes in zip(coordinates, _SHAPE, strict=True)]
     share = [c - b for c, b in zip(coordinates, below, strict=True)]
-    matrix = sparse.csr_matrix((len(level), ROWS * COLUMNS * LEVELS))
-    for corner in np.ndindex(2, 2, 2):
-        node = np.ravel_multi_index([b + c for b, c in zip(below, corner, strict=True)], _SHAPE)
-        weight = np.prod([s if c else 1 - s for s, c in zip(share, corner, strict=True)], axis=0)
-        matrix += sparse.csr_matrix((weight, (np.arange(len(level)), node)), shape=matrix.shape)
-    return matrix
+    corners = list(np.ndindex(2, 2, 2))
+    nodes = [np.ravel_multi_index([b + c for b, c in zip(below, corner, strict=True)], _SHAPE) for corner in corners]
+    weights = [np.prod([s if c else 1 - s for s, c in zip(share, corner, strict=True)], axis=0) for corner in corners]
+    starts = np.arange(0, len(corners) * len(level) + 1, len(corners))
+    entries = np.column_stack(weights).ravel(), np.column_stack(nodes).ravel(), starts
+    return sparse.csr_matrix(entries, shape=(len(level), math.prod(_SHAPE)))
 
 
-def _prior(step_sigma: float) -> sparse.csr_matrix:
+@cache
+def _prior(step_sigma: float) -> np.ndarray:
     """Normal matrix (nodes, nodes) of the prior: neighbouring nodes are similar, all are near 0."""
     number = np.arange(ROWS * COLUMNS * LEVELS).reshape(_SHAPE)
     prior = sparse.identity(number.size, format="csr") / (_SIZE_SHARE * step_sigma) ** 2
@@ -199,4 +202,5 @@ def _prior(step_sigma: float) -> sparse.csr_matrix:
             (np.append(ones, -ones), (np.append(rows, rows), np.append(after, before))), shape=(len(rows), number.size)
         )
         prior += step.T @ step / (share * step_sigma) ** 2
-    return prior
+    found: np.ndarray = prior.toarray()
+    return found

@@ -72,7 +72,7 @@ class FeatureTracks:
         self.settings, self._flow = settings.constants, flow
         self._recent: dict[int, deque[_FlowKeyframe]] = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
-        self._keyframe_count = 0
+        self.keyframe_count = 0
         self._camera: PinholeCamera | None = None
 
     def add(self, keyframe: Frame, map_number: int = 0) -> None:
@@ -83,7 +83,7 @@ class FeatureTracks:
         self._camera = keyframe.camera
         log_depth = np.log(keyframe.depth_mm[rows, columns].astype(np.float64))
         share = relative_sigma(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
-        first = self._add_points(self._keyframe_count, corners, log_depth, np.nan_to_num(share, nan=0.0))
+        first = self._add_points(self.keyframe_count, corners, log_depth, np.nan_to_num(share, nan=0.0))
         # The map that was used last is the last one.
         recent = self._recent[map_number] = self._recent.pop(map_number, deque(maxlen=max(self.settings.keyframe_gaps)))
         for oldest in [*self._recent][:-_MOST_MAPS]:
@@ -95,10 +95,10 @@ class FeatureTracks:
             for past in others:
                 past.composed = None
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
-        new = _FlowKeyframe(self._keyframe_count, number_in_map, _slim(keyframe), corners, first)
+        new = _FlowKeyframe(self.keyframe_count, number_in_map, _slim(keyframe), corners, first)
         self._match_with(recent, new)
         recent.append(new)
-        self._keyframe_count += 1
+        self.keyframe_count += 1
 
     def _match_with(self, recent: deque[_FlowKeyframe], new: _FlowKeyframe) -> None:
         """Match a new keyframe both ways with recent ones of its map, the latest first."""
@@ -147,8 +147,8 @@ class FeatureTracks:
         keyframes : increasing numbers of the keyframes that are used, None: all. The result numbers keyframes by their
         place in it. most_observations : above about so many only every n-th point is returned.
         """
-        new_number = np.full(self._keyframe_count, -1)
-        chosen = range(self._keyframe_count) if keyframes is None else keyframes
+        new_number = np.full(self.keyframe_count, -1)
+        chosen = range(self.keyframe_count) if keyframes is None else keyframes
         new_number[list(chosen)] = np.arange(len(chosen))
         points, matches = self._points.read(), self._matches.read()
         point, keyframe = matches["point"], new_number[matches["keyframe"]]
@@ -164,6 +164,18 @@ class FeatureTracks:
         pixel, log_depth, sigma = (points[name][by_host] for name in ("pixel", "log_depth", "sigma"))
         observed = Observations(place[point][order], keyframe[order], self._centred(matches["pixel"][order]))
         return Points(host[by_host], pixel, log_depth, sigma), observed
+
+    def keep_last(self, count: int) -> None:
+        """Forget the points of all keyframes but the last `count`, not fewer than are matched with the next one."""
+        points, matches = self._points.read(), self._matches.read()
+        gone = int(np.searchsorted(points["host"], self.keyframe_count - count))
+        matches = matches[matches["point"] >= gone]
+        matches["point"] -= gone
+        self._points.keep(np.arange(len(points)) >= gone)
+        self._matches.keep(np.zeros(len(self._matches), bool))
+        self._matches.append(matches)
+        for past in (past for recent in self._recent.values() for past in recent):
+            past.first_point -= gone
 
     def _add_points(self, keyframe: int, pixels: np.ndarray, log_depth: np.ndarray, share: np.ndarray) -> int:
         """Add points at pixels (n, 2), with relative deviation of depth `share` (n,); return the first's number."""

@@ -183,7 +183,7 @@ class _Finishing:
         frames, pipeline, clock = self.frames, self.run.pipeline, self.run.clock
         check_tracked(frames, self.run.sequence.path)
         clock.timed("track backwards", track_backwards, pipeline, frames)
-        if pipeline.config.mapping.method != "none":
+        if pipeline.config.mapping.at_end:
             self.run.progress("adjusting keyframes", 0, 0)
         submaps, notices = clock.timed("back end", pipeline.mapper.submaps)
         results = [self._fused(number, submaps) for number in range(len(submaps))]
@@ -230,9 +230,9 @@ class _Finishing:
         agreement = check(surface_agreement, fused.mesh, fused.settings, *looking)
         fused.mesh.vertex_attributes["sigma_mm"] = check(vertex_sigmas, fused.mesh, *looking)
         provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
-        confirmed = pipeline.mapper.adjusts or pipeline.estimators.anchor.is_measured
-        notices = self.notices + motion_notices(frames, config, confirmed=confirmed)
-        notices += [] if submap.correction is None else submap.correction.notices
+        adjusted = pipeline.odometry.notices(submap.main) if submap.correction is None else submap.correction.notices
+        confirmed = bool(adjusted) or pipeline.estimators.anchor.is_measured
+        notices = self.notices + motion_notices(frames, config, confirmed=confirmed) + adjusted
         notices += [part.notice for part in (state, seen_at, depths) if part is not None] + fused.notices
         notices += [] if free_space.notice is None else [free_space.notice]
         masks, known_mm = pipeline.estimators.masks, self.frames["median_depth_mm"]

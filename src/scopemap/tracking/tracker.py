@@ -191,6 +191,7 @@ class Tracker(FrameTracker):
         if keyframe is None:
             return False
         self._use_keyframe(keyframe)
+        self._motion.T_world_last = frame.T_world_camera  # it may have been adjusted
         self._relocaliser.add(keyframe)
         self._earlier_keyframes.append(replace(frame, depth_sigma_mm=None))
         self._choice.begin()

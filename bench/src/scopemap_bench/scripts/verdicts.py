@@ -95,7 +95,7 @@ def phantom_cases() -> list[Case]:
         changes.append(("another lens's field of view", f"view{view_deg}", lens))
     changes += [("frames dropped", f"every{step}", ("--frames", f"::{step}")) for step in (4, 6)]
     fast = ("--preset", "realtime")
-    changes += [("realtime", "fast", fast), ("realtime, light", "light", (*fast, "--set", "mapping.method=light"))]
+    changes += [("realtime", "fast", fast), ("realtime, as tracked", "plain", (*fast, "--set", "mapping.method=none"))]
     changes.append(("calibration of another size", "small", stated(160 / 1.5)))
     changes.append(("calibration of another size", "large", stated(320, 319.5, 255.5)))
     for (group, name, words), scene, seed in product(changes, SCENES, SEEDS):

@@ -1,0 +1,182 @@
+"""Local bundle adjustment: each new keyframe with the few before it, before frames are tracked against it.
+
+What ORB-SLAM's local mapping does, but in the tracker's thread, so that a result does not depend on the machine. Frames
+that are tracked against a keyframe take over the correction of its depth. Loops are not closed, maps not merged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.cameras.camera import PinholeCamera
+from scopemap.config import MappingSettings
+from scopemap.flow.estimator import FlowEstimator
+from scopemap.frame import Frame
+from scopemap.geometry.se3 import inverse
+from scopemap.mapping.backend import contradiction
+from scopemap.mapping.bundle_adjustment import HELD_SIGMA, BundleSolution, adjust
+from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State
+from scopemap.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
+from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.notices import Notice
+
+_FREE = 3  # last keyframes of the window that move
+_ITERATIONS = 10
+_LEAST_SEEN = 0.1  # of a keyframe's points that those before it must observe: else nothing corrects its depth
+_REMEMBERED = 1000  # keyframes whose correction is kept: the tracker returns to fewer
+# Robust standard deviation, px, of adjusted reprojection errors of a rigid scene: between so near keyframes it is at
+# most 0.3; 0.4 to 1.5 where tissue moves.
+_MAX_SIGMA_PX = 0.5
+_MOST_REFUSED = 0.1  # of the keyframes: with more, the scene is not rigid
+
+
+class KeyframeCorrection(NamedTuple):
+    """Correction of a keyframe's depth: ln of the factor of all of it, and of that of each pixel (None: 1)."""
+
+    log_scale: float = 0.0
+    field: DepthCorrectionField | None = None
+
+    def corrected(self, frame: Frame) -> Frame:
+        """Return a frame with its depth, and the standard deviation of that, corrected."""
+        depth_mm, sigma_mm = np.asarray(frame.depth_mm), frame.depth_sigma_mm
+        log = 0.0 if self.field is None else self.field.log_factor(depth_mm)
+        factor = np.exp(np.float32(self.log_scale) + log, dtype=np.float32)
+        return replace(
+            frame, depth_mm=depth_mm * factor, depth_sigma_mm=None if sigma_mm is None else sigma_mm * factor
+        )
+
+
+class _WindowKeyframe(NamedTuple):
+    """A keyframe of the window: its frame's number and that of the keyframe it was tracked against, and its state.
+
+    log_depth, sigma : (n,) of its points, ln mm, and the standard deviation of that as in `BundleSolution`.
+    """
+
+    frame: int
+    reference: int
+    T_camera_world: np.ndarray
+    log_scale: float
+    log_depth: np.ndarray
+    sigma: np.ndarray
+
+
+class LocalAdjustment:
+    """Takes keyframes as they are tracked; corrects them, and the depth of the frames tracked against them.
+
+    settings : with `local_window`, keyframes that are adjusted together. flow : between keyframes, in one thread.
+    """
+
+    def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
+        self._settings, self._flow = settings, flow
+        self._tracks = FeatureTracks(settings, flow)
+        self._window: deque[_WindowKeyframe] = deque(maxlen=settings.constants.local_window)
+        self._corrections: dict[int, KeyframeCorrection] = {}
+        self._adjusted, self._refused = Counter[int](), Counter[int]()
+
+    def corrected(self, frame: Frame, reference: int) -> Frame:
+        """Return a frame, tracked against the keyframe of frame `reference`, with its depth corrected as that one's."""
+        return self._correction(reference).corrected(frame)
+
+    def adjusted(self, keyframe: Frame, reference: int, map_number: int) -> Frame:
+        """Return a new keyframe with its pose adjusted and its depth corrected.
+
+        keyframe : with its pose as tracked, against the keyframe of frame `reference`, and its depth as estimated. It
+        is adjusted with those before it where one of them, or what one of them was tracked against, is the reference.
+        Elsewhere, where these observe hardly any of its points, and where no rigid scene explains the observations, it
+        takes over the correction of the reference.
+        """
+        if reference not in {number for one in self._window for number in (one.frame, one.reference)}:
+            self._begin()
+        self._take(keyframe, reference)
+        correction = self._correction(reference)
+        if len(self._window) > 1:
+            points, observations = self._tracks.collected(self._numbers)
+            found = adjust(self._problem(points, observations, keyframe.camera.fx), max_iterations=_ITERATIONS)
+            own_sigma = found.log_depth_sigma[points.host == len(self._window) - 1]
+            limits = replace(self._settings.constants, max_sigma_px=_MAX_SIGMA_PX)
+            moves, is_seen = contradiction(points, found, limits), np.isfinite(own_sigma).mean() >= _LEAST_SEEN
+            if moves or not is_seen:
+                self._refused[map_number] += bool(moves)
+                self._begin()
+                self._take(keyframe, reference)
+            else:
+                self._adjusted[map_number] += 1
+                correction = self._update(points, found, keyframe.camera)
+        self._corrections[keyframe.index] = correction
+        while len(self._corrections) > _REMEMBERED:
+            del self._corrections[next(iter(self._corrections))]
+        return correction.corrected(replace(keyframe, T_world_camera=inverse(self._window[-1].T_camera_world)))
+
+    def take_over(self, index: int, reference: int) -> None:
+        """Have frames be tracked against frame `index` too, which was tracked against the keyframe of `reference`."""
+        self._corrections[index] = self._correction(reference)
+        if self._window and self._window[-1].frame == reference:
+            self._window[-1] = self._window[-1]._replace(reference=index)
+
+    def notices(self, map_number: int) -> list[Notice]:
+        """Return what was adjusted of a map; [] where nothing was."""
+        adjusted, refused = self._adjusted[map_number], self._refused[map_number]
+        if not adjusted + refused:
+            return []
+        values = {"adjusted": adjusted, "refused": refused}
+        moves = refused > _MOST_REFUSED * (adjusted + refused)
+        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values)]
+
+    @property
+    def _numbers(self) -> range:
+        """Numbers of the window's keyframes among those of the feature tracks."""
+        return range(self._tracks.keyframe_count - len(self._window), self._tracks.keyframe_count)
+
+    def _begin(self) -> None:
+        """Begin a window without keyframes."""
+        self._tracks = FeatureTracks(self._settings, self._flow)
+        self._window.clear()
+
+    def _correction(self, reference: int) -> KeyframeCorrection:
+        return self._corrections.get(reference, KeyframeCorrection())
+
+    def _take(self, keyframe: Frame, reference: int) -> None:
+        """Put a keyframe in the window, as tracked."""
+        assert keyframe.T_world_camera is not None
+        self._tracks.add(keyframe)
+        log_scale, points = (
+            self._correction(reference).log_scale,
+            self._tracks.collected([self._tracks.keyframe_count - 1])[0],
+        )
+        state = log_scale, points.log_depth + log_scale, np.full(len(points.host), np.inf)
+        self._window.append(_WindowKeyframe(keyframe.index, reference, inverse(keyframe.T_world_camera), *state))
+        self._tracks.keep_last(len(self._window))
+
+    def _problem(self, points: Points, observations: Observations, focal_px: float) -> BundleProblem:
+        """Return the adjustment of the window, from where its keyframes are; the first ones are held."""
+        constants, count = self._settings.constants, len(self._window)
+        _, _, T_camera_world, log_scale, log_depth, found_sigma = map(list, zip(*self._window, strict=True))
+        T, lens = np.stack(T_camera_world), np.array([np.log(focal_px), 0.0, 0.0])
+        start = State(T, np.array(log_scale), np.concatenate(log_depth), lens)
+        held = max(count - _FREE, 0)
+        known, sigma = points.host < held, np.clip(np.concatenate(found_sigma), HELD_SIGMA, points.sigma)
+        estimated = np.where(known, start.log_depth - start.log_scale[points.host], points.log_depth)
+        points = replace(points, log_depth=estimated, sigma=np.where(known, sigma, points.sigma))
+        rotation_rad = math.radians(constants.rotation_sigma_deg)
+        priors = Priors(constants.scale_sigma, rotation_rad, constants.translation_sigma_share)
+        facts = (points, observations, priors, np.arange(count - 1)[:, None] + [0, 1], focal_px)
+        correlated = constants.correlated_observations
+        return BundleProblem(T, *facts, start=start, correlated=correlated, held=held)
+
+    def _update(self, points: Points, found: BundleSolution, camera: PinholeCamera) -> KeyframeCorrection:
+        """Take over an adjustment; return the correction of the window's last keyframe."""
+        state, sigma, last = found.state, found.log_depth_sigma, len(self._window) - 1
+        for k, keyframe in enumerate(self._window):
+            own = points.host == k
+            T, log_scale, log_depth = state.T_camera_world[k], float(state.log_scale[k]), state.log_depth[own]
+            changed = {"T_camera_world": T, "log_scale": log_scale, "log_depth": log_depth, "sigma": sigma[own]}
+            self._window[k] = keyframe._replace(**changed)
+        alone = Points(points.host[own] - last, points.pixel[own], points.log_depth[own], points.sigma[own])
+        error = state.log_depth[own] - alone.log_depth - log_scale
+        step_sigma = self._settings.constants.depth_step_sigma
+        return KeyframeCorrection(log_scale, fit_depth_corrections(camera, alone, 1, error, sigma[own], step_sigma)[0])
