@@ -105,6 +105,7 @@ def test_a_keyframe_that_sees_nothing_of_those_before_takes_over_the_correction(
     elsewhere = plane_scene.frame(plane_scene.pose(at_mm=(60, -50, 0)), COUNT)
     elsewhere = replace(elsewhere, depth_mm=plane_scene.frame(TRUE[-1]).depth_mm * np.exp(BEND))
     np.testing.assert_allclose(local.adjusted(elsewhere, COUNT - 1, 0).depth_mm, last.depth_mm, rtol=1e-5)
+    local.adjusted(plane_scene.frame(TRUE[0], COUNT + 1), COUNT, 0)  # after it, nothing is observed at all
     assert local.notices(0)[0].values == {"adjusted": COUNT - 1, "refused": 0}
 
 

@@ -91,7 +91,7 @@ def test_a_run_killed_after_the_last_frame_tracks_none_again(
 ) -> None:
     preset, wanted = whole
     if preset == "realtime" and doing != "writing":
-        pytest.skip("realtime adjusts nothing, and has fused when the last frame is tracked")
+        pytest.skip("realtime adjusts as frames come, and has fused when the last one is tracked")
     out = tmp_path / "run"
 
     def kill(stage: str, done: int, total: int) -> None:

@@ -99,9 +99,9 @@ class LocalAdjustment:
             found = adjust(self._problem(points, observations, keyframe.camera.fx), max_iterations=_ITERATIONS)
             own_sigma = found.log_depth_sigma[points.host == len(self._window) - 1]
             limits = replace(self._settings.constants, max_sigma_px=_MAX_SIGMA_PX)
-            moves, is_seen = contradiction(points, found, limits), np.isfinite(own_sigma).mean() >= _LEAST_SEEN
-            if moves or not is_seen:
-                self._refused[map_number] += bool(moves)
+            is_seen = np.isfinite(own_sigma).sum() > _LEAST_SEEN * len(own_sigma)
+            if not is_seen or contradiction(points, found, limits):
+                self._refused[map_number] += is_seen
                 self._begin()
                 self._take(keyframe, reference)
             else:
@@ -144,10 +144,8 @@ class LocalAdjustment:
         """Put a keyframe in the window, as tracked."""
         assert keyframe.T_world_camera is not None
         self._tracks.add(keyframe)
-        log_scale, points = (
-            self._correction(reference).log_scale,
-            self._tracks.collected([self._tracks.keyframe_count - 1])[0],
-        )
+        points, _ = self._tracks.collected([self._tracks.keyframe_count - 1])
+        log_scale = self._correction(reference).log_scale
         state = log_scale, points.log_depth + log_scale, np.full(len(points.host), np.inf)
         self._window.append(_WindowKeyframe(keyframe.index, reference, inverse(keyframe.T_world_camera), *state))
         self._tracks.keep_last(len(self._window))
