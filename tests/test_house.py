@@ -175,7 +175,7 @@ CEILINGS = {
     "core, net": (lambda: _net(MODULES), 22_895),
     "bench": (lambda: _total(BENCH_MODULES), 14_285),  # 145: lenses; 445: polyps; 235: two runs; 1195: others
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 35_355),  # 190: lesions, live map; 230: a network at rest; 190: maps
+    "tests": (lambda: _total(TESTS), 35_360),  # 190: lesions, live map; 230: a network at rest; 195: maps
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 104),
     "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 15_465),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),

@@ -101,7 +101,7 @@ class LocalAdjustment:
             limits = replace(self._settings.constants, max_sigma_px=_MAX_SIGMA_PX)
             is_seen = np.isfinite(own_sigma).sum() > _LEAST_SEEN * len(own_sigma)
             if not is_seen or contradiction(points, found, limits):
-                self._refused[map_number] += is_seen
+                self._refused[map_number] += int(is_seen)
                 self._begin()
                 self._take(keyframe, reference)
             else:
