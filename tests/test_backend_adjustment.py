@@ -9,8 +9,9 @@ import pytest
 from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping.bundle_adjustment import adjust, adjust_in_windows, lens_residual
+from scopemap.mapping.bundle_adjustment import adjust, adjust_in_windows
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
+from scopemap.mapping.lens_residual import lens_residual
 
 LOOSE = Priors(rotation_rad=10, translation_share=10)
 

@@ -170,14 +170,14 @@ def _total(modules: list[_Module]) -> int:
 
 
 CEILINGS = {
-    # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 515: speed, local maps
-    "core": (lambda: _total(MODULES), 37_230),
-    "core, net": (lambda: _net(MODULES), 22_895),
-    "bench": (lambda: _total(BENCH_MODULES), 14_285),  # 145: lenses; 445: polyps; 235: two runs; 1195: others
+    # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 565: speed, local maps
+    "core": (lambda: _total(MODULES), 37_280),
+    "core, net": (lambda: _net(MODULES), 22_915),
+    "bench": (lambda: _total(BENCH_MODULES), 14_290),  # 145: lenses; 445: polyps; 235: two runs; 1195: others
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
-    "tests": (lambda: _total(TESTS), 35_360),  # 190: lesions, live map; 230: a network at rest; 195: maps
-    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 104),
-    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 15_465),
+    "tests": (lambda: _total(TESTS), 35_375),  # 190: lesions, live map; 230: a network at rest; 195: maps
+    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 105),
+    "lines that a run imports": (lambda: _total(_of_closure("scopemap.runner.run")), 15_515),
     "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),
     "settings": (lambda: len(setting_names()), 46),
 }
@@ -276,8 +276,8 @@ def _of_closure(start: str) -> list[_Module]:
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.pipeline")
     assert "scopemap.mapping.backend" in closure
-    # With typed notices, causes of losses, local adjustment, and moving tissue with the skin that its states share.
-    assert len(closure) <= 72, "\n".join(sorted(closure))
+    # With notices, causes of losses, local adjustment, its lens, moving tissue and the skin that its states share.
+    assert len(closure) <= 73, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

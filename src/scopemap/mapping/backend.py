@@ -18,7 +18,7 @@ from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px, lens_residual
+from scopemap.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px
 from scopemap.mapping.bundle_problem import BundleProblem, Points, Priors, State
 from scopemap.mapping.depth_correction import (
     DepthCorrectionField,
@@ -27,6 +27,7 @@ from scopemap.mapping.depth_correction import (
     fit_depth_corrections,
 )
 from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.mapping.lens_residual import lens_residual
 from scopemap.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
 from scopemap.mapping.map_merging import AdjustedMaps, Part, loop_support, merge_maps, split_maps
 from scopemap.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue

@@ -45,9 +45,6 @@ _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 _POINT_STEPS = 5  # of the points alone, after the keyframes
 WINDOW = 300
 """Most keyframes that are adjusted at once."""
-_RESIDUAL_SIGMA = np.array([0.3, 0.2, 0.2])  # prior standard deviations of ln f, and of the principal point over f
-_RESIDUAL_DEPTH = 3.0  # factor of the estimated depth's deviation there: errors of a network bend the lens, too
-_SIGNIFICANT = 5.0  # standard deviations: a right lens of a real clip had 3.4, the least noticed wrong one 6.7
 HELD_SIGMA = 0.01
 """Least standard deviation of ln depth of points that an earlier window adjusted."""
 
@@ -68,18 +65,6 @@ class BundleSolution(NamedTuple):
     def sigma_px(self) -> float:
         """Robust standard deviation of the reprojection errors, px; NaN without observations."""
         return self.state.sigma_px
-
-
-class LensResidual(NamedTuple):
-    """What the observations ask of the lens: changes of ln f, and of cx and cy over f; NaN: undetermined.
-
-    A change is 0 where it is not significant. sigma : standard deviation of ln f.
-    """
-
-    log_focal: float = float("nan")
-    x: float = float("nan")
-    y: float = float("nan")
-    sigma: float = float("nan")
 
 
 def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSolution:
@@ -149,27 +134,6 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     if problem.correlated > 1:
         state = with_points(problem, state)
     return BundleSolution(state, log_depth_sigma(problem, state), found.iterations)
-
-
-def lens_residual(problem: BundleProblem, solution: State) -> LensResidual:
-    """Return what the observations ask of the lens, all else adjusted with it from the solution.
-
-    Changes are significant from five standard deviations; all is NaN where it is undetermined, and with more keyframes
-    than are adjusted at once.
-    """
-    if not len(problem.observations.point) or len(problem.T_camera_world) > WINDOW:
-        return LensResidual()
-    unit = np.array([1.0, problem.focal_px, problem.focal_px])
-    points = replace(problem.points, sigma=_RESIDUAL_DEPTH * problem.points.sigma)
-    free = replace(problem, start=solution, points=points, lens_sigma=_RESIDUAL_SIGMA * unit)
-    state = adjust(free, max_iterations=40, min_decrease=1e-4).state  # a wrong lens may be far away
-    try:
-        covariance = np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)
-    except np.linalg.LinAlgError:
-        return LensResidual()
-    change, deviation = (state.lens - problem.tracked.lens) / unit, np.sqrt(np.diag(covariance)[-3:]) / unit
-    log_focal, x, y = np.where(np.abs(change) > _SIGNIFICANT * deviation, change, 0.0).tolist()
-    return LensResidual(log_focal, x, y, float(deviation[0]))
 
 
 def errors_px(problem: BundleProblem, state: State) -> np.ndarray:

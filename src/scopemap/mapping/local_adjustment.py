@@ -23,6 +23,7 @@ from scopemap.mapping.bundle_adjustment import HELD_SIGMA, BundleSolution, adjus
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State
 from scopemap.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
 from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.mapping.lens_residual import LensEvidence, lens_evidence
 from scopemap.notices import Notice
 
 _FREE = 3  # last keyframes of the window that move
@@ -32,6 +33,8 @@ _REMEMBERED = 1000  # keyframes whose correction is kept: the tracker returns to
 # Robust standard deviation, px, of adjusted reprojection errors of a rigid scene: between so near keyframes it is at
 # most 0.3; 0.4 to 1.5 where tissue moves.
 _MAX_SIGMA_PX = 0.5
+_LENS_EVERY = 4  # adjusted keyframes: windows that have hardly a keyframe in common
+_LENS_SIGMA = 0.01  # of ln f, below which no further windows are asked
 _MOST_REFUSED = 0.1  # of the keyframes: with more, the scene is not rigid
 
 
@@ -77,6 +80,7 @@ class LocalAdjustment:
         self._window: deque[_WindowKeyframe] = deque(maxlen=settings.constants.local_window)
         self._corrections: dict[int, KeyframeCorrection] = {}
         self._adjusted, self._refused = Counter[int](), Counter[int]()
+        self._lens: LensEvidence | None = None
 
     def corrected(self, frame: Frame, reference: int) -> Frame:
         """Return a frame, tracked against the keyframe of frame `reference`, with its depth corrected as that one's."""
@@ -106,6 +110,7 @@ class LocalAdjustment:
                 self._take(keyframe, reference)
             else:
                 self._adjusted[map_number] += 1
+                self._test_lens(points, observations, found.state, keyframe.camera.fx)
                 correction = self._update(points, found, keyframe.camera)
         self._corrections[keyframe.index] = correction
         while len(self._corrections) > _REMEMBERED:
@@ -119,13 +124,15 @@ class LocalAdjustment:
             self._window[-1] = self._window[-1]._replace(reference=index)
 
     def notices(self, map_number: int) -> list[Notice]:
-        """Return what was adjusted of a map; [] where nothing was."""
+        """Return what was adjusted of a map, and whether the views contradict the lens; [] where nothing was."""
         adjusted, refused = self._adjusted[map_number], self._refused[map_number]
         if not adjusted + refused:
             return []
         values = {"adjusted": adjusted, "refused": refused}
         moves = refused > _MOST_REFUSED * (adjusted + refused)
-        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values)]
+        # So short windows do not tell the principal point well: a right lens of a real clip had -0.1 +- 0.02.
+        lens = [] if self._lens is None else self._lens.residual._replace(x=0.0, y=0.0).notices
+        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *lens]
 
     @property
     def _numbers(self) -> range:
@@ -165,6 +172,14 @@ class LocalAdjustment:
         facts = (points, observations, priors, np.arange(count - 1)[:, None] + [0, 1], focal_px)
         correlated = constants.correlated_observations
         return BundleProblem(T, *facts, start=start, correlated=correlated, held=held)
+
+    def _test_lens(self, points: Points, observations: Observations, state: State, focal_px: float) -> None:
+        """Ask one full window in a few what its views tell of the lens, until they tell it."""
+        is_due = len(self._window) == self._window.maxlen and not self._adjusted.total() % _LENS_EVERY
+        if is_due and (self._lens is None or self._lens.residual.sigma > _LENS_SIGMA):
+            problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
+            evidence = lens_evidence(problem, state)
+            self._lens = self._lens if evidence is None else evidence.and_also(self._lens)
 
     def _update(self, points: Points, found: BundleSolution, camera: PinholeCamera) -> KeyframeCorrection:
         """Take over an adjustment; return the correction of the window's last keyframe."""

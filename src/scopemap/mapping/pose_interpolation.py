@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -11,19 +10,13 @@ import numpy as np
 
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, mean_near, rotation_angle_rad
-from scopemap.mapping.bundle_adjustment import LensResidual
 from scopemap.mapping.deformation_graph import Deformation
 from scopemap.mapping.depth_correction import DepthCorrectionField
+from scopemap.mapping.lens_residual import LensResidual
 from scopemap.mapping.nonrigid_adjustment import LeftOutTracks
 from scopemap.notices import Notice
 
 _AT_REST = 1e-6  # rad
-_FOCAL_CHANGE = 0.03
-"""Of ln f, above which the views contradict the lens; a focal length off by 2 % bends little."""
-_FOCAL_SIGMA = 0.05
-"""Of ln f, above which the views say too little of the lens to confirm it."""
-_POINT_CHANGE = 0.05
-"""Of the principal point over f: right lenses up to 0.03, one off by 5 % of the width 0.09 and more."""
 
 
 class TrackedPose(NamedTuple):
@@ -81,15 +74,7 @@ class FrameCorrection:
     @property
     def notices(self) -> list[Notice]:
         """What was adjusted and how well it fits, or why nothing was; and whether the views ask for another lens."""
-        log_focal, x, y, sigma = self.lens_residual
-        found = [self.notice]
-        if abs(log_focal) > _FOCAL_CHANGE:
-            found.append(Notice("camera-contradicted", {"change": math.expm1(log_focal)}))
-        if math.hypot(x, y) > _POINT_CHANGE:
-            found.append(Notice("camera-off-centre", {"x": x, "y": y}))
-        if sigma > _FOCAL_SIGMA:
-            found.append(Notice("camera-unconfirmed", {"sigma": sigma}))
-        return found
+        return [self.notice, *self.lens_residual.notices]
 
     @property
     def notice(self) -> Notice:

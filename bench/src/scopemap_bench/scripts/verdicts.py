@@ -96,6 +96,9 @@ def phantom_cases() -> list[Case]:
     changes += [("frames dropped", f"every{step}", ("--frames", f"::{step}")) for step in (4, 6)]
     fast = ("--preset", "realtime")
     changes += [("realtime", "fast", fast), ("realtime, as tracked", "plain", (*fast, "--set", "mapping.method=none"))]
+    for sign in (1, -1):
+        lens = stated(160 * (1 + sign / 10))
+        changes.append(("realtime, focal length off by 10 %", f"fast{sign}", (*fast, *lens)))
     changes.append(("calibration of another size", "small", stated(160 / 1.5)))
     changes.append(("calibration of another size", "large", stated(320, 319.5, 255.5)))
     for (group, name, words), scene, seed in product(changes, SCENES, SEEDS):
