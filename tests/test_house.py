@@ -171,8 +171,8 @@ def _total(modules: list[_Module]) -> int:
 
 CEILINGS = {
     # 525: lesions; 1040: coverage; 465: exams; 590: findings, flow; 210: whole; 275: scopes; 565: speed, local maps
-    "core": (lambda: _total(MODULES), 37_280),
-    "core, net": (lambda: _net(MODULES), 22_915),
+    "core": (lambda: _total(MODULES), 37_285),
+    "core, net": (lambda: _net(MODULES), 22_920),
     "bench": (lambda: _total(BENCH_MODULES), 14_290),  # 145: lenses; 445: polyps; 235: two runs; 1195: others
     "training": (lambda: _total([m for m in OTHERS if m.path.is_relative_to(ROOT / "training")]), 4_750),
     "tests": (lambda: _total(TESTS), 35_375),  # 190: lesions, live map; 230: a network at rest; 195: maps

@@ -9,6 +9,7 @@ from scopemap.io.sequence import Sequence
 from scopemap.reconstruction import Reconstruction
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import write_report
+from scopemap.runner.memory import give_back_freed
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Observer, Progress
 
@@ -25,6 +26,7 @@ def reconstruct_with_report(
     """Write the result of a sequence to a folder, with report.html and summary.png; as `reconstruct` otherwise."""
     seen = (FramePictures().observe, *observers)
     result = reconstruct(sequence, config, out=out, overwrite=overwrite, observers=seen, progress=progress)
+    give_back_freed()
     progress("writing the report", 0, 0)
     write_report(out)
     return result
