@@ -29,7 +29,7 @@ MEASURED = ("src", "bench/src")
 SCRIPT = "python -m scopemap_bench.scripts"
 PLAN = "env SCOPEMAP_WEIGHTS_DIR=DATA/weights python -m scopemap bench"
 TABLES: dict[str, tuple[str, str]] = {
-    "overview": (f"{SCRIPT}.overview --data DATA --out OUT", ""),
+    "overview": (f"{SCRIPT}.overview --data DATA --out OUT --repeat 5", ""),
     "surface": (f"{SCRIPT}.surface --data DATA --out OUT", ""),
     "clinical-phantoms": (f"{SCRIPT}.clinical_phantoms", ""),
     "unknown-lenses": (f"{SCRIPT}.unknown_lenses", ""),
