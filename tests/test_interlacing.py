@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from itertools import islice
+from pathlib import Path
+
+import av
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +18,9 @@ from hypothesis import strategies as st
 from scopemap.io.video_format.interlacing import LEAST_COMBING, combing, deinterlaced, is_interlaced
 
 NUMBERS = range(0, 40, 5)
+C3VD = "endoscopy/c3vd"
+PROGRESSIVE = ("endoscopy/hamlyn/rectified01_part/image01", "endoscopy/endonerf/pulling_soft_tissues/images")
+VIDEOS = ("colonoscopy_nflba_03", "laparoscopy_rvim", "laparoscopy_endo3r_rgb3")
 
 
 def _grey(values: np.ndarray) -> np.ndarray:
@@ -82,3 +90,56 @@ def test_a_slope_is_not_shifted_by_half_a_row(height: int) -> None:
     inner = height - 1 if height % 2 == 0 else height
     np.testing.assert_array_equal(out[:inner], slope[:inner])
     assert out.shape == slope.shape
+
+
+def _real(path: Path, numbers: list[int]) -> list[np.ndarray]:
+    """Pictures of a video, or of a folder's files in the order of their numbers."""
+    if not path.is_dir():
+        with av.open(str(path)) as video:
+            shown = [frame.to_ndarray(format="rgb24") for frame in islice(video.decode(video=0), max(numbers) + 1)]
+        return [shown[number] for number in numbers]
+    kept = path.glob("*_color.*") if path.parent.name == "c3vd" else path.glob("*.*g")
+    files = sorted(kept, key=lambda f: int(re.findall(r"\d+", f.name)[-1]))
+    return [cv2.cvtColor(cv2.imread(str(files[number])), cv2.COLOR_BGR2RGB) for number in numbers]
+
+
+def _slope(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
+    """Motion from a picture's even rows to its odd ones over that to the next picture's even rows, and correlation.
+
+    Measured by dense flow, not as `combing` does, and along the rows: down, the odd rows lie half a row apart.
+    """
+    fields = (first[::2], first[1::2], second[::2])
+    even, odd, later = (cv2.GaussianBlur(cv2.cvtColor(f, cv2.COLOR_RGB2GRAY), (0, 0), 1) for f in fields)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    within, between = (dis.calc(even, other, np.zeros((*even.shape, 2), np.float32))[..., 0] for other in (odd, later))
+    edges = cv2.GaussianBlur(np.abs(cv2.Sobel(even, cv2.CV_32F, 1, 0)), (0, 0), 5)
+    told = edges > np.median(edges)
+    return float(np.polyfit(between[told], within[told], 1)[0]), float(np.corrcoef(between[told], within[told])[0, 1])
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("name", "numbers", "low", "least"), [("trans_t1_a", (3, 4), 0.4, 0.9), ("trans_t2_a", (29, 30), 0.1, 0.6)]
+)
+def test_c3vd_is_interlaced(real_data: Path, name: str, numbers: tuple[int, int], low: float, least: float) -> None:
+    """The odd rows are half a frame later all over the picture; lossy coding, as of trans_t2_a, blends fields."""
+    first, second = _real(real_data / C3VD / name, list(numbers))
+    slope, correlation = _slope(first, second)
+    assert low < slope < 0.6
+    assert correlation > least
+    assert combing(first) > 3 * LEAST_COMBING
+    assert combing(deinterlaced(first)) < LEAST_COMBING
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("path", [*PROGRESSIVE, *(f"endoscopy/video/{name}.mp4" for name in VIDEOS)])
+def test_real_progressive_pictures_are_told_from_woven_ones(real_data: Path, path: str) -> None:
+    starts = range(10, 60, 6)
+    pictures = _real(real_data / path, [n for start in starts for n in (start, start + 1, start + 3)])
+    first, next_, later = pictures[::3], pictures[1::3], pictures[2::3]
+    assert max(combing(picture) for picture in first) < LEAST_COMBING
+    assert abs(np.median([_slope(*pair)[0] for pair in zip(first, later, strict=True)])) < 0.1
+    for others in (next_, later):
+        for picture, other in zip(first, others, strict=True):
+            other[::2] = picture[::2]
+        assert is_interlaced(others)
