@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -30,6 +31,14 @@ AlignBy = Annotated[
     Align, typer.Option(help="Alignment before measuring; origin: of the first frames, scale: of the size alone.")
 ]
 AlignFirst = Annotated[int | None, advanced(min=3, metavar="N", help="Fit on the first N tracked frames only.")]
+TimeOffset = Annotated[
+    str,
+    advanced(
+        metavar="SECONDS|fit",
+        help="Read the truth so much later, where its clock is not the pictures'; fit: the offset, of at most half a "
+        "second in either direction, that leaves the least error of positions.",
+    ),
+]
 OfUnit = Annotated[Unit, advanced(help="Unit of a trajectory file that does not state one.")]
 TruthUnit = Annotated[Unit | None, advanced(help="The same for the truth; as --unit if left out.")]
 OfKind = Annotated[str, advanced(help="Form of the trajectory file where its content fits two.")]
@@ -47,6 +56,7 @@ def evaluate(
     source: InputNow = None,
     align: AlignBy = "sim3",
     align_first: AlignFirst = None,
+    time_offset: TimeOffset = "0",
     unit: OfUnit = "mm",
     truth_unit: TruthUnit = None,
     kind: OfKind = "auto",
@@ -62,10 +72,12 @@ def evaluate(
     scopemap-bench this command also measures depth, surfaces and the protocols of other papers.
     """
     form = output_form(as_json=as_json, as_csv=as_csv, quiet=quiet)
+    offset = offset_of(time_offset)
     if truth is None and not against_video:
         raise typer.BadParameter("needed for all figures but those of --against-video", param_hint="--truth")
     figures = against_own_video(trajectory, source) if against_video else {}
     if truth is not None:
+        from scopemap.evaluation.clock import by_clock
         from scopemap.evaluation.poses import match, pose_report
         from scopemap.io.reference import read_reference
         from scopemap.trajectory.formats.opening import read_trajectory
@@ -74,12 +86,26 @@ def evaluate(
         reference = read_reference(truth, unit=truth_unit or unit, kind=truth_kind)
         if reference is None:
             raise InputError(f"{truth} has no true poses")
+        reference, clock = by_clock(estimate, reference, align, offset, first=align_first)
         matched = match(estimate, reference, align, first=align_first)
         sources = {"trajectory": estimate.source, "truth": reference.source}
-        figures = pose_report(matched) | figures | {"sources": sources}
+        figures = pose_report(matched) | clock | figures | {"sources": sources}
         if not quiet:
-            warn_of(matched)
+            warn_of(matched, clock)
     show(figures, form)
+
+
+def offset_of(text: str) -> float | Literal["fit"]:
+    """Return the clock offset of `--time-offset`, s, or "fit". Raises `BadParameter` for anything else."""
+    if text == "fit":
+        return "fit"
+    try:
+        offset_s = float(text)
+    except ValueError:
+        offset_s = math.nan
+    if not math.isfinite(offset_s):
+        raise typer.BadParameter(f"expected seconds or fit, got {text!r}", param_hint="--time-offset")
+    return offset_s
 
 
 def output_form(*, as_json: bool, as_csv: bool, quiet: bool) -> OutputForm:
@@ -98,8 +124,12 @@ def against_own_video(run: Path, source: Path | None = None) -> dict[str, Any]:
     return {"against_video": agreement.figures()}
 
 
-def warn_of(matched: MatchedTrajectories) -> None:
-    """Print what limits the figures of these trajectories."""
+def warn_of(matched: MatchedTrajectories, clock: dict[str, Any]) -> None:
+    """Print what limits the figures of these trajectories; `clock` : what `by_clock` says of the truth's clock."""
+    from scopemap.evaluation.clock import clock_sentence
+
+    if said := clock_sentence(clock):
+        typer.echo(f"warning: {said}", err=True)
     lost = int((~matched.tracked).sum())
     if lost:
         counted = f"{lost} of {len(matched.tracked)} frames are lost"

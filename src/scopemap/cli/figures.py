@@ -15,6 +15,7 @@ from scopemap.io.json_numbers import without_nan
 
 _LABELS = {
     "ate_rmse_mm": "ATE RMSE, tracked frames (mm)",
+    "ate_as_recorded_mm": "ATE RMSE without the clock offset (mm)",
     "ate_hold_rmse_mm": "ATE RMSE, lost frames held (mm)",
     "ate_mean_mm": "ATE mean (mm)",
     "ate_median_mm": "ATE median (mm)",
@@ -30,6 +31,9 @@ _LABELS = {
     "rpe_10mm_path_mm": "RPE over 10 mm of true path, RMSE (mm)",
     "rpe_10mm_path_deg": "RPE over 10 mm of true path, RMSE (deg)",
     "tlr": "TLR, path estimated / true, unaligned",
+    "time_offset_s": "truth read so much later (s)",
+    "time_offset": "this clock offset is",
+    "time_offset_within_s": "clock offset to within (s)",
     "coverage": "tracked share of the true poses in its span",
     "longest_tracked": "longest segment without loss (frames)",
     "frames_until_loss": "frames until the first loss",
@@ -85,10 +89,11 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
 def _one_line(figures: dict[str, Any]) -> str:
     if "ate_rmse_mm" not in figures:  # no true poses: depth alone was measured
         return ", ".join(f"{name} {_text(value)}" for name, value in _flat(figures) if isinstance(value, float))
+    clock = f", truth {figures['time_offset_s']:+.3f} s ({figures['time_offset']})" if "time_offset" in figures else ""
     return (
         f"ATE {figures['ate_rmse_mm']:.3f} mm, rotation {figures['rotation_unaligned_mean_deg']:.2f} deg unaligned, "
         f"TLR {figures['tlr']:.3f} (align {figures['align']}, "
-        f"{figures['tracked']} of {figures['frames']} frames tracked)"
+        f"{figures['tracked']} of {figures['frames']} frames tracked){clock}"
     )
 
 

@@ -16,9 +16,11 @@ from scopemap.cli.evaluate import (
     OfKind,
     OfUnit,
     OneLine,
+    TimeOffset,
     TruthKind,
     TruthUnit,
     against_own_video,
+    offset_of,
     output_form,
     warn_of,
 )
@@ -47,6 +49,7 @@ def evaluate(
     source: InputNow = None,
     align: AlignBy = "sim3",
     align_first: AlignFirst = None,
+    time_offset: TimeOffset = "0",
     unit: OfUnit = "mm",
     truth_unit: TruthUnit = None,
     kind: OfKind = "auto",
@@ -78,6 +81,8 @@ def evaluate(
     as TUM time stamps), else by time within 0.01 s; files without times count 30 frames per s.
     """
     form = output_form(as_json=as_json, as_csv=as_csv, quiet=quiet)
+    offset = offset_of(time_offset)
+    from scopemap.evaluation.clock import by_clock
     from scopemap.evaluation.poses import match, pose_report
     from scopemap.io.reference import read_reference
     from scopemap.trajectory.formats.opening import read_trajectory
@@ -98,8 +103,9 @@ def evaluate(
             raise InputError(f"{truth} has no true poses; if it has depth: --depth median compares that alone")
         show(depth_groups(trajectory, truth, depth, consistency=consistency) | own, form)
         return
+    reference, clock = by_clock(estimate, reference, align, offset, first=align_first)
     matched = match(estimate, reference, align, first=align_first)
-    figures: dict[str, Any] = pose_report(matched) | _surface(trajectory, truth, matched, icp=icp)
+    figures: dict[str, Any] = pose_report(matched) | clock | _surface(trajectory, truth, matched, icp=icp)
     if paper_units:
         figures["paper"] = paper_figures(matched)
     figures |= _protocols(estimate, reference, protocol or [])
@@ -110,7 +116,7 @@ def evaluate(
     figures |= own
     figures["sources"] = {"trajectory": estimate.source, "truth": reference.source}
     if not quiet:
-        warn_of(matched)
+        warn_of(matched, clock)
     show(figures, form)
 
 
