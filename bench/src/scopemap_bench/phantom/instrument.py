@@ -57,9 +57,16 @@ def instrument(
 
 
 def insert(
-    tool: Capsules | None, radiance: np.ndarray, surface: SurfaceBuffers, camera: CameraModel
+    tool: Capsules | None,
+    radiance: np.ndarray,
+    surface: SurfaceBuffers,
+    camera: CameraModel,
+    sent: np.ndarray | float = 1.0,
 ) -> tuple[np.ndarray, SurfaceBuffers]:
-    """Return light (H, W, 3) and surface of a view with an instrument in front; the depth that it hides is unknown."""
+    """Return light (H, W, 3) and surface of a view with an instrument in front; the depth that it hides is unknown.
+
+    sent : of the lamp along each ray, as `shading.beam` returns it.
+    """
     if tool is None:
         return radiance, surface
     rays = rays_of(camera).astype(np.float32)
@@ -80,7 +87,7 @@ def insert(
         normal=np.where(hides[..., None], np.nan, surface.normal).astype(np.float32),
         rest_mm=np.where(hides[..., None], np.nan, surface.rest_mm).astype(np.float32),
     )
-    return np.where(hides[..., None], light, radiance).astype(np.float32), unknown
+    return np.where(hides[..., None], light * sent, radiance).astype(np.float32), unknown
 
 
 def _hit(rays: np.ndarray, ends: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -34,6 +34,7 @@ from scopemap_bench.phantom.polyps import Polyps, grow
 from scopemap_bench.phantom.scenes import Tint, colon_volume, laparoscopy_volume, tube_volume
 from scopemap_bench.phantom.shading import (
     Appearance,
+    beam,
     develop,
     disturb,
     exposure_for,
@@ -45,7 +46,7 @@ from scopemap_bench.phantom.shading import (
     vignette,
 )
 from scopemap_bench.phantom.slit import in_wound
-from scopemap_bench.phantom.spec import DEFAULT_FRAMES, Event, EventName, PhantomSpec
+from scopemap_bench.phantom.spec import DEFAULT_FRAMES, OPEN_SCENES, Event, EventName, PhantomSpec
 
 _WOUND_RGB = np.array([0.7, 0.22, 0.2], np.float32)
 _COLON_RGB = np.array([0.64, 0.265, 0.165])
@@ -54,8 +55,6 @@ _TUBE_RGB = np.array([0.55, 0.30, 0.22])
 _METERING_SHARE = 8
 # Where a frame shows what is poked, over its height and width.
 _POKED_AT = 0.5, 0.68
-# Scenes of an open cavity, and the share by which their organs rise.
-_OPEN = {"laparoscopy": 1.0, "abdominal_wall": 0.3}
 _ALONG_MM = {"sideways": np.array([22.0, 0, 0]), "withdrawal": np.array([0, 0, -52.0])}
 _PUSHED_AWAY_MM = {"laparoscopy": 60.0, "lumen": 25.0}
 
@@ -101,7 +100,7 @@ def _motion(spec: PhantomSpec, poses: np.ndarray, volume: Volume) -> TissueMotio
     parts: list[Part] = []
     if spec.deform:
         parts.append(breathing(spec.breath_mm, spec.breath_frames, spec.seed))
-    away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene in _OPEN else "lumen"]
+    away_mm = _PUSHED_AWAY_MM["laparoscopy" if spec.scene in OPEN_SCENES else "lumen"]
     for event in spec.events:
         first, last, pose = event.first, event.last, poses[min(event.first, len(poses) - 1)]
         if event.kind in ("push", "rebound"):
@@ -148,7 +147,7 @@ def camera_path(spec: PhantomSpec) -> np.ndarray:
         frames = ((spec.frames or DEFAULT_FRAMES) - 1) * spec.speed + 1
         if spec.route != "wander":
             path = straight_path(frames, _ALONG_MM[spec.route], spec.seed)
-        elif spec.scene in _OPEN:
+        elif spec.scene in OPEN_SCENES:
             path = sweep_path(frames, spec.loop, spec.seed)
         else:
             path = lumen_path(frames, spec.loop, spec.seed, straight=spec.scene == "tube")
@@ -174,7 +173,7 @@ def build_scene(spec: PhantomSpec, poses: np.ndarray) -> tuple[Volume, Appearanc
     if spec.scene == "colon":
         volume, base = colon_volume(poses, spec.seed, spec.fold_mm), _COLON_RGB
     else:
-        volume, base = laparoscopy_volume(poses, spec.seed, _OPEN[spec.scene])
+        volume, base = laparoscopy_volume(poses, spec.seed, OPEN_SCENES[spec.scene], spec.omentum_mm)
     return volume, Appearance(base, spec.texture, spec.gloss, spec.seed, spec.seed + 1000 * spec.examination)
 
 
@@ -199,15 +198,16 @@ def _light_at(phantom: Phantom, time: float) -> tuple[np.ndarray, SurfaceBuffers
     albedo[in_wound(displacement.slits, rest)] *= _WOUND_RGB
     if phantom.polyps is not None:
         albedo = albedo * phantom.polyps.tint(rest)
-    radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect)
+    sent = beam(camera, phantom.spec.beam_deg)
+    radiance = shade(surface, albedo, ripple, look.film(rest), camera, phantom.spec.indirect, sent)
     for tool in _tools(phantom, time):
-        radiance, surface = insert(tool, radiance, surface, camera)
+        radiance, surface = insert(tool, radiance, surface, camera, sent)
     return radiance * vignette(camera), surface
 
 
 def _tools(phantom: Phantom, time: float) -> list[Capsules | None]:
     """Return the instruments at a moment, in frames; one that holds tissue has its tip where that is."""
-    rigid, seed = phantom.spec.scene in _OPEN, phantom.spec.seed
+    rigid, seed = phantom.spec.scene in OPEN_SCENES, phantom.spec.seed
     tools = [instrument(time, e.first, e.last, rigid, seed) for e in _events(phantom.spec, "instrument")]
     for part in phantom.motion.parts:
         if isinstance(part, Grasp):

@@ -27,6 +27,10 @@ _TINTS = np.array(
     ],
     np.float32,
 )
+# A third of the floor's fat: what is full of blood is as dark.
+_OMENTUM_RGB = _TINTS[0] / 3
+# Its middle line below the view's, and its half widths along and across the lower edge.
+_OMENTUM_DOWN_MM, _OMENTUM_ALONG_MM, _OMENTUM_ACROSS_MM = 26.0, 70.0, 20.0
 _SPACING_MM, _AHEAD_MM, _RADIUS_MM = 4.0, 84.0, 18.0
 _SHARPNESS_PER_MM, _OUTSIDE_MM = 0.35, -8.0
 _BRICK, _VOXEL_BUDGET = 8, 20e6
@@ -50,10 +54,11 @@ class Tint:
         return np.stack(channels, -1) / 255
 
 
-def laparoscopy_volume(poses: np.ndarray, seed: int, rise: float = 1.0) -> tuple[Volume, Tint]:
+def laparoscopy_volume(poses: np.ndarray, seed: int, rise: float = 1.0, omentum_mm: float = 0.0) -> tuple[Volume, Tint]:
     """Return the free space and the colours of a cavity with organs, at least 25 mm in front of poses (N, 4, 4).
 
     rise : how far organs and relief rise from the floor, share of the usual; a small one makes it nearly plane.
+    omentum_mm : how far a dark omentum rises from the floor below the middle of the view; 0: there is none.
     """
     frame = _frame(poses)
     local = (poses[:, :3, 3] - frame[:3, 3]) @ frame[:3, :3]
@@ -64,6 +69,7 @@ def laparoscopy_volume(poses: np.ndarray, seed: int, rise: float = 1.0) -> tuple
     corners = corners @ frame[:3, :3].T + frame[:3, 3]
     origin = corners.min(0) - 6.0
     shape = np.ceil((corners.max(0) + 6.0 - origin) / _VOXEL_MM).astype(int) + 1
+    tints = np.vstack([_TINTS, _OMENTUM_RGB]) if omentum_mm > 0 else _TINTS
     value, colours = np.empty(shape, np.float32), np.empty((*shape, 3), np.uint8)
     for start in range(0, shape[0], _SLABS):
         block = slice(start, min(start + _SLABS, shape[0]))
@@ -71,11 +77,13 @@ def laparoscopy_volume(poses: np.ndarray, seed: int, rise: float = 1.0) -> tuple
         points[:, 0] += start * _VOXEL_MM
         points = (points + (origin - frame[:3, 3])) @ frame[:3, :3]
         distances = _distances(points, half, depth, behind, seed, rise)
+        if omentum_mm > 0:
+            distances = np.vstack([distances, _omentum(points, depth, omentum_mm, seed)])
         nearest = distances.min(0)
         melt = np.exp(-_MELT_PER_MM * (distances - nearest))
         total = melt.sum(0)
         value[block] = np.maximum(nearest - np.log(total) / _MELT_PER_MM, _DEEPEST_MM).reshape(value[block].shape)
-        colours[block] = np.rint(255 * (melt / total).T @ _TINTS).reshape(colours[block].shape)
+        colours[block] = np.rint(255 * (melt / total).T @ tints).reshape(colours[block].shape)
     return Volume(value, origin, _VOXEL_MM), Tint(colours, origin, _VOXEL_MM)
 
 
@@ -100,6 +108,15 @@ def _distances(p: np.ndarray, half: float, depth: float, behind: float, seed: in
     near = np.abs(distances.min(0)) < _RELIEF_MM
     distances[:, near] += rise * _relief(p[near], len(distances) - 2, seed)
     return distances
+
+
+def _omentum(p: np.ndarray, depth: float, rise_mm: float, seed: int) -> np.ndarray:
+    """Distance (N,) from points (N, 3) in cavity axes to a lumpy ridge along the lower edge of the view (y down)."""
+    radii = np.array([_OMENTUM_ALONG_MM, _OMENTUM_ACROSS_MM, rise_mm])
+    ridge = _ellipsoid(p, np.array([0.0, _OMENTUM_DOWN_MM, depth]), radii, 0.0)
+    near = np.abs(ridge) < _RELIEF_MM
+    ridge[near] += 3.0 * noise_at(p[near], 18.0, seed + 28) + 1.2 * noise_at(p[near], 7.0, seed + 29)
+    return ridge
 
 
 def _relief(p: np.ndarray, organs: int, seed: int) -> np.ndarray:

@@ -1,7 +1,8 @@
 """From a surface to the picture of it: tissue's albedo and wet film, the lamp at the camera, exposure, video coding.
 
-Irradiance falls as cosine over squared distance, and a wet spot that faces the lamp reflects it. Albedo, vessels and
-film are functions of the rest point, so that they move with the tissue; they fade where a pixel is too coarse for them.
+Irradiance falls as cosine over squared distance, in a beam also beside its axis, and a wet spot that faces the lamp
+reflects it. Albedo, vessels and film are functions of the rest point, so that they move with the tissue; they fade
+where a pixel is too coarse for them.
 """
 
 from __future__ import annotations
@@ -110,15 +111,17 @@ def shade(
     film: np.ndarray,
     camera: CameraModel,
     indirect: float = 0.0,
+    sent: np.ndarray | float = 1.0,
 ) -> np.ndarray:
     """Return linear radiance (H, W, 3) float32, per mm^2 of distance, before exposure; 0 where nothing is seen.
 
     `albedo` (H, W, 3) linear RGB, `ripple` (H, W, 3) tilt of the fluid film, `film` (H, W) strength of reflection.
     `indirect` : share of the lamp's light that reaches every point alike after scattering in the cavity.
+    `sent` : share of the lamp's light along each ray, as `beam` returns it.
     """
     rays = rays_of(camera).astype(np.float32)
     towards = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-    light = 1.0 / surface.distance_mm[..., None] ** 2
+    light = sent / surface.distance_mm[..., None] ** 2
     cosine = np.clip((surface.normal * towards).sum(-1, keepdims=True), 0, 1)
     irradiance = cosine * light
     if indirect > 0 and np.isfinite(irradiance).any():
@@ -130,6 +133,18 @@ def shade(
         mirrored = np.clip((wet * towards).sum(-1, keepdims=True), 0, 1) ** _HIGHLIGHT_SHARPNESS
         radiance = radiance + film[..., None] * _HIGHLIGHT_STRENGTH * mirrored * light
     return np.nan_to_num(radiance, nan=0.0, posinf=0.0).astype(np.float32)
+
+
+def beam(camera: CameraModel, beam_deg: float | None) -> np.ndarray | float:
+    """Return what the lamp sends along each ray, (H, W, 1) float32, 1 on its axis: 0.5 ** (2 angle / beam_deg) ** 2.
+
+    The lamp is at the camera, its axis the optical one. beam_deg : full angle of half power, degrees; None: 1 anywhere.
+    """
+    if beam_deg is None:
+        return 1.0
+    rays = rays_of(camera)
+    angle_rad = np.arctan2(np.linalg.norm(rays[..., :2], axis=-1, keepdims=True), rays[..., 2:])
+    return np.exp2(-((2 * angle_rad / np.radians(beam_deg)) ** 2)).astype(np.float32)
 
 
 def vignette(camera: CameraModel) -> np.ndarray:

@@ -24,6 +24,9 @@ EventName = Literal[
 ]  # fmt: skip
 
 DEFAULT_FRAMES = 200
+OPEN_SCENES = {"laparoscopy": 1.0, "abdominal_wall": 0.3}
+"""Scenes of an open cavity, and the share by which their organs rise."""
+
 C3VD_DEPTH_SCALE_MM = 100.0 / 65535
 
 
@@ -82,6 +85,10 @@ class PhantomSpec:
     auto_exposure : whether every frame has its own exposure, which follows with the time constant exposure_lag_frames.
     shutter : share of the time between two frames during which light is gathered, 0: no motion blur.
     indirect : light that the tissue scatters onto itself, share of the lamp's; it lights far walls too much.
+    beam_deg : full angle, degrees, at which the lamp sends half as much as along the view, falling as a Gaussian of the
+    angle; None: equally everywhere.
+    omentum_mm : how far an omentum, three times as dark as the fat of an open cavity's floor, rises from that floor,
+    62 mm away, towards the camera along the lower edge of the view; 0: there is none.
     h264_crf : rate factor, 0 to 51, of the video coding (`shading.VideoCoding`); None: none.
     depth_scale_mm : mm per unit of the depth files; C3VD's by default. fps : frames per second of `camera.yaml`.
     """
@@ -112,6 +119,8 @@ class PhantomSpec:
     exposure_lag_frames: float = 0.0
     shutter: float = 0.0
     indirect: float = 0.0
+    beam_deg: float | None = None
+    omentum_mm: float = 0.0
     h264_crf: int | None = None
     depth_scale_mm: float = C3VD_DEPTH_SCALE_MM
     fps: float = 30.0
@@ -134,6 +143,9 @@ class PhantomSpec:
             or (self.exposure_lag_frames > 0 and self.auto_exposure),
             "shutter must be between 0 and 1": 0 <= self.shutter <= 1,
             "indirect must be between 0 and 1": 0 <= self.indirect <= 1,
+            "beam_deg must be between 5 and 170": self.beam_deg is None or 5 <= self.beam_deg <= 170,
+            "omentum_mm must be between 0 and 45, and needs an open cavity": self.omentum_mm == 0
+            or (0 < self.omentum_mm <= 45 and self.scene in OPEN_SCENES),
             "h264_crf must be between 0 and 51": self.h264_crf is None or 0 <= self.h264_crf <= 51,
             f"route must be one of {', '.join(get_args(RouteName))}": self.route in get_args(RouteName),
             "only the route wander goes with loop or path_file": self.route == "wander"

@@ -40,6 +40,10 @@ PHANTOMS = {
         *("--scene", "abdominal_wall", "--frames", 600, "--set", "route=sideways", "--set", "fov_deg=65"),
         *("--set", "indirect=0.15", "--set", "h264_crf=30", *EXPOSURE),
     ),
+    "dark omentum before a lit wall, narrow beam, 45 degrees, sideways": (
+        *("--scene", "abdominal_wall", "--set", "route=sideways", "--set", "fov_deg=45"),
+        *("--set", "beam_deg=24", "--set", "omentum_mm=40"),
+    ),
     "withdrawal along a straight colon, 184 frames": (
         *("--scene", "colon", "--frames", 184, "--set", "route=withdrawal", "--set", "gloss=2"),
         *("--set", "texture=0", "--set", "indirect=0.8", "--set", "h264_crf=36", *EXPOSURE),
