@@ -151,7 +151,8 @@ def test_c3vd_recorded_poses_are_ahead_of_the_pictures(real_data: Path) -> None:
     truth = read_reference(folder)
     assert truth is not None
     speed = np.linalg.norm(np.diff(truth.positions_mm, axis=0), axis=1)
-    greys = [cv2.imread(str(folder / f"{n}_color.jpg"), cv2.IMREAD_GRAYSCALE)[::4, ::4] for n in range(60, 80)]
+    files = [str(folder / f"{number}_color.jpg") for number in range(60, 80)]
+    greys = [np.asarray(cv2.imread(file, cv2.IMREAD_GRAYSCALE))[::4, ::4] for file in files]
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     empty = np.zeros((*greys[0].shape, 2), np.float32)
     moved = [np.median(np.linalg.norm(flow.calc(a, b, empty.copy()), axis=-1)) for a, b in pairwise(greys)]

@@ -100,7 +100,7 @@ def _real(path: Path, numbers: list[int]) -> list[np.ndarray]:
         return [shown[number] for number in numbers]
     kept = path.glob("*_color.*") if path.parent.name == "c3vd" else path.glob("*.*g")
     files = sorted(kept, key=lambda f: int(re.findall(r"\d+", f.name)[-1]))
-    return [cv2.cvtColor(cv2.imread(str(files[number])), cv2.COLOR_BGR2RGB) for number in numbers]
+    return [cv2.cvtColor(np.asarray(cv2.imread(str(files[number]))), cv2.COLOR_BGR2RGB) for number in numbers]
 
 
 def _slope(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
