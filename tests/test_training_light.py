@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from drawn_buffers import WIDTH, sphere
 
-from training.light import draw_light, shade
+from training.light import beam_shares, draw_light, shade
 from training.samples import make_sample
+from training.scene import COLON, LAPAROSCOPY
 
 
 def _plain_light():
@@ -70,3 +71,50 @@ def test_outside_the_field_of_view_there_is_no_truth_and_no_light():
             assert np.median(sample.rgb[outside].max(-1)) < 60
             return
     pytest.fail("no field of view was drawn in 30 pictures")
+
+
+def _angles(rays, axis):
+    return np.arccos(np.clip(rays @ axis, -1, 1))
+
+
+@pytest.mark.parametrize(("tilt", "steepness"), [((0.0, 0.0), 2.0), ((0.3, -0.2), 2.0), ((0.0, 0.0), 7.0)])
+def test_a_beam_falls_with_the_angle_to_its_own_axis(tilt, steepness):
+    wall = sphere()
+    widest = _angles(wall.rays, np.array([0, 0, 1])).max()
+    beams = np.array([[*tilt, 0.5, steepness, 0.05]] * 2)
+    narrow, even = (shade(wall, _plain_light()._replace(beams=b), 0.0) for b in (beams, _plain_light().beams))
+    turned, angle = widest * np.array(tilt), widest * np.hypot(*tilt)
+    axis = np.array([*(turned * np.sinc(angle / np.pi)), np.cos(angle)])
+    expected = 0.05 + 0.95 * 0.5 ** ((_angles(wall.rays, axis) / (0.5 * widest)) ** steepness)
+    share = narrow[..., 0] / even[..., 0]
+    # Brightness is told by the median of the picture.
+    assert share == pytest.approx(expected * share.max() / expected.max(), rel=2e-3)
+    assert beam_shares(wall.rays, beams) == pytest.approx(expected, rel=2e-3)
+
+
+def test_near_tissue_is_darker_and_instruments_are_not():
+    wall = sphere(40.0)
+    log_distance = np.where(np.arange(WIDTH) < 20, np.log(20.0), wall.log_distance).astype(np.float32)
+    part = np.where(np.arange(48)[:, None] < 10, 7, wall.part).astype(np.uint8)
+    stepped = replace(wall, log_distance=log_distance, part=part)
+    plain = _plain_light()._replace(near=np.zeros(3), tints=np.full((8, 3), 0.5))
+    dark = plain._replace(near=np.array([0.8, -0.3, 0.02]))
+    before, after = (shade(stepped, light, 0.0)[..., 0] for light in (plain, dark))
+    assert before[30, 10] == pytest.approx(4 * before[30, 40], rel=1e-3)
+    assert after[30, 10] == pytest.approx(4 * 0.2 * after[30, 40], rel=1e-3)
+    assert after[5, 10] == pytest.approx(4 * after[30, 40], rel=1e-3)
+
+
+def test_beams_and_dark_near_tissue_are_drawn_seldom_and_change_no_other_draw():
+    open_ones, closed = (
+        [draw_light(np.random.default_rng(n), kind) for n in range(400)] for kind in (LAPAROSCOPY, COLON)
+    )
+    for lights, beamed, darkened in ((open_ones, 0.3, 0.2), (closed, 0.1, 0.04)):
+        assert np.mean([np.isfinite(light.beams[0, 2]) for light in lights]) == pytest.approx(beamed, abs=0.07)
+        assert np.mean([light.near[0] > 0 for light in lights]) == pytest.approx(darkened, abs=0.06)
+    for one, other in zip(open_ones, closed, strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(one[:-2], other[:-2], strict=True))
+    first = [np.random.default_rng(3) for _ in range(2)]
+    draw_light(first[0], LAPAROSCOPY)
+    draw_light(first[1], COLON)
+    assert first[0].random() == first[1].random()

@@ -14,6 +14,7 @@ from training.marching import INSTRUMENT, march_rays, shade_shadows, surface
 from training.render import render_buffers, render_store
 from training.scene import COLON, KINDS, LAPAROSCOPY, SINUS, Scene
 from training.shapes import ELLIPSOID, shape_row
+from training.viewpoint import random_camera
 
 SIZE = (32, 40)
 CAMERA = np.array([0, 24.0, 24.3, 19.0, 16.2, 40, 32], np.float32)
@@ -135,3 +136,13 @@ def test_a_store_of_another_size_is_refused(tmp_path: Path) -> None:
         render_store(tmp_path / "a", 3, (16, 20), 4)
     with pytest.raises(InputError, match=r"no done\.npy"):
         open_store(tmp_path / "b")
+
+
+def test_narrow_lenses_are_drawn_in_the_share_asked_for_and_leave_the_others() -> None:
+    some, none = (
+        [random_camera(np.random.default_rng(n), 160, 128, share) for n in range(300)] for share in (0.2, 0.0)
+    )
+    narrow = [camera[0] == 0 and 2 * np.degrees(np.arctan(80 / camera[1])) < 50.0 for camera in some]
+    assert np.mean(narrow) == pytest.approx(0.2, abs=0.07)
+    for number in np.flatnonzero(~np.array(narrow)):
+        np.testing.assert_array_equal(some[number], none[number])

@@ -15,7 +15,7 @@ from scopemap.depth.scopenet.planes import input_planes
 from training.buffers import Buffers
 from training.instrument_layers import Layer
 from training.instrument_looks import light_of_instruments
-from training.light import INSTRUMENT, Light, brightest, draw_light, shade
+from training.light import INSTRUMENT, Light, beam_shares, brightest, draw_light, shade
 from training.samples import bounce_share, masked, told_rays
 from training.scene import log_uniform
 from training.sensor import motion_kernel, take_picture
@@ -44,7 +44,8 @@ def make_instrument_sample(
 
     hard : with dyes, pale tissue and what else is taken for instruments, and strange as in `take_picture`.
     """
-    light = _harder(draw_light(rng), rng) if hard else draw_light(rng)
+    light = draw_light(rng, buffers.kind)
+    light = _harder(light, rng) if hard else light
     shares = (buffers.part >= INSTRUMENT).astype(np.float32)
     if layer is None:
         linear = shade(buffers, light, bounce_share(rng))
@@ -85,6 +86,7 @@ def _composed(buffers: Buffers, layer: Layer, light: Light, rng: np.random.Gener
     rays = buffers.rays.reshape(-1, 3)[layer.pixel]
     nearer = replace(layer, distance=scale * layer.distance)
     mine = light_of_instruments(nearer, rays, buffers.lamps_mm / median_mm, light, around, rng)
+    mine *= beam_shares(buffers.rays, light.beams).reshape(-1, 1)[layer.pixel]
     instrument = np.zeros((height * width, 3), np.float32)
     instrument[layer.pixel] = mine
     # Premultiplied, so that a blur mixes what is there alone.

@@ -1,7 +1,9 @@
 """From the bare buffers of a scene to linear light at the lens: tissue, paint, wetness and one or two lamps, at random.
 
-Irradiance from a lamp beside the lens falls as cosine over squared distance. What comes back is a diffuse part, a wet
-coat that mirrors the lamp (sharp where the film is calm, broad where it is not) and light that bounced between walls.
+Irradiance from a lamp beside the lens falls as cosine over squared distance, in a share of the scenes also beside the
+axis of a narrow beam, which need not be the view's; in a share, tissue is darker the nearer it is. What comes back is a
+diffuse part, a wet coat that mirrors the lamp (sharp where the film is calm, broad where it is not) and light that
+bounced between walls.
 """
 
 from __future__ import annotations
@@ -13,9 +15,13 @@ import numpy as np
 from numba import njit
 
 from training.buffers import Buffers
+from training.scene import COLON, LAPAROSCOPY, WALL
 
 INSTRUMENT = 7
 _PARTS = 8
+# Shares of closed and of open scenes: in open ones the lamp's beam is seen to end, and organs lie before walls. Chosen,
+# not measured: few enough that dark still means far more often than near.
+_BEAM_SHARES, _DARK_NEAR_SHARES = (0.1, 0.3), (0.04, 0.2)
 _TISSUES = np.array(
     [
         [0.64, 0.27, 0.17],
@@ -40,6 +46,11 @@ class Light(NamedTuple):
     stains : (2, 5) threshold (in units of the noise, above 1: none), softness, RGB that it multiplies by.
     lamps : (2,) brightness. fall : (4,) powers of distance and cosine, of the lamp's own axis, least cosine.
     coat : (5,) sharpness and strength of the sharp, then of the broad coat; tilt of the film.
+    beams : (2, 5) of each lamp: its axis's tilt to the right and down and the angle of half power, all as shares of the
+        widest ray's angle; steepness (2: a Gaussian spot, 8: even within and dark beside, as a vignetted beam is);
+        share of the light that goes everywhere. An angle of inf: no beam.
+    near : (3,) share by which near tissue is darker; ln of the distance, as a share of the median, where half of that
+        is reached; ln distance over which. A share of 0: nothing is.
     """
 
     tints: np.ndarray
@@ -52,10 +63,14 @@ class Light(NamedTuple):
     lamps: np.ndarray
     fall: np.ndarray
     coat: np.ndarray
+    beams: np.ndarray
+    near: np.ndarray
 
 
-def draw_light(rng: np.random.Generator) -> Light:
-    """Return a random light and paint: mostly mild textures, seldom strong ones, wet and dry."""
+def draw_light(rng: np.random.Generator, kind: int = COLON) -> Light:
+    """Return a random light and paint for a scene of that kind: mostly mild textures, seldom strong, wet and dry."""
+    # From a stream of its own: what else is drawn of `rng`, here and later, does not change.
+    aside, is_open = rng.spawn(1)[0], kind in (LAPAROSCOPY, WALL)
     base = _TISSUES[rng.integers(len(_TISSUES))] * rng.uniform(0.75, 1.25, 3)
     other = _TISSUES[rng.integers(len(_TISSUES), size=_PARTS)] * rng.uniform(0.7, 1.3, (_PARTS, 3))
     # Parts of one organ look alike, organs do not.
@@ -82,7 +97,28 @@ def draw_light(rng: np.random.Generator) -> Light:
         coat=np.array(
             [np.exp(rng.uniform(3.0, 7.3)), rng.uniform(0.3, 4.0), rng.uniform(2, 15), broad, rng.uniform(0.02, 0.5)]
         ),
+        beams=_beams(aside, _BEAM_SHARES[is_open]),
+        near=_dark_near(aside, _DARK_NEAR_SHARES[is_open]),
     )
+
+
+def _beams(rng: np.random.Generator, share: float) -> np.ndarray:
+    """Beams (2, 5) of both lamps, in a share of the scenes: spots and vignetted ones, also beside the view's axis."""
+    beams = np.tile([0.0, 0.0, np.inf, 2.0, 0.0], (2, 1))
+    if rng.random() >= share:
+        return beams
+    steepness = 2.0 if rng.random() < 0.5 else rng.uniform(2.0, 8.0)
+    tilt = rng.normal(0, 0.2, 2) if rng.random() < 0.5 else np.zeros(2)
+    beams[:] = *tilt, rng.uniform(0.35, 1.0), steepness, rng.uniform(0, 0.1) * (rng.random() < 0.5)
+    # Two fibre bundles of one instrument differ little.
+    beams[1, :2] += rng.normal(0, 0.05, 2)
+    return beams
+
+
+def _dark_near(rng: np.random.Generator, share: float) -> np.ndarray:
+    """How much darker near tissue is, (3,), in a share of the scenes."""
+    strength = rng.uniform(0.5, 0.95) if rng.random() < share else 0.0
+    return np.array([strength, rng.uniform(-0.5, 0.0), rng.uniform(0.03, 0.2)])
 
 
 def shade(buffers: Buffers, light: Light, bounce: float) -> np.ndarray:
@@ -93,6 +129,7 @@ def shade(buffers: Buffers, light: Light, bounce: float) -> np.ndarray:
     distance_mm = np.exp(buffers.log_distance)
     out = np.zeros((*distance_mm.shape, 3), np.float32)
     albedo = np.zeros_like(out)
+    axes, spreads = _axes_and_spreads(buffers.rays, light.beams)
     _shade(
         distance_mm,
         buffers.rays,
@@ -102,6 +139,7 @@ def shade(buffers: Buffers, light: Light, bounce: float) -> np.ndarray:
         buffers.lit,
         buffers.lamps_mm.astype(np.float64),
         light,
+        (axes, spreads, _median(distance_mm)),
         out,
         albedo,
     )
@@ -111,6 +149,30 @@ def shade(buffers: Buffers, light: Light, bounce: float) -> np.ndarray:
     if bounce > 0:
         out += np.float32(bounce) * albedo * _bounced(out)
     return out
+
+
+def beam_shares(rays: np.ndarray, beams: np.ndarray) -> np.ndarray:
+    """Return the share (H, W) float32, 0..1, of its axis's light that the first lamp of `Light.beams` sends along rays.
+
+    rays : (H, W, 3) unit, of a view. The lamp is taken to be at the lens: it is near, against what it lights.
+    """
+    axes, spreads = _axes_and_spreads(rays, beams)
+    out = np.empty(rays.shape[:2], np.float32)
+    _send(rays, axes[0], spreads[0], out)
+    return out
+
+
+def _axes_and_spreads(rays: np.ndarray, beams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Axes (2, 3), unit, of the lamps, and (2, 3) angle of half power, rad, steepness and share sent everywhere."""
+    widest = float(np.arccos(np.clip(rays[..., 2].min(), -1, 1)))
+    tilt = widest * beams[:, :2]
+    angle = np.linalg.norm(tilt, axis=1, keepdims=True)
+    axes = np.hstack([tilt * np.sinc(angle / np.pi), np.cos(angle)])
+    return axes, np.column_stack([widest * beams[:, 2], beams[:, 3:]])
+
+
+def _median(distance_mm: np.ndarray) -> float:
+    return float(np.nanmedian(distance_mm)) if np.isfinite(distance_mm).any() else 1.0
 
 
 def brightest(light: np.ndarray) -> np.ndarray:
@@ -184,9 +246,26 @@ def _mirrored(normal, noise, tilt, view, towards):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shade(distance, rays, normals, noises, parts, lit, lamps_mm, light, out, albedo):  # type: ignore[no-untyped-def]
-    """Fill out and albedo (H, W, 3)."""
+def _sent(cosine, spread):  # type: ignore[no-untyped-def]
+    """Share of its axis's light that a lamp sends at an angle to it; spread (3,) as `_axes_and_spreads` has it."""
+    angle = np.arccos(min(max(cosine, -1.0), 1.0)) / spread[0]
+    return spread[2] + (1.0 - spread[2]) * np.exp2(-(angle ** spread[1]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _send(rays, axis, spread, out):  # type: ignore[no-untyped-def]
+    """Fill out (H, W) with what is sent along unit rays (H, W, 3)."""
+    for row in range(rays.shape[0]):
+        for column in range(rays.shape[1]):
+            ray = rays[row, column]
+            out[row, column] = _sent(ray[0] * axis[0] + ray[1] * axis[1] + ray[2] * axis[2], spread)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shade(distance, rays, normals, noises, parts, lit, lamps_mm, light, beams, out, albedo):  # type: ignore[no-untyped-def]
+    """Fill out and albedo (H, W, 3); beams: axes, spreads, median distance."""
     towards = np.empty(3)
+    axes, spreads, median_mm = beams
     for row in range(distance.shape[0]):
         for column in range(distance.shape[1]):
             reach = distance[row, column]
@@ -195,6 +274,10 @@ def _shade(distance, rays, normals, noises, parts, lit, lamps_mm, light, out, al
             view, normal, noise = rays[row, column], normals[row, column], noises[row, column]
             part, rgb = parts[row, column], albedo[row, column]
             _paint(noise, part, light, rgb)
+            if light.near[0] > 0 and part != INSTRUMENT:
+                nearer = 1.0 / (1.0 + np.exp((np.log(reach / median_mm) - light.near[1]) / light.near[2]))
+                for c in range(3):
+                    rgb[c] *= 1.0 - light.near[0] * nearer
             wet = light.gloss[part] * min(max(0.4 + 2.0 * noise[7], 0.0), 1.5)
             for n in range(2):
                 seen = lit[row, column, n] * light.lamps[n]
@@ -210,6 +293,11 @@ def _shade(distance, rays, normals, noises, parts, lit, lamps_mm, light, out, al
                     cosine += towards[c] * normal[c]
                 axis = max(-towards[2], 0.05)
                 power = seen * np.exp(light.fall[2] * np.log(axis) - light.fall[0] * np.log(to_lamp))
+                if np.isfinite(spreads[n, 0]):
+                    along = 0.0
+                    for c in range(3):
+                        along -= towards[c] * axes[n, c]
+                    power *= _sent(along, spreads[n])
                 diffuse = power * max(cosine, light.fall[3]) ** light.fall[1]
                 mirror = 0.0
                 if wet > 0:

@@ -55,7 +55,7 @@ class Batch(NamedTuple):
 
 def make_sample(buffers: Buffers, rng: np.random.Generator, *, strange: bool = True) -> Sample:
     """Return a random picture of a scene; equal generators give equal samples. `strange` : see `take_picture`."""
-    rgb, field = take_picture(shade(buffers, draw_light(rng), bounce_share(rng)), rng, strange=strange)
+    rgb, field = take_picture(shade(buffers, draw_light(rng, buffers.kind), bounce_share(rng)), rng, strange=strange)
     valid = field & np.isfinite(buffers.log_distance)
     if rng.random() < _MASKED_SHARE:
         valid = masked(rgb)

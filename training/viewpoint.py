@@ -18,6 +18,8 @@ _LEAST_SPREAD, _MOST_SPREAD = 1.3, 20.0
 # Share of the plain views (spread below 1.8) that are turned down.
 _PLAIN, _TURNED_DOWN = 1.8, 0.6
 _MOST_MISSED = 0.02
+# Laparoscopes and exoscopes can be as narrow as this; in this share of the views of open scenes.
+_NARROW_DEG, _NARROW_SHARE = (35.0, 50.0), 0.2
 
 
 @dataclass(frozen=True)
@@ -38,13 +40,20 @@ class SceneView:
     median: float
 
 
-def random_camera(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Return a random camera (7,): pinhole of 50 to 115 degrees across, or (15 %) a fisheye of up to 140."""
+def random_camera(rng: np.random.Generator, width: int, height: int, narrow: float = 0.0) -> np.ndarray:
+    """Return a random camera (7,): pinhole of 50 to 115 degrees across, or (15 %) a fisheye of up to 140.
+
+    narrow : share of them that are pinholes of 35 to 50 degrees instead.
+    """
+    # From a stream of its own: what else is drawn of `rng` does not change.
+    aside = rng.spawn(1)[0]
     fisheye = rng.random() < 0.15
     if fisheye:
         focal = 0.5 * width / (0.5 * np.deg2rad(rng.uniform(80, 140)))
     else:
         focal = 0.5 * width / np.tan(0.5 * np.deg2rad(rng.uniform(50, 115)))
+    if aside.random() < narrow:
+        fisheye, focal = False, 0.5 * width / np.tan(0.5 * np.deg2rad(aside.uniform(*_NARROW_DEG)))
     shift = np.clip(rng.normal(0, 0.025, 2), -0.06, 0.06) * width
     centre = 0.5 * (width - 1) + shift[0], 0.5 * (height - 1) + shift[1]
     return np.array([fisheye, focal, focal * rng.uniform(0.98, 1.02), *centre, width, height], np.float32)
@@ -52,7 +61,7 @@ def random_camera(rng: np.random.Generator, width: int, height: int) -> np.ndarr
 
 def random_view(scene: Scene, rng: np.random.Generator, width: int, height: int) -> SceneView | None:
     """Return a random view of a scene, or None where the draw is no good: draw again."""
-    camera = random_camera(rng, width, height)
+    camera = random_camera(rng, width, height, _NARROW_SHARE if scene.kind in (LAPAROSCOPY, WALL) else 0.0)
     arrays = scene.arrays()
     ahead: np.ndarray | None
     if scene.kind == COLON:
