@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from training.buffers import Buffers
-from training.scene import COLON, LAPAROSCOPY, WALL
+from training.scene import COLON, LAPAROSCOPY, WALL, log_uniform
 
 INSTRUMENT = 7
 _PARTS = 8
@@ -108,8 +108,8 @@ def _beams(rng: np.random.Generator, share: float) -> np.ndarray:
     if rng.random() >= share:
         return beams
     steepness = 2.0 if rng.random() < 0.5 else rng.uniform(2.0, 8.0)
-    tilt = rng.normal(0, 0.2, 2) if rng.random() < 0.5 else np.zeros(2)
-    beams[:] = *tilt, rng.uniform(0.35, 1.0), steepness, rng.uniform(0, 0.1) * (rng.random() < 0.5)
+    tilt = rng.normal(0, 0.3, 2) if rng.random() < 0.5 else np.zeros(2)
+    beams[:] = *tilt, rng.uniform(0.3, 1.0), steepness, rng.uniform(0, 0.1) * (rng.random() < 0.5)
     # Two fibre bundles of one instrument differ little.
     beams[1, :2] += rng.normal(0, 0.05, 2)
     return beams
@@ -117,8 +117,9 @@ def _beams(rng: np.random.Generator, share: float) -> np.ndarray:
 
 def _dark_near(rng: np.random.Generator, share: float) -> np.ndarray:
     """How much darker near tissue is, (3,), in a share of the scenes."""
-    strength = rng.uniform(0.5, 0.95) if rng.random() < share else 0.0
-    return np.array([strength, rng.uniform(-0.5, 0.0), rng.uniform(0.03, 0.2)])
+    # Down to an eighth, as the green of liver against that of fat in `_TISSUES`, and half that where blood is on it.
+    strength = 1 - log_uniform(rng, 0.06, 0.5) if rng.random() < share else 0.0
+    return np.array([strength, rng.uniform(-0.5, 0.3), rng.uniform(0.03, 0.2)])
 
 
 def shade(buffers: Buffers, light: Light, bounce: float) -> np.ndarray:
