@@ -18,8 +18,10 @@ from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping import Backend, FrameCorrection, TrackedPose
+from scopemap.mapping import backend as backend_module
 from scopemap.mapping.bundle_problem import Observations, Points
 from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.mapping.other_starts import ShapeTest
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)
@@ -82,7 +84,7 @@ def test_flow_is_sampled_at_more_points_than_opencv_allows() -> None:
 
 
 def test_an_error_with_a_keyframe_is_raised_at_a_later_call(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(self: FeatureTracks, keyframe: Frame, map_number: int) -> None:
+    def broken(self: FeatureTracks, keyframe: Frame, map_number: int, known: object) -> None:
         raise RuntimeError("flow broke")
 
     monkeypatch.setattr(FeatureTracks, "add", broken)
@@ -161,14 +163,26 @@ def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
     assert "not rigid" in correction.notice.text
 
 
-def test_poses_stay_as_tracked_where_depth_would_change_too_much() -> None:
-    factors = np.exp(0.5 * np.sin(np.linspace(-2, 2, CAMERA.width))).astype(np.float32)
-    for most, refused in ((0.2, True), (0.6, False)):
-        settings = MappingSettings(constants=MappingConstants(max_depth_change=most, depth_sigma_share=0.5))
-        frames = [replace(frame, depth_mm=frame.depth_mm * factors) for frame in map(_frame, range(5))]
-        correction = plane_scene.adjusted(frames, settings)
-        assert bool(correction.refused) == refused
-        assert ("depth would have to change by" in correction.notice.text) == refused
+def test_an_adjustment_says_what_determines_the_shape() -> None:
+    factors = np.exp(0.2 * np.sin(np.linspace(-2, 2, CAMERA.width))).astype(np.float32)
+    correction = plane_scene.adjusted(
+        [replace(frame, depth_mm=frame.depth_mm * factors) for frame in map(_frame, range(5))]
+    )
+    assert correction.shape.outcome == "determined"
+    assert [notice.code for notice in correction.notices][:2] == ["mapping-adjusted", "shape-determined"]
+
+
+def test_poses_stay_as_tracked_where_the_starts_end_in_different_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    undetermined = ShapeTest("not determined", False, 0.2, 0.3, 0.30, 0.31)
+    monkeypatch.setattr(backend_module, "with_other_starts", lambda problem, found: (found, undetermined))
+    kept = plane_scene.adjusted(map(_frame, range(5)))  # one rigid scene fits: the poses are the better ones
+    assert [notice.code for notice in kept.notices][:2] == ["mapping-adjusted", "shape-not-determined"]
+    monkeypatch.setattr(backend_module, "RIGID_SIGMA_PX", 0.01)
+    correction = plane_scene.adjusted(map(_frame, range(5)))
+    assert [notice.code for notice in correction.notices] == ["mapping-not-determined"]
+    assert "depth network decides" in correction.notice.text
+    assert correction.depth_factor(20) == 1.0
+    np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
 
 
 @pytest.mark.parametrize("zoom", [0.0, 0.04])
@@ -185,7 +199,9 @@ def test_an_adjustment_that_makes_depths_disagree_is_refused(zoom: float, monkey
     monkeypatch.setattr(FeatureTracks, "collected", biased)
     drift = [se3_exp(0.003 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
     tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
-    correction = plane_scene.adjusted(_frame(number, T) for number, T in enumerate(tracked))
+    # Where other starts confirm the shape, depth that was not used does not judge it.
+    settings = MappingSettings(constants=MappingConstants(other_starts=False))
+    correction = plane_scene.adjusted((_frame(number, T) for number, T in enumerate(tracked)), settings)
     assert correction.sigma_px < 0.8
     assert (correction.notice.code == "mapping-depth-disagrees") == bool(zoom)
     before = _errors(tracked, POSES)

@@ -152,3 +152,34 @@ def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
     assert 0.6 * most < len(fewer.point) <= 1.1 * most
     counts = np.bincount(observations.point, minlength=len(points.host))
     assert np.array_equal(np.bincount(fewer.point, minlength=len(fewer_points.host)), counts[::every])
+
+
+class _Counted(DisFlow):
+    """DIS flow; pairs : how often flow between two pictures was found."""
+
+    pairs = 0
+
+    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self.pairs += 1
+        return super().estimate_both(rgb_a, rgb_b)
+
+    def estimate_both_from(
+        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        self.pairs += 1
+        return super().estimate_both_from(rgb_a, rgb_b, start)
+
+
+def test_what_windows_have_matched_is_not_matched_again() -> None:
+    frames = [plane_scene.frame(plane_scene.pose(at_mm=(1.5 * n, 0.5 * n, 0.0)), n) for n in range(5)]
+    settings, shared = MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2, 3))), _Counted()
+    alone, far = FeatureTracks(settings, DisFlow()), FeatureTracks(settings, shared)
+    near = FeatureTracks(settings, DisFlow(), gaps=(1, 2))
+    for frame in frames:
+        alone.add(frame)
+        far.add(frame, known=near.add(frame))
+    for one, other in zip(alone.collected(), far.collected(), strict=True):
+        for name in vars(one):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    # Only keyframes three apart are left: 0 and 3, 1 and 4.
+    assert shared.pairs == 2

@@ -151,8 +151,8 @@ def test_no_function_takes_keywords_it_does_not_name() -> None:
 
 
 CEILINGS = {
-    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 105),
-    "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 105),
+    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 107),
+    "lines of pipeline.py": (lambda: _read(SOURCE / "pipeline.py").lines, 106),
     "settings": (lambda: len(setting_names()), 46),
 }
 
@@ -245,8 +245,8 @@ def import_closure(start: str) -> set[str]:
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.pipeline")
     assert "scopemap.mapping.backend" in closure
-    # With notices, causes of losses, local adjustment, its lens, moving tissue, the skin of its states.
-    assert len(closure) <= 73, "\n".join(sorted(closure))
+    # With notices, causes of losses, local adjustment, its lens, other starts, moving tissue, the skin of its states.
+    assert len(closure) <= 75, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

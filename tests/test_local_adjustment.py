@@ -41,7 +41,7 @@ def _keyframes(adjustment: LocalAdjustment | None, split: bool = False) -> list[
             moved = plane_scene.see(pose @ se3_exp(np.array([0, 0, 0, 0, 0.8 * (-1) ** n, 0])))
             frame.rgb[:, half:] = moved.rgb[:, half:]
         frame = replace(frame, depth_mm=frame.depth_mm * np.exp(BEND))
-        found.append(frame if adjustment is None else adjustment.adjusted(frame, max(n - 1, 0), 0))
+        found.append(frame if adjustment is None else adjustment.adjusted(frame, max(n - 1, 0), 0)[0])
     return found
 
 
@@ -68,7 +68,8 @@ def test_bent_depth_and_wrong_steps_are_corrected_as_keyframes_come() -> None:
     assert _bend_left(tracked[-1]) > 0.08
     assert max(map(_bend_left, adjusted[1:])) < 0.02
     assert _step_errors_mm(adjusted).max() < 0.1 < 0.2 * _step_errors_mm(tracked).mean()
-    notice, lens = local.notices(0)
+    notice, shape, lens = local.notices(0)
+    assert shape.code == "shape-determined"
     assert (notice.code, notice.values) == ("mapping-local", {"adjusted": COUNT - 1, "refused": 0})
     assert lens.code == "camera-unconfirmed"  # one plane tells little of it
     assert not local.notices(1)
@@ -99,7 +100,7 @@ def test_a_keyframe_that_was_not_tracked_against_the_window_is_not_adjusted_with
     local = LocalAdjustment(LOCAL, DisFlow())
     _keyframes(local)
     frame = plane_scene.frame(TRUE[-1], COUNT)
-    begun = local.adjusted(frame, reference, 1)
+    begun = local.adjusted(frame, reference, 1)[0]
     np.testing.assert_allclose(begun.T_world_camera, frame.T_world_camera, atol=1e-12)
     np.testing.assert_array_equal(begun.depth_mm, frame.depth_mm)
     assert not local.notices(1)
@@ -110,7 +111,8 @@ def test_a_keyframe_that_sees_nothing_of_those_before_takes_over_the_correction(
     last = _keyframes(local)[-1]
     elsewhere = plane_scene.frame(plane_scene.pose(at_mm=(60, -50, 0)), COUNT)
     elsewhere = replace(elsewhere, depth_mm=plane_scene.frame(TRUE[-1]).depth_mm * np.exp(BEND))
-    np.testing.assert_allclose(local.adjusted(elsewhere, COUNT - 1, 0).depth_mm, last.depth_mm, rtol=1e-5)
+    again, _ = local.adjusted(elsewhere, COUNT - 1, 0)
+    np.testing.assert_allclose(again.depth_mm, last.depth_mm, rtol=1e-5)
     local.adjusted(plane_scene.frame(TRUE[0], COUNT + 1), COUNT, 0)  # after it, nothing is observed at all
     assert local.notices(0)[0].values == {"adjusted": COUNT - 1, "refused": 0}
 

@@ -141,7 +141,7 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
     ("facts", "words"),
     [
         ({"camera": {"origin": "assumed"}}, "lens is a guess"),
-        (notices(Notice("mapping-not-rigid", {"merged": "", "reason": "0.98 px"})), "one rigid shape"),
+        (notices(Notice("mapping-not-rigid", {"merged": "", "sigma_px": 0.98})), "one rigid shape"),
         (notices(Notice("mapping-none")), "not adjusted: no other view confirms"),
         (notices(Notice("camera-at-rest")), "hardly moves"),
         (notices(Notice("camera-distorted", {"share": 0.12})), "bends straight lines"),
@@ -150,10 +150,13 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
         (notices(Notice("camera-off-centre", {"x": 0.1, "y": 0.0})), "another centre of the lens"),
         (notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})), "as tracked"),
         (notices(moving(30)), "moves on its own in 30 of 60"),
-        (notices(adjusted(16, 3.1)), "by up to 3 degrees"),
+        (notices(Notice("shape-not-determined", {"error_px": 0.3, "other_px": 0.31})), "does not determine the shape"),
+        (
+            notices(Notice("mapping-not-determined", {"error_px": 0.3, "other_px": 0.31, "merged": ""})),
+            "rests on the depth network alone",
+        ),
         (notices(Notice("depth-triangulated", {"triangulated": 3, "keyframes": 6})), "in 3 of 6 keyframes only"),
         (notices(Notice("mapping-without-observations", {"keyframes": 1})), "no other view confirms"),
-        (notices(adjusted(100, 6.1)), "by up to 6 degrees"),
         ({"interrupted_at_frame": 30}, "was stopped at frame 30"),
     ],
 )
@@ -170,6 +173,15 @@ def test_tissue_that_moves_in_few_frames_and_a_usual_adjustment_are_no_doubt() -
     assert verdict(run_of([0] * 60, **notices(moving(60), at_rest))).word == "good"
     confirmed = Notice("depth-triangulated", {"triangulated": 4, "keyframes": 6})
     assert verdict(run_of([0] * 60, **notices(adjusted(100, 5.9), confirmed))).word == "good"
+
+
+def test_where_the_motion_determines_the_shape_triangulation_need_not() -> None:
+    few = Notice("depth-triangulated", {"triangulated": 3, "keyframes": 6})
+    assert verdict(run_of([0] * 60, **notices(few))).word == "doubtful"
+    determined = Notice("shape-determined", {"correlation": 0.99})
+    assert verdict(run_of([0] * 60, **notices(few, determined))).word == "good"
+    decided = Notice("shape-decided", {"error_px": 0.2, "other_px": 0.3})
+    assert verdict(run_of([0] * 60, **notices(few, decided))).word == "good"
 
 
 def run_of_submaps(*submaps: tuple[int, int, float]) -> Reconstruction:

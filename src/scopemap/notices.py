@@ -140,8 +140,32 @@ KINDS: dict[str, _Kind] = {
     ),
     "mapping-not-rigid": _Kind(
         "doubtful",
-        "mapping: poses are as tracked{merged}; the scene is not rigid or the focal length is wrong: {reason}",
+        "mapping: poses are as tracked{merged}, and the depth network decides the shape; the scene is not rigid or the "
+        "focal length is wrong: reprojection errors stay at {sigma_px:.2f} px (robust standard deviation)",
         "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed",
+    ),
+    "shape-determined": _Kind(
+        "info",
+        "mapping: the motion determines the shape; the adjustment finds it from another start, too (correlation of the "
+        "relief {correlation:.2f})",
+    ),
+    "shape-decided": _Kind(
+        "note",
+        "mapping: starts of the adjustment end in different shapes; two of them in the one taken, with clearly smaller "
+        "errors of tracks left out: {error_px:.2f} px, {other_px:.2f} px for the other",
+        "Two shapes fit the views; the one that was taken fits them clearly better",
+    ),
+    "shape-not-determined": _Kind(
+        "doubtful",
+        "mapping: starts of the adjustment end in different shapes; that of the depth network stands (errors of tracks "
+        "left out {error_px:.2f} px, of the other {other_px:.2f} px)",
+        "The motion does not determine the shape: it rests on the depth network alone",
+    ),
+    "mapping-not-determined": _Kind(
+        "doubtful",
+        "mapping: poses are as tracked{merged}, and the depth network decides the shape; starts of the adjustment end "
+        "in different shapes (errors of tracks left out {error_px:.2f} and {other_px:.2f} px)",
+        "The motion does not determine the shape: it rests on the depth network alone",
     ),
     "mapping-tissue-moves": _Kind(
         "doubtful",

@@ -13,7 +13,7 @@ A frame is tracked by the keyframe's corners, or by RTDL. The preset `paper` ref
 
 from __future__ import annotations
 
-from scopemap.config import Config
+from scopemap.config import Config, MappingSettings
 from scopemap.faults import notices_of_faults
 from scopemap.frame import Frame
 from scopemap.fusion.frame_store import FrameStore
@@ -48,12 +48,13 @@ class Pipeline:
         if tracker is None and estimators.tracker is not None:
             tracker = estimators.tracker()
         tracker = tracker or Tracker(config.tracking, estimators.corner_flow, estimators.features)
-        at_rest = {"method": "none"} if config.tracking.camera_at_rest else {}  # there is nothing to adjust
-        mapping = config.mapping.model_copy(update=at_rest)
+        # Of a camera at rest there is nothing to adjust.
+        mapping = MappingSettings(method="none") if config.tracking.camera_at_rest else config.mapping
         features, anchored = estimators.features, config.depth.is_anchored
         mapper = Mapper(mapping, estimators.keyframe_flow, store.table, features, anchored)
         local = mapping.constants.local_window and estimators.keyframe_flow.name != "none"
-        adjustment = LocalAdjustment(mapping, estimators.keyframe_flow) if local else None
+        # In the tracker's thread, so with its flow: that between keyframes is the back end's.
+        adjustment = LocalAdjustment(mapping, estimators.corner_flow) if local else None
         self.odometry = Odometry(config, tracker, mapper, adjustment)
         self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.at_end)
 

@@ -19,9 +19,10 @@ class MappingConstants:
     # False: depth as predicted, corrected at the keyframes' corners.
     triangulate_depth: bool = True
     keyframe_gaps: tuple[int, ...] = (1, 2, 3, 5, 8, 16, 32)  # a keyframe's corners are matched in those so many before
-    # Keyframes that each new one is adjusted with, itself among them, before frames are tracked against it; 0: all are
-    # adjusted after the last frame.
-    local_window: int = 0
+    # Keyframes that each new one is adjusted with, itself among them, before frames are tracked against it; 0: none.
+    local_window: int = 5
+    local_gaps: tuple[int, ...] = (1, 2)  # there a keyframe's corners are matched in those so many before
+    global_adjustment: bool = True  # of all keyframes after the last frame
     # So many observations count as one: errors of flow are alike at neighbouring corners.
     correlated_observations: float = 4.0
     depth_sigma_share: float = 0.2  # standard deviation that every estimated depth has at least, over the depth
@@ -29,24 +30,24 @@ class MappingConstants:
     depth_step_sigma: float = 0.1  # of ln depth between nodes of the depth correction field; 0: depth is only scaled
     rotation_sigma_deg: float = 3.0  # standard deviation of the tracked rotation between keyframes
     translation_sigma_share: float = 0.1  # of the tracked translation between keyframes, over the median depth
-    # Poses stay as tracked where the robust sigma of adjusted reprojection errors, or the median change of ln depth is
-    # larger.
-    max_sigma_px: float = 0.8
-    max_depth_change: float = 0.3
+    max_sigma_px: float = 0.8  # robust, of adjusted reprojection errors; poses stay as tracked where it is larger
+    other_starts: bool = True  # try other starts of the adjustment; False: the shape is taken for determined
     # Where a rigid scene leaves errors, try tissue that moves by one curve over time; False: poses stay as they are.
     moving_tissue: bool = True
 
 
 MAPPING: dict[str, dict[str, Any]] = {
     "full": {},
-    "none": {},
+    "none": {"local_window": 0, "global_adjustment": False},
+    "no-windows": {"local_window": 0},
+    "one-start": {"other_starts": False},
     "no-loops": {"min_loop_inliers": 0},
     "no-triangulation": {"triangulate_depth": False},
     "previous-keyframe-only": {"keyframe_gaps": (1,)},
-    "local": {"triangulate_depth": False, "min_loop_inliers": 0, "keyframe_gaps": (1, 2), "local_window": 5},
+    "local": {"triangulate_depth": False, "min_loop_inliers": 0, "global_adjustment": False},
     "fixed-depth": {"scale_sigma": 1e-3},
     "rigid": {"moving_tissue": False},
-    "always-adjusted": {"max_sigma_px": 99.0, "max_depth_change": 9.0, "moving_tissue": False},
+    "always-adjusted": {"max_sigma_px": 99.0, "other_starts": False, "moving_tissue": False},
 }
 
 
@@ -65,7 +66,7 @@ class MappingSettings(StageSettings):
     @property
     def at_end(self) -> bool:
         """Whether keyframes are adjusted after the last frame."""
-        return self.method != "none" and not self.constants.local_window
+        return self.constants.global_adjustment
 
 
 @dataclass(frozen=True)

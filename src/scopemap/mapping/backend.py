@@ -12,25 +12,25 @@ import numpy as np
 
 from scopemap.cameras.camera import PinholeCamera
 from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingConstants
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.align import Similarity
 from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px
+from scopemap.mapping.bundle_adjustment import RIGID_SIGMA_PX, BundleSolution, adjust_in_windows, errors_px
 from scopemap.mapping.bundle_problem import BundleProblem, Points, Priors, State
 from scopemap.mapping.depth_correction import (
     DepthCorrectionField,
-    depth_disagreement,
     depth_grid,
     fit_depth_corrections,
+    growth_of_disagreement,
 )
-from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.mapping.lens_residual import lens_residual
 from scopemap.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
 from scopemap.mapping.map_merging import AdjustedMaps, Part, loop_support, merge_maps, split_maps
 from scopemap.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
+from scopemap.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.mapping.pose_graph import (
     PathWithoutDrift,
     optimise_pose_graph,
@@ -42,10 +42,6 @@ from scopemap.mapping.pose_interpolation import FrameCorrection, TissueMotion, T
 from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
 
-# Standard deviation of ln depth below which a point tests rigidity; with a smaller share of such points nothing does.
-_TEST_SIGMA, _MIN_TEST_SHARE = 0.1, 0.1
-# Disagreement of depth, ln, that a right adjustment may leave: errors of networks themselves; and its growth by noise.
-_DEPTH_ERROR, _MAX_DEPTH_FACTOR = 0.05, 1.1
 # Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
 _MAX_PART_ERROR = 0.05
 # Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
@@ -95,11 +91,11 @@ class Backend:
         """Return the number of keyframes of a map."""
         return sum(pose.map == map_number for pose in self._tracked)
 
-    def add(self, keyframe: Frame, tracked: TrackedPose | None = None) -> None:
+    def add(self, keyframe: Frame, tracked: TrackedPose | None = None, matches: KeyframeMatches | None = None) -> None:
         """Take a keyframe with depth and pose, later than those before; poses of one map share a world.
 
-        tracked : pose as tracked; None: in map 0, from the keyframe before. Raises an error of an earlier keyframe's
-        feature tracks, and ValueError without a pose or a depth.
+        tracked : pose as tracked; None: in map 0, from the keyframe before. matches : what is known of its feature
+        tracks. Raises an error of an earlier keyframe's feature tracks, and ValueError without a pose or a depth.
         """
         if keyframe.T_world_camera is None or keyframe.depth_mm is None:
             raise ValueError("a keyframe needs a pose and a depth")
@@ -115,7 +111,7 @@ class Backend:
         self._grid_shape = grid.shape
         while self._pending and self._pending[0].done():
             self._pending.popleft().result()
-        self._pending.append(self._worker.submit(self._observe, keyframe, tracked.map))
+        self._pending.append(self._worker.submit(self._observe, keyframe, tracked.map, matches))
 
     def replace_tracked(self, change: Callable[[TrackedPose], TrackedPose]) -> None:
         """Change the poses as tracked of all keyframes, after the last one."""
@@ -209,10 +205,10 @@ class Backend:
         others = ends[(ends == number).any(1)].sum(1) - number
         return max(sorted(merged), key=lambda one: int((others == one).sum()))
 
-    def _observe(self, keyframe: Frame, map_number: int) -> None:
+    def _observe(self, keyframe: Frame, map_number: int, matches: KeyframeMatches | None) -> None:
         """Add a keyframe's feature tracks and loop closures."""
         self._camera = keyframe.camera
-        self._tracks.add(keyframe, map_number)
+        self._tracks.add(keyframe, map_number, matches)
         if self._finder is not None:
             self._take(self._finder.add(keyframe, map_number))
 
@@ -248,8 +244,16 @@ class Backend:
         chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
         map_of = np.array([self._tracked[k].map for k in chosen])
         problem, accepted = self._problem(chosen, worlds, self._camera)
-        points, observations, found = problem.points, problem.observations, adjust_in_windows(problem)
-        refused, fields = self._judged(chosen, problem, found, worlds)
+        points, observations, found, shape = (
+            problem.points,
+            problem.observations,
+            adjust_in_windows(problem),
+            ShapeTest(),
+        )
+        is_rigid = found.sigma_px <= self.settings.max_sigma_px
+        if is_rigid and len(worlds) == 1 and self.settings.other_starts:
+            found, shape = with_other_starts(problem, found)
+        refused, fields = self._judged(chosen, problem, found, shape, worlds)
         host, observer = map_of[points.host[observations.point]], map_of[observations.keyframe]
 
         def sigmas_px(state: State) -> tuple[list[float], float]:
@@ -265,6 +269,7 @@ class Backend:
         index = np.array(self._frames)[chosen]
         if not refused:
             correction = replace(self._correction(chosen, worlds, found), loops=len(accepted), depth_fields=fields)
+            correction = replace(correction, shape=shape)
         elif len(worlds) > 1 and problem.start is not None:
             by_graph = found._replace(state=graph._replace(sigma_px=found.sigma_px))
             correction = self._correction(chosen, worlds, by_graph)
@@ -274,6 +279,7 @@ class Backend:
         else:
             as_tracked = np.tile(np.eye(4), (len(chosen), 1, 1))
             correction = FrameCorrection(index, as_tracked, np.zeros(len(index)), found.sigma_px, refused=refused)
+            correction = replace(correction, shape=shape)
         correction = replace(correction, loop_frames=index[accepted].tolist() if correction.loops else [])
         # A map of one keyframe has no observations: NaN.
         largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
@@ -334,12 +340,22 @@ class Backend:
         return FrameCorrection(index, T_world_world, log_scale, found.sigma_px, depth_mm=depth_mm)
 
     def _judged(
-        self, chosen: list[int], problem: BundleProblem, found: BundleSolution, worlds: Mapping[int, Similarity]
+        self,
+        chosen: list[int],
+        problem: BundleProblem,
+        found: BundleSolution,
+        shape: ShapeTest,
+        worlds: Mapping[int, Similarity],
     ) -> tuple[Notice | None, tuple[DepthCorrectionField, ...]]:
         """Return why a solution is refused, None where it is not, and its depth correction fields."""
-        if reason := contradiction(problem.points, found, self.settings):
-            return Notice("mapping-not-rigid", {"reason": reason, "merged": ""}), ()
+        if not found.sigma_px <= self.settings.max_sigma_px:  # NaN: nothing was observed
+            return Notice("mapping-not-rigid", {"sigma_px": found.sigma_px, "merged": ""}), ()
+        if shape.is_contradicted and found.sigma_px > RIGID_SIGMA_PX:  # else poses fit the views all the same
+            errors = {"error_px": shape.error_px, "other_px": shape.other_px}
+            return Notice("mapping-not-determined", {**errors, "merged": ""}), ()
         fields = self._fields(chosen, problem.points, found)
+        if shape.outcome != "not tested":  # depth that is not used cannot judge what several starts agree on
+            return None, fields
         return self._depth_contradiction(chosen, found, fields, worlds), fields
 
     def _fields(self, chosen: list[int], points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
@@ -368,27 +384,13 @@ class Backend:
         if fields:
             factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
             after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
-        both = ((self._as_tracked(chosen, worlds), before), (inverse(found.state.T_camera_world), after))
         # Farther apart two keyframes may have a few pixels in common, which prove nothing.
         gaps = [gap for gap in self.settings.keyframe_gaps if gap <= MOST_RECENT]
-        tracked, adjusted = (depth_disagreement(self._camera, T, grids, gaps) for T, grids in both)
-        for was, now in zip(tracked, adjusted, strict=True):
-            if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
-                values = {"adjusted": float(now), "tracked": float(was), "merged": ""}
-                return Notice("mapping-depth-disagrees", values)
-        return None
-
-
-def contradiction(points: Points, found: BundleSolution, settings: MappingConstants) -> str:
-    """Return why a rigid scene does not explain the observations, "" where it does."""
-    if not found.sigma_px <= settings.max_sigma_px:
-        return f"reprojection errors stay at {found.sigma_px:.2f} px (robust standard deviation)"
-    certain = found.log_depth_sigma < _TEST_SIGMA
-    change = np.abs(_depth_change(points, found)[certain])
-    # Errors of networks are smaller almost everywhere; tissue that swells before a camera at rest looks like this.
-    if certain.sum() > _MIN_TEST_SHARE * len(certain) and np.median(change) > settings.max_depth_change:
-        return f"depth would have to change by {100 * np.expm1(np.median(change)):.0f} %"
-    return ""
+        both = (self._as_tracked(chosen, worlds), before), (inverse(found.state.T_camera_world), after)
+        grown = growth_of_disagreement(self._camera, *both, gaps)
+        if grown is None:
+            return None
+        return Notice("mapping-depth-disagrees", {"tracked": grown[0], "adjusted": grown[1], "merged": ""})
 
 
 def _depth_change(points: Points, found: BundleSolution) -> np.ndarray:

@@ -43,8 +43,12 @@ CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 _POINT_STEPS = 5  # of the points alone, after the keyframes
+_ADDED_WITH, _ADDED_ITERATIONS = 2, 6  # keyframes before a new one that move with it, and steps of each search
 WINDOW = 300
 """Most keyframes that are adjusted at once."""
+RIGID_SIGMA_PX = 0.45
+"""Robust standard deviation of reprojection errors that a rigid scene leaves at most: between near keyframes 0.3, in a
+fast, interlaced video (C3VD trans_t2_a) 0.45. Where tissue moves it is 0.4 to 1.5."""
 HELD_SIGMA = 0.01
 """Least standard deviation of ln depth of points that an earlier window adjusted."""
 
@@ -76,23 +80,42 @@ def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSol
     # Equally long windows: a last one of few keyframes would hardly be adjusted.
     edges = np.linspace(0, count, -(-count // window) + 1).astype(int)
     for first, end in itertools.pairwise(edges):
+        if first:  # From where the window before has ended.
+            state, at_start = found.state, problem.begin.T_camera_world
+            T = state.T_camera_world.copy()
+            T[first:] = at_start[first:] @ inverse(at_start[first - 1]) @ T[first - 1]
+            found = found._replace(state=state._replace(T_camera_world=T))
         found = _with_window(problem, found, first, end)
     lengths_px = errors_px(problem, found.state)
     sigma_px = robust_sigma_2d(lengths_px[np.isfinite(lengths_px)], problem.least_sigma_px)
     return found._replace(state=found.state._replace(sigma_px=sigma_px))
 
 
-def _with_window(problem: BundleProblem, found: BundleSolution, first: int, end: int) -> BundleSolution:
+def adjust_one_by_one(problem: BundleProblem) -> BundleSolution:
+    """Return the solution of keyframes that are added one after the other, as incremental structure from motion does.
+
+    Each begins at the pose of the one before and is adjusted with the two before it, those before these held; then all
+    together.
+    """
+    found = BundleSolution(problem.begin, np.full(len(problem.points.host), np.inf), 0)
+    for k in range(1, len(problem.T_camera_world)):
+        T = found.state.T_camera_world.copy()
+        T[k] = T[k - 1]
+        found = found._replace(state=found.state._replace(T_camera_world=T))
+        found = _with_window(problem, found, max(k - _ADDED_WITH, 0), k + 1, _ADDED_ITERATIONS)
+    return adjust_in_windows(replace(problem, start=found.state))
+
+
+def _with_window(
+    problem: BundleProblem, found: BundleSolution, first: int, end: int, max_iterations: int = 20
+) -> BundleSolution:
     """Return the solution with the keyframes from `first` to before `end` adjusted, those before `first` being so."""
     points, seen, state = problem.points, problem.observations, found.state
     moved = state.T_camera_world.copy()
-    if first:  # From where the window before has ended.
-        at_start = problem.begin.T_camera_world
-        moved[first:] = at_start[first:] @ inverse(at_start[first - 1]) @ moved[first - 1]
     host, observer = points.host[seen.point], seen.keyframe
     some = (np.maximum(host, observer) >= first) & (np.maximum(host, observer) < end)
     if not some.any():
-        return found._replace(state=state._replace(T_camera_world=moved))
+        return found
     keyframes = np.union1d(np.union1d(host[some], observer[some]), np.arange(max(first - 1, 0), end))
     own = np.union1d(seen.point[some], np.flatnonzero((points.host >= first) & (points.host < end)))
     place = np.full(len(state.T_camera_world), -1)
@@ -109,7 +132,7 @@ def _with_window(problem: BundleProblem, found: BundleSolution, first: int, end:
         start=State(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.lens),
         held=int((keyframes < first).sum()),
     )
-    solved, new = adjust(part), ~known
+    solved, new = adjust(part, max_iterations=max_iterations), ~known
     log_depth, sigma, log_scale = state.log_depth.copy(), found.log_depth_sigma.copy(), state.log_scale.copy()
     log_depth[own[new]], sigma[own[new]] = solved.state.log_depth[new], solved.log_depth_sigma[new]
     moved[keyframes], log_scale[keyframes] = solved.state.T_camera_world, solved.state.log_scale

@@ -39,6 +39,8 @@ _ITERATIONS = 3
 _MIN_POINTS = 10
 # The first and the last level are these percentiles of the points' ln depths.
 _LEVEL_PERCENTILES = (1, 99)
+# Disagreement of depth, ln, that a right adjustment may leave: errors of networks themselves; and its growth by noise.
+_DEPTH_ERROR, _MAX_DEPTH_FACTOR = 0.05, 1.1
 _GRID_PX = 8  # between the pixels whose depth is compared between keyframes
 
 
@@ -132,6 +134,23 @@ def depth_disagreement(
     if not compared:
         return float("nan"), float("nan")
     return float(np.median(np.concatenate(compared))), float(np.median(compared[-1]))
+
+
+def growth_of_disagreement(
+    camera: PinholeCamera,
+    before: tuple[np.ndarray, Sequence[np.ndarray]],
+    after: tuple[np.ndarray, Sequence[np.ndarray]],
+    gaps: Collection[int],
+) -> tuple[float, float] | None:
+    """Return by how much depths of keyframes disagree before and after an adjustment, where that is clearly more.
+
+    before, after : poses and depths as `depth_disagreement` takes them. None: they agree about as well as before.
+    """
+    both = (depth_disagreement(camera, *each, gaps) for each in (before, after))
+    for was, now in zip(*both, strict=True):
+        if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
+            return was, now
+    return None
 
 
 def _log_ratios(

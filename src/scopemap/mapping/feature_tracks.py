@@ -7,8 +7,10 @@ parallax outweighs what flow lags behind, from where their depth and poses as tr
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -60,32 +62,70 @@ class _FlowKeyframe:
         self.pattern = normalised_brightness(self.frame.rgb)
 
 
+class PairMatches(NamedTuple):
+    """Corners of two keyframes that were found in the other one: their numbers (n,), and where there, (n, 2) px."""
+
+    of_past: tuple[np.ndarray, np.ndarray]
+    of_new: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def corners(self) -> int:
+        """Number of corners of both that were found."""
+        return len(self.of_past[0]) + len(self.of_new[0])
+
+
+class KeyframeMatches(NamedTuple):
+    """What was matched of a new keyframe, so that nobody does it again.
+
+    corners : (n, 2) int px. pairs : its matches with earlier keyframes, by the numbers of their frames. latest : number
+    of the frame of the keyframe before. coarse : small flows from that one, and back; None: they are unknown.
+    """
+
+    corners: np.ndarray
+    pairs: Mapping[int, PairMatches] = MappingProxyType({})
+    latest: int = -1
+    coarse: FlowPair | None = None
+
+
 _POINT = np.dtype([("host", np.int64), ("pixel", np.float64, (2,)), ("log_depth", np.float64), ("sigma", np.float32)])
 _MATCH = np.dtype([("point", np.int64), ("keyframe", np.int64), ("pixel", np.float64, (2,))])
 """An observation, in the order in which they were found; its pixel is as in the image."""
 
 
 class FeatureTracks:
-    """Takes keyframes one by one; each is matched both ways with those `keyframe_gaps` before it in its map."""
+    """Takes keyframes one by one; each is matched both ways with earlier ones of its map.
 
-    def __init__(self, settings: MappingSettings, flow: FlowEstimator, table: RowTable = rows_in_memory) -> None:
+    gaps : how many keyframes before it these are; None: `keyframe_gaps` of the settings.
+    """
+
+    def __init__(
+        self,
+        settings: MappingSettings,
+        flow: FlowEstimator,
+        table: RowTable = rows_in_memory,
+        gaps: Collection[int] | None = None,
+    ) -> None:
         self.settings, self._flow = settings.constants, flow
+        self._gaps = gaps or self.settings.keyframe_gaps
         self._recent: dict[int, deque[_FlowKeyframe]] = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
         self.keyframe_count = 0
         self._camera: PinholeCamera | None = None
 
-    def add(self, keyframe: Frame, map_number: int = 0) -> None:
-        """Take a keyframe with depth: its corners become points, and are matched with earlier keyframes."""
+    def add(self, keyframe: Frame, map_number: int = 0, known: KeyframeMatches | None = None) -> KeyframeMatches:
+        """Take a keyframe with depth: its corners become points, and are matched with earlier keyframes.
+
+        known : what was matched of it elsewhere. Returns what is known now.
+        """
         assert keyframe.depth_mm is not None
-        corners = detect_corners(keyframe, _CELL_PX)
+        corners = detect_corners(keyframe, _CELL_PX) if known is None else known.corners
         rows, columns = corners[:, 1], corners[:, 0]
         self._camera = keyframe.camera
         log_depth = np.log(keyframe.depth_mm[rows, columns].astype(np.float64))
         share = relative_sigma(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
         first = self._add_points(self.keyframe_count, corners, log_depth, np.nan_to_num(share, nan=0.0))
         # The map that was used last is the last one.
-        recent = self._recent[map_number] = self._recent.pop(map_number, deque(maxlen=max(self.settings.keyframe_gaps)))
+        recent = self._recent[map_number] = self._recent.pop(map_number, deque(maxlen=max(self._gaps)))
         for oldest in [*self._recent][:-_MOST_MAPS]:
             del self._recent[oldest]
         # With the flows, and the older keyframes, of each new map memory would grow by tens of megabytes.
@@ -96,38 +136,58 @@ class FeatureTracks:
                 past.composed = None
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
         new = _FlowKeyframe(self.keyframe_count, number_in_map, _slim(keyframe), corners, first)
-        self._match_with(recent, new)
+        matches = self._match_with(recent, new, known or KeyframeMatches(corners))
         recent.append(new)
         self.keyframe_count += 1
+        return matches
 
-    def _match_with(self, recent: deque[_FlowKeyframe], new: _FlowKeyframe) -> None:
-        """Match a new keyframe both ways with recent ones of its map, the latest first."""
+    def _match_with(self, recent: deque[_FlowKeyframe], new: _FlowKeyframe, known: KeyframeMatches) -> KeyframeMatches:
+        """Match a new keyframe both ways with recent ones of its map, the latest first; return what is known then."""
         if not recent:
-            return
-        latest = recent[-1]
-        step, size = self._flow.estimate_both(latest.frame.rgb, new.frame.rgb), new.frame.valid.shape[::-1]
-        coarse = _resized(step, (size[0] // _DOWNSCALE, size[1] // _DOWNSCALE))
-        overlaps = True
+            return known
+        latest, size = recent[-1], new.frame.valid.shape[::-1]
+        step: FlowPair | None = None
+        coarse = known.coarse if known.latest == latest.frame.index else None
+        if coarse is None:
+            step = self._flow.estimate_both(latest.frame.rgb, new.frame.rgb)
+            coarse = _resized(step, (size[0] // _DOWNSCALE, size[1] // _DOWNSCALE))
+        pairs, overlaps = dict(known.pairs), True
         for past in reversed(recent):
-            gap = new.number_in_map - past.number_in_map
-            wanted = overlaps and gap in self.settings.keyframe_gaps
-            start: FlowPair | None = step
-            if gap > MOST_RECENT:
-                past.composed = None
-                start = _expected_flows(past.frame, new.frame) if wanted else None
-            elif past is latest:
-                past.composed = coarse
-            elif past.composed is not None:
-                past.composed = _composed(past.composed[0], coarse[0]), _composed(coarse[1], past.composed[1])
-                start = past.composed
-            elif overlaps:
-                start = self._flow.estimate_both(past.frame.rgb, new.frame.rgb)
-                past.composed = _resized(start, coarse[0].shape[1::-1])
-            if wanted and start is not None:
+            gap, number = new.number_in_map - past.number_in_map, past.frame.index
+            wanted = overlaps and gap in self._gaps
+            start = self._start(past, new, coarse, gap, wanted=wanted, overlaps=overlaps)
+            if wanted and number not in pairs and start is not None:
                 both = past.frame.rgb, new.frame.rgb
-                flows = step if past is latest else self._flow.estimate_both_from(*both, _resized(start, size))
-                found = self._match(past, new, flows) + self._match(new, past, flows[::-1])
-                overlaps = found >= _LEAST_MATCHED * (len(past.corners) + len(new.corners))
+                flows = step if past is latest else None
+                if flows is None:
+                    flows = self._flow.estimate_both_from(*both, _resized(start, size))
+                pairs[number] = PairMatches(_matched(past, new, flows), _matched(new, past, flows[::-1]))
+            if wanted and number in pairs:
+                found = pairs[number]
+                self._add_matches(past.first_point + found.of_past[0], new.number, found.of_past[1])
+                self._add_matches(new.first_point + found.of_new[0], past.number, found.of_new[1])
+                overlaps = found.corners >= _LEAST_MATCHED * (len(past.corners) + len(new.corners))
+        return KeyframeMatches(known.corners, pairs, latest.frame.index, coarse)
+
+    def _start(
+        self, past: _FlowKeyframe, new: _FlowKeyframe, coarse: FlowPair, gap: int, *, wanted: bool, overlaps: bool
+    ) -> FlowPair | None:
+        """Return flows between a keyframe and a new one to search from; None where nothing is to be searched.
+
+        coarse : flows between the latest keyframe and the new one, with which those of earlier ones are composed.
+        """
+        if gap > MOST_RECENT:
+            past.composed = None
+            return _expected_flows(past.frame, new.frame) if wanted else None
+        if gap == 1:
+            past.composed = coarse
+        elif past.composed is not None:
+            past.composed = _composed(past.composed[0], coarse[0]), _composed(coarse[1], past.composed[1])
+        elif overlaps:
+            start = self._flow.estimate_both(past.frame.rgb, new.frame.rgb)
+            past.composed = _resized(start, coarse[0].shape[1::-1])
+            return start
+        return past.composed
 
     def add_loop(self, loop: Loop) -> None:
         """Take the features of a loop closure: points of either keyframe that the other one observes."""
@@ -199,12 +259,12 @@ class FeatureTracks:
         centred: np.ndarray = (pixel - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
         return centred
 
-    def _match(self, host: _FlowKeyframe, other: _FlowKeyframe, flows: FlowPair) -> int:
-        """Add the observations of the host's corners in another keyframe, and return how many; flows : there, back."""
-        number, pixel = match_corners(host.corners, flows, other.frame.valid, _CONSISTENCY_PX)
-        kept, pixel = refined_corners(host.pattern, other.pattern, host.corners[number], pixel, flows[0])
-        self._add_matches(host.first_point + number[kept], other.number, pixel)
-        return len(kept)
+
+def _matched(host: _FlowKeyframe, other: _FlowKeyframe, flows: FlowPair) -> tuple[np.ndarray, np.ndarray]:
+    """Return which of the host's corners are found in another keyframe, and where; flows : there, back."""
+    number, pixel = match_corners(host.corners, flows, other.frame.valid, _CONSISTENCY_PX)
+    kept, pixel = refined_corners(host.pattern, other.pattern, host.corners[number], pixel, flows[0])
+    return number[kept], pixel
 
 
 def _composed(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -18,21 +18,18 @@ from scopemap.config import MappingSettings
 from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame
 from scopemap.geometry.se3 import inverse
-from scopemap.mapping.backend import contradiction
-from scopemap.mapping.bundle_adjustment import HELD_SIGMA, BundleSolution, adjust
+from scopemap.mapping.bundle_adjustment import HELD_SIGMA, RIGID_SIGMA_PX, BundleSolution, adjust
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State
 from scopemap.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
-from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.mapping.lens_residual import LensEvidence, lens_evidence
+from scopemap.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.notices import Notice
 
 _FREE = 3  # last keyframes of the window that move
 _ITERATIONS = 10
 _LEAST_SEEN = 0.1  # of a keyframe's points that those before it must observe: else nothing corrects its depth
 _REMEMBERED = 1000  # keyframes whose correction is kept: the tracker returns to fewer
-# Robust standard deviation, px, of adjusted reprojection errors of a rigid scene: between so near keyframes it is at
-# most 0.3; 0.4 to 1.5 where tissue moves.
-_MAX_SIGMA_PX = 0.5
 _LENS_EVERY = 4  # adjusted keyframes: windows that have hardly a keyframe in common
 _LENS_SIGMA = 0.01  # of ln f, below which no further windows are asked
 _MOST_REFUSED = 0.1  # of the keyframes: with more, the scene is not rigid
@@ -76,18 +73,20 @@ class LocalAdjustment:
 
     def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
         self._settings, self._flow = settings, flow
-        self._tracks = FeatureTracks(settings, flow)
+        self._tracks = FeatureTracks(settings, flow, gaps=settings.constants.local_gaps)
         self._window: deque[_WindowKeyframe] = deque(maxlen=settings.constants.local_window)
         self._corrections: dict[int, KeyframeCorrection] = {}
         self._adjusted, self._refused = Counter[int](), Counter[int]()
         self._lens: LensEvidence | None = None
+        self._is_determined = False
+        self._shapes: dict[int, ShapeTest] = {}
 
     def corrected(self, frame: Frame, reference: int) -> Frame:
         """Return a frame, tracked against the keyframe of frame `reference`, with its depth corrected as that one's."""
         return self._correction(reference).corrected(frame)
 
-    def adjusted(self, keyframe: Frame, reference: int, map_number: int) -> Frame:
-        """Return a new keyframe with its pose adjusted and its depth corrected.
+    def adjusted(self, keyframe: Frame, reference: int, map_number: int) -> tuple[Frame, KeyframeMatches]:
+        """Return a new keyframe with its pose adjusted and its depth corrected, and what was matched of it.
 
         keyframe : with its pose as tracked, against the keyframe of frame `reference`, and its depth as estimated. It
         is adjusted with those before it where one of them, or what one of them was tracked against, is the reference.
@@ -96,15 +95,15 @@ class LocalAdjustment:
         """
         if reference not in {number for one in self._window for number in (one.frame, one.reference)}:
             self._begin()
-        self._take(keyframe, reference)
+        matches = self._take(keyframe, reference)
         correction = self._correction(reference)
         if len(self._window) > 1:
             points, observations = self._tracks.collected(self._numbers)
             found = adjust(self._problem(points, observations, keyframe.camera.fx), max_iterations=_ITERATIONS)
+            found, is_determined = self._with_other_starts(points, observations, found, keyframe.camera.fx, map_number)
             own_sigma = found.log_depth_sigma[points.host == len(self._window) - 1]
-            limits = replace(self._settings.constants, max_sigma_px=_MAX_SIGMA_PX)
             is_seen = np.isfinite(own_sigma).sum() > _LEAST_SEEN * len(own_sigma)
-            if not is_seen or contradiction(points, found, limits):
+            if not (is_seen and found.sigma_px <= RIGID_SIGMA_PX and is_determined):
                 self._refused[map_number] += int(is_seen)
                 self._begin()
                 self._take(keyframe, reference)
@@ -115,7 +114,8 @@ class LocalAdjustment:
         self._corrections[keyframe.index] = correction
         while len(self._corrections) > _REMEMBERED:
             del self._corrections[next(iter(self._corrections))]
-        return correction.corrected(replace(keyframe, T_world_camera=inverse(self._window[-1].T_camera_world)))
+        T_world_camera = inverse(self._window[-1].T_camera_world)
+        return correction.corrected(replace(keyframe, T_world_camera=T_world_camera)), matches
 
     def take_over(self, index: int, reference: int) -> None:
         """Have frames be tracked against frame `index` too, which was tracked against the keyframe of `reference`."""
@@ -124,7 +124,7 @@ class LocalAdjustment:
             self._window[-1] = self._window[-1]._replace(reference=index)
 
     def notices(self, map_number: int) -> list[Notice]:
-        """Return what was adjusted of a map, and whether the views contradict the lens; [] where nothing was."""
+        """Return what was adjusted of a map, what determines its shape, and another lens; [] where nothing was."""
         adjusted, refused = self._adjusted[map_number], self._refused[map_number]
         if not adjusted + refused:
             return []
@@ -132,7 +132,8 @@ class LocalAdjustment:
         moves = refused > _MOST_REFUSED * (adjusted + refused)
         # So short windows do not tell the principal point well: a right lens of a real clip had -0.1 +- 0.02.
         lens = [] if self._lens is None else self._lens.residual._replace(x=0.0, y=0.0).notices
-        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *lens]
+        shape = self._shapes.get(map_number, ShapeTest()).notices
+        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *shape, *lens]
 
     @property
     def _numbers(self) -> range:
@@ -141,21 +142,23 @@ class LocalAdjustment:
 
     def _begin(self) -> None:
         """Begin a window without keyframes."""
-        self._tracks = FeatureTracks(self._settings, self._flow)
+        self._tracks = FeatureTracks(self._settings, self._flow, gaps=self._settings.constants.local_gaps)
         self._window.clear()
+        self._is_determined = False
 
     def _correction(self, reference: int) -> KeyframeCorrection:
         return self._corrections.get(reference, KeyframeCorrection())
 
-    def _take(self, keyframe: Frame, reference: int) -> None:
-        """Put a keyframe in the window, as tracked."""
+    def _take(self, keyframe: Frame, reference: int) -> KeyframeMatches:
+        """Put a keyframe in the window, as tracked; return its matches."""
         assert keyframe.T_world_camera is not None
-        self._tracks.add(keyframe)
+        matches = self._tracks.add(keyframe)
         points, _ = self._tracks.collected([self._tracks.keyframe_count - 1])
         log_scale = self._correction(reference).log_scale
         state = log_scale, points.log_depth + log_scale, np.full(len(points.host), np.inf)
         self._window.append(_WindowKeyframe(keyframe.index, reference, inverse(keyframe.T_world_camera), *state))
         self._tracks.keep_last(len(self._window))
+        return matches
 
     def _problem(self, points: Points, observations: Observations, focal_px: float) -> BundleProblem:
         """Return the adjustment of the window, from where its keyframes are; the first ones are held."""
@@ -172,6 +175,21 @@ class LocalAdjustment:
         facts = (points, observations, priors, np.arange(count - 1)[:, None] + [0, 1], focal_px)
         correlated = constants.correlated_observations
         return BundleProblem(T, *facts, start=start, correlated=correlated, held=held)
+
+    def _with_other_starts(
+        self, points: Points, observations: Observations, found: BundleSolution, focal_px: float, map_number: int
+    ) -> tuple[BundleSolution, bool]:
+        """Return the solution of the start that wins in the first full window that tells, and whether one does."""
+        is_due = len(self._window) == self._window.maxlen and not self._is_determined
+        is_due = is_due and found.sigma_px <= RIGID_SIGMA_PX
+        if not (is_due and self._settings.constants.other_starts):
+            return found, True
+        problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
+        best, test = with_other_starts(problem, found)
+        if test.outcome != "not tested":
+            self._is_determined = test.outcome != "not determined"
+            self._shapes[map_number] = test
+        return best, not test.is_contradicted
 
     def _test_lens(self, points: Points, observations: Observations, state: State, focal_px: float) -> None:
         """Ask one full window in a few what its views tell of the lens, until they tell it."""

@@ -17,11 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.geometry.least_squares import robust_sigma_2d
 from scopemap.geometry.se3 import inverse, orthonormalised
 from scopemap.geometry.skinning import skin_of
 from scopemap.mapping.bundle_adjustment import BundleSolution, errors_px, log_depth_sigma, with_points
-from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, State, reproject
+from scopemap.mapping.bundle_problem import BundleProblem, State, reproject
 from scopemap.mapping.deformation_graph import (
     Deformation,
     MotionPrior,
@@ -31,6 +30,7 @@ from scopemap.mapping.deformation_graph import (
     periodic_rate,
     spread_nodes,
 )
+from scopemap.mapping.left_out import part_of, placed
 from scopemap.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, solve
 
 LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 300
@@ -50,7 +50,6 @@ _LEAST_FACTOR, _LEAST_FALL = 1.5, 0.05
 _LEAST_LEFT_OUT = 100  # observations
 # Beside a core at rest a node moves where the share of wrong observations exceeds that of most nodes by so much.
 _MOVING_SHARE = 0.02
-_RESCALINGS = 3
 
 
 @dataclass(frozen=True)
@@ -101,13 +100,13 @@ def adjust_moving_tissue(problem: BundleProblem, rigid: State, time_s: np.ndarra
     outside = (column + 2 * row) % _EVERY == 0
     seen = np.zeros(len(outside), bool)
     seen[observed] = True
-    inside = _part(problem, ~outside & seen)
+    inside = part_of(problem, ~outside & seen)
     place = spread_nodes(_in_world(inside), _NODES)
     nodes = _Nodes(place, _moving(problem, place, wrong) if core else np.ones(_NODES, bool))
     if not nodes.moving.any():
         return None
     start = _with_curve(inside, nodes, _curve(inside, nodes))
-    left_out = _compared(_part(problem, outside & seen), rigid, start, nodes)
+    left_out = _compared(part_of(problem, outside & seen), rigid, start, nodes)
     if left_out is None or not left_out.accepts:
         return None
     if not core and np.isfinite(periodic_rate(time_s, start.basis[:, 0])):
@@ -154,7 +153,7 @@ def _moving(problem: BundleProblem, nodes: np.ndarray, wrong: np.ndarray) -> np.
 def _curve(problem: BundleProblem, nodes: _Nodes) -> np.ndarray:
     """Return the curve (K, 1) of nodes that move step by step: with more keyframes fewer nodes, not more unknowns."""
     thinned, keyframes = (
-        _part(problem, np.arange(len(problem.points.host)) % _THINNED == 0),
+        part_of(problem, np.arange(len(problem.points.host)) % _THINNED == 0),
         len(problem.T_camera_world),
     )
     if nodes.moving.all():
@@ -197,7 +196,7 @@ def _solved(problem: NonRigidProblem, modes: np.ndarray | None = None) -> NonRig
 
 def _compared(part: BundleProblem, rigid: State, state: NonRigidState, nodes: _Nodes) -> LeftOutTracks | None:
     """Return the errors of points that were left out near moving nodes, in the keyframes of two solutions."""
-    part = _part(part, nodes.moving[skin_of(nodes.place, _in_world(part)).node[:, 0]])
+    part = part_of(part, nodes.moving[skin_of(nodes.place, _in_world(part)).node[:, 0]])
     if len(part.observations.point) < _LEAST_LEFT_OUT:
         return None
     moving = _problem(part, nodes, state.basis, _ONE_CURVE).moved(state.modes, state.basis)
@@ -209,27 +208,9 @@ def _compared(part: BundleProblem, rigid: State, state: NonRigidState, nodes: _N
 
 def _errors(part: BundleProblem, keyframes: State, moved: np.ndarray) -> tuple[float, float]:
     """Return root mean square, px, and share above 2 px of the errors of points placed by their own observations."""
-    state = keyframes._replace(log_depth=part.points.log_depth + keyframes.log_scale[part.points.host])
-    for _ in range(_RESCALINGS):
-        seen = reproject(part, state, moved)
-        sigma_px = robust_sigma_2d(np.linalg.norm(seen.error, axis=1), part.least_sigma_px)
-        state = with_points(part, state._replace(sigma_px=sigma_px), moved)
-    seen = reproject(part, state, moved)
+    seen = reproject(part, placed(part, keyframes, moved), moved)
     lengths_px = np.where(seen.ahead, np.minimum(np.linalg.norm(seen.error, axis=1), _FALSE_PX), _FALSE_PX)
     return float(np.sqrt((lengths_px**2).mean())), float((lengths_px > _WRONG_PX).mean())
-
-
-def _part(problem: BundleProblem, chosen: np.ndarray) -> BundleProblem:
-    """Return the problem of some points alone, (P,) bool."""
-    points, seen, start = problem.points, problem.observations, problem.start
-    kept = chosen[seen.point]
-    number = np.cumsum(chosen) - 1
-    return replace(
-        problem,
-        points=Points(points.host[chosen], points.pixel[chosen], points.log_depth[chosen], points.sigma[chosen]),
-        observations=Observations(number[seen.point[kept]], seen.keyframe[kept], seen.pixel[kept]),
-        start=start and start._replace(log_depth=start.log_depth[chosen]),
-    )
 
 
 def _in_world(problem: BundleProblem) -> np.ndarray:

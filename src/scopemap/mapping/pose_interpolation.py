@@ -14,6 +14,7 @@ from scopemap.mapping.deformation_graph import Deformation
 from scopemap.mapping.depth_correction import DepthCorrectionField
 from scopemap.mapping.lens_residual import LensResidual
 from scopemap.mapping.nonrigid_adjustment import LeftOutTracks
+from scopemap.mapping.other_starts import ShapeTest
 from scopemap.notices import Notice
 
 _AT_REST = 1e-6  # rad
@@ -54,7 +55,7 @@ class FrameCorrection:
     (K,) further factors of each pixel's depth; (): none. S_common_map : by number of each merged map, Sim(3) from its
     world to the common one. tracked : poses as tracked by number of the frame, where known. depth_mm : typical depth,
     the unit of translations beside rad. lens_residual : what the observations ask of the lens. tissue : how it moves;
-    None: it is taken to be at rest.
+    None: it is taken to be at rest. shape : what other starts of the adjustment tell of it.
     """
 
     index: np.ndarray
@@ -70,11 +71,14 @@ class FrameCorrection:
     depth_mm: float = 1.0
     lens_residual: LensResidual = field(default_factory=LensResidual)
     tissue: TissueMotion | None = None
+    shape: ShapeTest = field(default_factory=ShapeTest)
 
     @property
     def notices(self) -> list[Notice]:
-        """What was adjusted and how well it fits, or why nothing was; and whether the views ask for another lens."""
-        return [self.notice, *self.lens_residual.notices]
+        """What was adjusted and how well it fits, or why nothing was; what determines the shape; another lens."""
+        said = self.tissue is not None or (self.refused and self.refused.code == "mapping-not-determined")
+        tested = [] if said else self.shape.notices
+        return [self.notice, *tested, *self.lens_residual.notices]
 
     @property
     def notice(self) -> Notice:

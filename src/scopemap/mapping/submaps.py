@@ -13,6 +13,7 @@ from scopemap.flow.estimator import FlowEstimator
 from scopemap.frame import Frame, RowTable, rows_in_memory
 from scopemap.geometry.se3 import inverse
 from scopemap.mapping.backend import Backend
+from scopemap.mapping.feature_tracks import KeyframeMatches
 from scopemap.mapping.map_merging import Part
 from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
 from scopemap.notices import Notice
@@ -78,7 +79,7 @@ class Mapper:
         features: FeatureDetector | None = None,
         anchored: bool = False,
     ) -> None:
-        links = settings.at_end and flow.name != "none"
+        links = settings.constants.global_adjustment and flow.name != "none"
         self._backend = Backend(settings, flow, table, features, anchored) if links else None
         self._rows = table("tracked_poses", _TRACKED)
         self._last: tuple[int, TrackedPose] | None = None
@@ -148,11 +149,14 @@ class Mapper:
         self._rows.keep(~np.isin(self._rows.read()["index"], list(indices)))
         self._read = {}
 
-    def add_keyframe(self, keyframe: Frame, track: Track) -> None:
-        """Take a keyframe with refined depth and pose, to be adjusted with the others; it may be observed already."""
+    def add_keyframe(self, keyframe: Frame, track: Track, matches: KeyframeMatches | None = None) -> None:
+        """Take a keyframe with refined depth and pose, to be adjusted with the others; it may be observed already.
+
+        matches : what is known of its feature tracks.
+        """
         if self._backend is not None:
             observed = self._last is not None and self._last[0] == track.index
-            self._backend.add(keyframe, self._last[1] if self._last and observed else self._pose(track))
+            self._backend.add(keyframe, self._last[1] if self._last and observed else self._pose(track), matches)
 
     def submaps(self) -> tuple[list[Submap], list[Notice]]:
         """Return the submaps, most frames first, and a notice of frames that are not in the first.

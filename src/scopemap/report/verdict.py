@@ -32,8 +32,6 @@ MOST_MOVING = 0.5
 """Share of the frames in which tissue moves on its own."""
 LEAST_TRIANGULATED = 0.5
 """Share of the keyframes above which several views agree on depth."""
-TURN_DEG, TURN_PER_KEYFRAME_DEG = 3.0, 0.6
-"""Rotations by which an adjustment may turn keyframes: what tracking drifts by, a random walk over the keyframes."""
 
 
 @dataclass(frozen=True)
@@ -254,15 +252,12 @@ def _level_of(notice: Notice) -> Level:
 
 
 def _of_adjustment(run: Result) -> list[Reason]:
-    """Return whether the adjustment turned keyframes farther than tracking drifts, and whether views agree on depth."""
-    found = []
-    for notice in notices_of(run.provenance):
+    """Return whether several views agree on depth, where the starts of the adjustment do not tell it."""
+    said, found = notices_of(run.provenance), []
+    if {"shape-determined", "shape-decided"} & {notice.code for notice in said}:
+        return []
+    for notice in said:
         values = notice.values
-        if notice.code == "mapping-adjusted" and values["rotation_deg"] > _most_turned_deg(values["keyframes"]):
-            text = (
-                f"The adjustment turned keyframes by up to {values['rotation_deg']:.0f} degrees: tracking drifts less."
-            )
-            found.append(Reason("adjusted-far", "doubtful", text))
         if notice.code == "mapping-without-observations":
             text = "The camera hardly moved, or nothing was found again: no other view confirms depth and path."
             found.append(Reason("depth-unconfirmed", "doubtful", text))
@@ -272,10 +267,6 @@ def _of_adjustment(run: Result) -> list[Reason]:
                 text = f"Several views agree on depth in {count} of {keyframes} keyframes only."
                 found.append(Reason("depth-unconfirmed", "doubtful", text))
     return found
-
-
-def _most_turned_deg(keyframes: int) -> float:
-    return float(max(TURN_DEG, TURN_PER_KEYFRAME_DEG * np.sqrt(keyframes)))
 
 
 def _of_end(run: Result) -> list[Reason]:
