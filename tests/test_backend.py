@@ -174,7 +174,7 @@ def test_an_adjustment_says_what_determines_the_shape() -> None:
 
 def test_poses_stay_as_tracked_where_the_starts_end_in_different_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     undetermined = ShapeTest("not determined", False, 0.2, 0.3, 0.30, 0.31)
-    monkeypatch.setattr(backend_module, "with_other_starts", lambda problem, found: (found, undetermined))
+    monkeypatch.setattr(backend_module, "with_other_starts", lambda problem, found, is_rigid: (found, undetermined))
     kept = plane_scene.adjusted(map(_frame, range(5)))  # one rigid scene fits: the poses are the better ones
     assert [notice.code for notice in kept.notices][:2] == ["mapping-adjusted", "shape-not-determined"]
     monkeypatch.setattr(backend_module, "RIGID_SIGMA_PX", 0.01)

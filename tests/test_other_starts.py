@@ -151,6 +151,12 @@ def test_a_camera_at_rest_is_not_tested() -> None:
     assert test == ShapeTest()
 
 
+def test_what_no_rigid_scene_explains_cannot_be_determined() -> None:
+    problem, _ = _scene(12)
+    _, test = with_other_starts(problem, adjust_in_windows(problem), is_rigid=False)
+    assert test.outcome == "not determined"
+
+
 @pytest.mark.parametrize(
     ("outcome", "error_px", "contradicted"),
     [

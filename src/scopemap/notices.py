@@ -140,8 +140,8 @@ KINDS: dict[str, _Kind] = {
     ),
     "mapping-not-rigid": _Kind(
         "doubtful",
-        "mapping: poses are as tracked{merged}, and the depth network decides the shape; the scene is not rigid or the "
-        "focal length is wrong: reprojection errors stay at {sigma_px:.2f} px (robust standard deviation)",
+        "mapping: poses are as tracked{merged}; the scene is not rigid or the focal length is wrong: reprojection "
+        "errors stay at {sigma_px:.2f} px (robust standard deviation)",
         "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed",
     ),
     "shape-determined": _Kind(

@@ -250,9 +250,9 @@ class Backend:
             adjust_in_windows(problem),
             ShapeTest(),
         )
-        is_rigid = found.sigma_px <= self.settings.max_sigma_px
-        if is_rigid and len(worlds) == 1 and self.settings.other_starts:
-            found, shape = with_other_starts(problem, found)
+        if len(worlds) == 1 and self.settings.other_starts:
+            is_rigid = found.sigma_px <= self.settings.max_sigma_px
+            found, shape = with_other_starts(problem, found, is_rigid=is_rigid)
         refused, fields = self._judged(chosen, problem, found, shape, worlds)
         host, observer = map_of[points.host[observations.point]], map_of[observations.keyframe]
 

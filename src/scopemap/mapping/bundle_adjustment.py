@@ -46,9 +46,9 @@ _POINT_STEPS = 5  # of the points alone, after the keyframes
 _ADDED_WITH, _ADDED_ITERATIONS = 2, 6  # keyframes before a new one that move with it, and steps of each search
 WINDOW = 300
 """Most keyframes that are adjusted at once."""
-RIGID_SIGMA_PX = 0.45
-"""Robust standard deviation of reprojection errors that a rigid scene leaves at most: between near keyframes 0.3, in a
-fast, interlaced video (C3VD trans_t2_a) 0.45. Where tissue moves it is 0.4 to 1.5."""
+RIGID_SIGMA_PX = 0.4
+"""Robust standard deviation of reprojection errors above which a scene is hardly rigid: rigid ones leave at most 0.3 px
+between near keyframes (0.45 in a fast, interlaced video, C3VD trans_t2_a), moving tissue leaves 0.4 to 1.5."""
 HELD_SIGMA = 0.01
 """Least standard deviation of ln depth of points that an earlier window adjusted."""
 

@@ -181,15 +181,14 @@ class LocalAdjustment:
     ) -> tuple[BundleSolution, bool]:
         """Return the solution of the start that wins in the first full window that tells, and whether one does."""
         is_due = len(self._window) == self._window.maxlen and not self._is_determined
-        is_due = is_due and found.sigma_px <= RIGID_SIGMA_PX
         if not (is_due and self._settings.constants.other_starts):
             return found, True
         problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
-        best, test = with_other_starts(problem, found)
+        best, test = with_other_starts(problem, found, is_rigid=found.sigma_px <= RIGID_SIGMA_PX)
         if test.outcome != "not tested":
             self._is_determined = test.outcome != "not determined"
             self._shapes[map_number] = test
-        return best, not test.is_contradicted
+        return best, test.outcome != "not determined"
 
     def _test_lens(self, points: Points, observations: Observations, state: State, focal_px: float) -> None:
         """Ask one full window in a few what its views tell of the lens, until they tell it."""

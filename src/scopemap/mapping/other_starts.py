@@ -111,34 +111,39 @@ class _Shape:
         return correlation >= _LEAST_CORRELATION and difference <= _MOST_DIFFERENCE
 
 
-def with_other_starts(problem: BundleProblem, found: BundleSolution) -> tuple[BundleSolution, ShapeTest]:
+def with_other_starts(
+    problem: BundleProblem, found: BundleSolution, *, is_rigid: bool = True
+) -> tuple[BundleSolution, ShapeTest]:
     """Return the solution of the start that wins, and what the starts tell.
 
-    found : the solution from the problem's own start, which explains the observations. It stays, but where another
-    start clearly wins. Of many keyframes those in the middle are tested; all, where another start wins there.
+    found : the solution from the problem's own start. It stays, but where another start clearly wins. is_rigid :
+    whether it explains the observations; where it does not, it cannot win. Of many keyframes those in the middle are
+    tested; all, where another start wins there.
     """
     count = len(problem.T_camera_world)
     middle = _stretch(problem, found.state, (count - MOST_KEYFRAMES) // 2, MOST_KEYFRAMES)
     tested, keyframes = (problem, found.state) if count <= MOST_KEYFRAMES else middle
-    best, test = _test(tested, keyframes)
+    best, test = _test(tested, keyframes, is_rigid=is_rigid)
     if test.replaced and tested is not problem:
-        best, test = _test(problem, found.state)
+        best, test = _test(problem, found.state, is_rigid=is_rigid)
         if not test.replaced:  # parts of the map tell different things
             test = test._replace(outcome="not determined")
     return (_from(problem, best), test) if test.replaced else (found, test)
 
 
-def _test(problem: BundleProblem, keyframes: State) -> tuple[State, ShapeTest]:
+def _test(problem: BundleProblem, keyframes: State, *, is_rigid: bool) -> tuple[State, ShapeTest]:
     """Return the keyframes of the start that wins, the given ones where none does, and what the starts tell."""
     adjusted, left_out = _samples(problem)
     own = None if left_out is None else _shape(left_out, keyframes)
     if left_out is None or own is None or own.known.sum() < _LEAST_POINTS:
         return keyframes, ShapeTest()
     mirrored = _shape(left_out, adjust_in_windows(_mirrored(adjusted)).state)
-    if own.meets(mirrored):
+    if is_rigid and own.meets(mirrored):
         return keyframes, ShapeTest("determined", False, *own.likeness(mirrored), own.error_px)
+    if not is_rigid and mirrored.error_px >= _CLEARLY_LESS * own.error_px:
+        return keyframes, ShapeTest("not determined", False, *own.likeness(mirrored), own.error_px, mirrored.error_px)
     flat = _shape(left_out, adjust_one_by_one(_flat(adjusted)).state)
-    if own.meets(flat) and own.error_px <= mirrored.error_px:
+    if is_rigid and own.meets(flat) and own.error_px <= mirrored.error_px:
         # The mirrored one stayed in a valley of its own, which is worse.
         return keyframes, ShapeTest("decided", False, *own.likeness(flat), own.error_px, mirrored.error_px)
     if flat.meets(mirrored) and max(flat.error_px, mirrored.error_px) < _CLEARLY_LESS * own.error_px:
