@@ -16,12 +16,13 @@ from scopemap.config.mapping import MappingConstants
 from scopemap.flow.corners import detect_corners, sample_flow
 from scopemap.flow.dis import DisFlow
 from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, se3_log
 from scopemap.mapping import Backend, FrameCorrection, TrackedPose
 from scopemap.mapping import backend as backend_module
 from scopemap.mapping.bundle_problem import Observations, Points
 from scopemap.mapping.feature_tracks import FeatureTracks
 from scopemap.mapping.other_starts import ShapeTest
+from scopemap.mapping.pose_interpolation import KeyframeStep
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)
@@ -113,6 +114,33 @@ def test_corrections_are_interpolated_by_the_camera_motion() -> None:
     assert correction.pose(4, np.eye(4))[0, 3] == pytest.approx(1.6)
     resting = replace(correction, tracked={0: _tracked(0, 3), 5: _tracked(0, 3), 10: _tracked(0, 3)})
     assert resting.pose(5, np.eye(4))[0, 3] == pytest.approx(2.0)
+
+
+def test_the_step_of_a_keyframe_that_was_moved_as_it_came_is_spread_over_the_frames_that_lead_to_it() -> None:
+    """Frames drift by 0.5 mm until the next keyframe, every tenth, which comes back to its place."""
+    backend = Backend(MappingSettings(), DisFlow())
+    drift, tracked = se3_exp(np.array([0, 0, 0, 0.5, 0, 0])), {}
+    for number, true in enumerate(POSES):
+        backend.add(
+            _frame(number),
+            tracked.setdefault(10 * number, TrackedPose(0, max(10 * number - 10, 0), true)),
+            step=KeyframeStep(drift, np.log(1.25)) if number else None,
+        )
+        if number:
+            middle = POSES[number - 1] @ se3_exp(0.5 * se3_log(inverse(POSES[number - 1]) @ true))
+            half = se3_exp(np.array([0, 0, 0, 0.25, 0, 0]))
+            tracked[10 * number - 5] = TrackedPose(0, 10 * number - 10, middle @ half)
+    correction = backend.adjust(0, tracked)
+    for number in range(1, len(POSES)):
+        before, own, after = (correction.pose(i, tracked[i].T_world_camera) for i in np.arange(-10, 1, 5) + 10 * number)
+        between = 0.5 * (before + after)[:3, 3]
+        assert np.linalg.norm(own[:3, 3] - between) < 0.01
+        factors = [correction.depth_factor(i) for i in np.arange(-10, 1, 5) + 10 * number]
+        assert factors[1] == pytest.approx(np.sqrt(1.25 * factors[0] * factors[2]), rel=0.01)
+    moved = correction.in_world(drift)
+    for index in (15, 20):
+        pose = moved.pose(index, tracked[index].T_world_camera)
+        np.testing.assert_allclose(pose, drift @ correction.pose(index, tracked[index].T_world_camera), atol=1e-9)
 
 
 @pytest.mark.parametrize(

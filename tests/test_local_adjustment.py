@@ -41,7 +41,7 @@ def _keyframes(adjustment: LocalAdjustment | None, split: bool = False) -> list[
             moved = plane_scene.see(pose @ se3_exp(np.array([0, 0, 0, 0, 0.8 * (-1) ** n, 0])))
             frame.rgb[:, half:] = moved.rgb[:, half:]
         frame = replace(frame, depth_mm=frame.depth_mm * np.exp(BEND))
-        found.append(frame if adjustment is None else adjustment.adjusted(frame, max(n - 1, 0), 0)[0])
+        found.append(frame if adjustment is None else adjustment.adjusted(frame, max(n - 1, 0), 0).keyframe)
     return found
 
 
@@ -95,12 +95,27 @@ def test_where_half_of_the_picture_moves_keyframes_stay_as_tracked() -> None:
         np.testing.assert_allclose(frame.T_world_camera, pose, atol=1e-9)
 
 
+def test_a_keyframe_says_by_how_much_it_was_moved() -> None:
+    local = LocalAdjustment(LOCAL, DisFlow())
+    adjusted = _keyframes(local)
+    pose = TRUE[-1] @ se3_exp(np.array([0, 0, 0, 0.5, 0, 0]))
+    T_tracked = adjusted[-1].T_world_camera @ inverse(TRUE[-2]) @ pose
+    depth_mm = 1.1 * adjusted[-1].depth_mm
+    keyframe = replace(plane_scene.frame(pose, COUNT, T_tracked), depth_mm=depth_mm)
+    moved, _, step = local.adjusted(keyframe, COUNT - 1, 0)
+    assert np.linalg.norm(step.T_camera_arrived[:3, 3]) > 0.01
+    np.testing.assert_allclose(moved.T_world_camera @ step.T_camera_arrived, T_tracked, atol=1e-9)
+    led_mm = local.corrected(keyframe, COUNT - 1).depth_mm  # as that of a frame just before it
+    factor = np.log(moved.depth_mm / led_mm)
+    assert np.median(factor) == pytest.approx(step.log_scale, abs=0.03)
+
+
 @pytest.mark.parametrize("reference", [COUNT + 5, COUNT])
 def test_a_keyframe_that_was_not_tracked_against_the_window_is_not_adjusted_with_it(reference: int) -> None:
     local = LocalAdjustment(LOCAL, DisFlow())
     _keyframes(local)
     frame = plane_scene.frame(TRUE[-1], COUNT)
-    begun = local.adjusted(frame, reference, 1)[0]
+    begun = local.adjusted(frame, reference, 1).keyframe
     np.testing.assert_allclose(begun.T_world_camera, frame.T_world_camera, atol=1e-12)
     np.testing.assert_array_equal(begun.depth_mm, frame.depth_mm)
     assert not local.notices(1)
@@ -111,7 +126,7 @@ def test_a_keyframe_that_sees_nothing_of_those_before_takes_over_the_correction(
     last = _keyframes(local)[-1]
     elsewhere = plane_scene.frame(plane_scene.pose(at_mm=(60, -50, 0)), COUNT)
     elsewhere = replace(elsewhere, depth_mm=plane_scene.frame(TRUE[-1]).depth_mm * np.exp(BEND))
-    again, _ = local.adjusted(elsewhere, COUNT - 1, 0)
+    again = local.adjusted(elsewhere, COUNT - 1, 0).keyframe
     np.testing.assert_allclose(again.depth_mm, last.depth_mm, rtol=1e-5)
     local.adjusted(plane_scene.frame(TRUE[0], COUNT + 1), COUNT, 0)  # after it, nothing is observed at all
     assert local.notices(0)[0].values == {"adjusted": COUNT - 1, "refused": 0}

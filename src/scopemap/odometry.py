@@ -167,10 +167,10 @@ class Odometry:
         if track.status == "lost":
             return track, frame
         kind, due, number = preprocessed.kind, self._tracker.needs_keyframe(), track.keyframe
-        keyframe, matches = replace(frame, T_world_camera=track.T_world_camera), None
+        keyframe, matches, step = replace(frame, T_world_camera=track.T_world_camera), None, None
         if self._local is not None and kind != "measured":
             if due:
-                keyframe, matches = self._local.adjusted(keyframe, number, track.map)
+                keyframe, matches, step = self._local.adjusted(keyframe, number, track.map)
             else:
                 keyframe = self._local.corrected(keyframe, number)
         frame, track = replace(keyframe, T_world_camera=None), replace(track, T_world_camera=_pose(keyframe))
@@ -181,7 +181,7 @@ class Odometry:
         measured = kind == "measured" and not self._mapis.needs_previous(kind)  # not after MAPIS changed it
         inserted = self._tracker.insert_keyframe(keyframe, measured=measured)
         if inserted and kind != "measured":  # with measured depth tracking alone is better
-            self.mapper.add_keyframe(keyframe, track, matches)
+            self.mapper.add_keyframe(keyframe, track, matches, step)
         if track.status == "initial" and not inserted:
             unknown = preprocessed.depth_note or "too little of its depth is known to start from (black or constant?)"
             return replace(track, status="lost", reason=unknown, cause=LossCause.OTHER), frame

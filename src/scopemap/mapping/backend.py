@@ -38,7 +38,7 @@ from scopemap.mapping.pose_graph import (
     scale_by_network,
     tracked_pairs,
 )
-from scopemap.mapping.pose_interpolation import FrameCorrection, TissueMotion, TrackedPose
+from scopemap.mapping.pose_interpolation import FrameCorrection, KeyframeStep, TissueMotion, TrackedPose
 from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
 
@@ -69,6 +69,7 @@ class Backend:
         self._frames: list[int] = []
         self._times_s: list[float] = []
         self._tracked: list[TrackedPose] = []
+        self._steps: list[KeyframeStep] = []
         self._log_scales: list[float] = []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
         self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
@@ -91,11 +92,18 @@ class Backend:
         """Return the number of keyframes of a map."""
         return sum(pose.map == map_number for pose in self._tracked)
 
-    def add(self, keyframe: Frame, tracked: TrackedPose | None = None, matches: KeyframeMatches | None = None) -> None:
+    def add(
+        self,
+        keyframe: Frame,
+        tracked: TrackedPose | None = None,
+        matches: KeyframeMatches | None = None,
+        step: KeyframeStep | None = None,
+    ) -> None:
         """Take a keyframe with depth and pose, later than those before; poses of one map share a world.
 
         tracked : pose as tracked; None: in map 0, from the keyframe before. matches : what is known of its feature
-        tracks. Raises an error of an earlier keyframe's feature tracks, and ValueError without a pose or a depth.
+        tracks. step : by how much it was moved as it came; None: not at all. Raises an error of an earlier keyframe's
+        feature tracks, and ValueError without a pose or a depth.
         """
         if keyframe.T_world_camera is None or keyframe.depth_mm is None:
             raise ValueError("a keyframe needs a pose and a depth")
@@ -105,6 +113,7 @@ class Backend:
         self._frames.append(keyframe.index)
         self._times_s.append(keyframe.time_s)
         self._tracked.append(tracked)
+        self._steps.append(step or KeyframeStep())
         self._log_scales.append(math.log(keyframe.depth_scale))
         grid = depth_grid(keyframe.depth_mm, keyframe.valid)
         self._depths_mm.append(grid.ravel())
@@ -279,7 +288,7 @@ class Backend:
         else:
             as_tracked = np.tile(np.eye(4), (len(chosen), 1, 1))
             correction = FrameCorrection(index, as_tracked, np.zeros(len(index)), found.sigma_px, refused=refused)
-            correction = replace(correction, shape=shape)
+            correction = self._continuous(replace(correction, shape=shape), chosen, worlds)
         correction = replace(correction, loop_frames=index[accepted].tolist() if correction.loops else [])
         # A map of one keyframe has no observations: NaN.
         largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
@@ -337,7 +346,24 @@ class Backend:
         T_world_world = inverse(state.T_camera_world) @ inverse(self._as_tracked(chosen, worlds))
         depth_mm = float(np.exp(np.median(state.log_depth))) if len(state.log_depth) else 1.0
         log_scale = state.log_scale - self._path.drift[chosen]
-        return FrameCorrection(index, T_world_world, log_scale, found.sigma_px, depth_mm=depth_mm)
+        correction = FrameCorrection(index, T_world_world, log_scale, found.sigma_px, depth_mm=depth_mm)
+        return self._continuous(correction, chosen, worlds)
+
+    def _continuous(
+        self, correction: FrameCorrection, chosen: list[int], worlds: Mapping[int, Similarity]
+    ) -> FrameCorrection:
+        """Return a correction that spreads the step of each keyframe over the frames that lead to it."""
+        steps = [self._steps[k] for k in chosen]
+        arrived = [
+            worlds[pose.map].transform_poses(pose.T_world_camera @ step.T_camera_arrived)
+            for pose, step in zip((self._tracked[k] for k in chosen), steps, strict=True)
+        ]
+        T_world_camera = correction.T_world_world @ self._as_tracked(chosen, worlds)
+        return replace(
+            correction,
+            T_world_world_before=T_world_camera @ inverse(np.stack(arrived)),
+            log_scale_before=correction.log_scale + [step.log_scale for step in steps],
+        )
 
     def _judged(
         self,

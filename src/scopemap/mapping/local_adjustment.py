@@ -24,6 +24,7 @@ from scopemap.mapping.depth_correction import DepthCorrectionField, fit_depth_co
 from scopemap.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.mapping.lens_residual import LensEvidence, lens_evidence
 from scopemap.mapping.other_starts import ShapeTest, with_other_starts
+from scopemap.mapping.pose_interpolation import KeyframeStep
 from scopemap.notices import Notice
 
 _FREE = 3  # last keyframes of the window that move
@@ -49,6 +50,14 @@ class KeyframeCorrection(NamedTuple):
         return replace(
             frame, depth_mm=depth_mm * factor, depth_sigma_mm=None if sigma_mm is None else sigma_mm * factor
         )
+
+
+class AdjustedKeyframe(NamedTuple):
+    """A keyframe as adjusted, what was matched of it, and by how much it was moved."""
+
+    keyframe: Frame
+    matches: KeyframeMatches
+    step: KeyframeStep
 
 
 class _WindowKeyframe(NamedTuple):
@@ -85,8 +94,8 @@ class LocalAdjustment:
         """Return a frame, tracked against the keyframe of frame `reference`, with its depth corrected as that one's."""
         return self._correction(reference).corrected(frame)
 
-    def adjusted(self, keyframe: Frame, reference: int, map_number: int) -> tuple[Frame, KeyframeMatches]:
-        """Return a new keyframe with its pose adjusted and its depth corrected, and what was matched of it.
+    def adjusted(self, keyframe: Frame, reference: int, map_number: int) -> AdjustedKeyframe:
+        """Return a new keyframe with its pose adjusted and its depth corrected.
 
         keyframe : with its pose as tracked, against the keyframe of frame `reference`, and its depth as estimated. It
         is adjusted with those before it where one of them, or what one of them was tracked against, is the reference.
@@ -114,8 +123,11 @@ class LocalAdjustment:
         self._corrections[keyframe.index] = correction
         while len(self._corrections) > _REMEMBERED:
             del self._corrections[next(iter(self._corrections))]
-        T_world_camera = inverse(self._window[-1].T_camera_world)
-        return correction.corrected(replace(keyframe, T_world_camera=T_world_camera)), matches
+        T_camera_world = self._window[-1].T_camera_world
+        moved = correction.corrected(replace(keyframe, T_world_camera=inverse(T_camera_world)))
+        more = correction.log_scale - self._correction(reference).log_scale
+        step = KeyframeStep(T_camera_world @ np.asarray(keyframe.T_world_camera), more)
+        return AdjustedKeyframe(moved, matches, step)
 
     def take_over(self, index: int, reference: int) -> None:
         """Have frames be tracked against frame `index` too, which was tracked against the keyframe of `reference`."""

@@ -33,6 +33,17 @@ class TrackedPose(NamedTuple):
     segment: int = 0
 
 
+class KeyframeStep(NamedTuple):
+    """By how much a keyframe was moved as it came; the frames before it, tracked against an earlier one, were not.
+
+    T_camera_arrived : (4, 4), pose as tracked in the camera as moved. log_scale : ln of the factor of its depth, less
+    that of the frames before it.
+    """
+
+    T_camera_arrived: np.ndarray = np.eye(4)
+    log_scale: float = 0.0
+
+
 class TissueMotion(NamedTuple):
     """Motion of the tissue over the keyframes, in the adjusted world, and what confirms it.
 
@@ -49,19 +60,23 @@ class FrameCorrection:
     """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
 
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
-    tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth. sigma_px :
-    robust standard deviation of the reprojection errors; NaN without observations. refused : why nothing is changed,
-    None where it is. loops : number of accepted loop closures. loop_frames : the two frames of each. depth_fields :
-    (K,) further factors of each pixel's depth; (): none. S_common_map : by number of each merged map, Sim(3) from its
-    world to the common one. tracked : poses as tracked by number of the frame, where known. depth_mm : typical depth,
-    the unit of translations beside rad. lens_residual : what the observations ask of the lens. tissue : how it moves;
-    None: it is taken to be at rest. shape : what other starts of the adjustment tell of it.
+    tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
+    T_world_world_before, log_scale_before : the same for the frames that lead to the keyframe, which its `KeyframeStep`
+    parts from it; None: there is none. sigma_px : robust standard deviation of the reprojection errors; NaN without
+    observations. refused : why nothing is changed, None where it is. loops : number of accepted loop closures.
+    loop_frames : the two frames of each. depth_fields : (K,) further factors of each pixel's depth; (): none.
+    S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
+    number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens_residual :
+    what the observations ask of the lens. tissue : how it moves; None: it is taken to be at rest. shape : what other
+    starts of the adjustment tell of it.
     """
 
     index: np.ndarray
     T_world_world: np.ndarray
     log_scale: np.ndarray
     sigma_px: float = float("nan")
+    T_world_world_before: np.ndarray | None = None
+    log_scale_before: np.ndarray | None = None
     refused: Notice | None = None
     loops: int = 0
     loop_frames: Sequence[Sequence[int]] = ()
@@ -106,9 +121,11 @@ class FrameCorrection:
     def in_world(self, T_new_world: np.ndarray) -> FrameCorrection:
         """Return the correction to another common world; `T_new_world` (4, 4) takes points of this one to it."""
         moved = Similarity(1.0, T_new_world[:3, :3], T_new_world[:3, 3])
+        before = self.T_world_world_before
         return replace(
             self,
             T_world_world=T_new_world @ self.T_world_world @ inverse(T_new_world),
+            T_world_world_before=None if before is None else T_new_world @ before @ inverse(T_new_world),
             S_common_map={number: moved.after(S) for number, S in self.S_common_map.items()},
             tissue=self.tissue and self.tissue._replace(deformation=self.tissue.deformation.in_world(T_new_world)),
         )
@@ -117,13 +134,13 @@ class FrameCorrection:
         """Return the corrected pose (4, 4) of the frame with this number."""
         before, after, share = self._between(index)
         T_world_camera = self._world(index).transform_poses(T_world_camera)
-        poses = [self.T_world_world[k] @ T_world_camera for k in (before, after)]
+        poses = [self._T_world_world(k, index) @ T_world_camera for k in (before, after)]
         return mean_near(poses[0], [poses[1]], [share])
 
     def depth_factor(self, index: int) -> float:
         """Return the factor of the whole depth of the frame with this number, without its depth correction field."""
         before, after, share = self._between(index)
-        log_scale = (1 - share) * self.log_scale[before] + share * self.log_scale[after]
+        log_scale = (1 - share) * self._log_scale(before, index) + share * self._log_scale(after, index)
         return float(np.exp(log_scale)) * self._world(index).scale
 
     def depth_factors(self, index: int, depth_mm: np.ndarray) -> np.ndarray:
@@ -137,6 +154,17 @@ class FrameCorrection:
         if after != before:
             log = (1 - share) * log + share * self.depth_fields[after].log_factor(depth_mm)
         return factor * np.exp(log.astype(np.float32))
+
+    def _T_world_world(self, k: int, index: int) -> np.ndarray:
+        """Return the correction (4, 4) of a frame near keyframe k, which it follows or leads to."""
+        leads = index < self.index[k] and self.T_world_world_before is not None
+        corrections = self.T_world_world_before if leads else self.T_world_world
+        T: np.ndarray = np.asarray(corrections)[k]
+        return T
+
+    def _log_scale(self, k: int, index: int) -> float:
+        leads = index < self.index[k] and self.log_scale_before is not None
+        return float(np.asarray(self.log_scale_before if leads else self.log_scale)[k])
 
     def _world(self, index: int) -> Similarity:
         """Sim(3) from the world of a frame's map to the common one."""
@@ -165,6 +193,7 @@ class FrameCorrection:
         frames = (int(self.index[before]), index, int(self.index[after]))
         if all(frame in self.tracked for frame in frames):
             first, own, last = (self._world(f).transform_poses(self.tracked[f].T_world_camera) for f in frames)
+            last = inverse(self._T_world_world(after, index)) @ self.T_world_world[after] @ last  # as it arrived
             motion_before, motion_after = self._motion(first, own), self._motion(own, last)
             if motion_before + motion_after > _AT_REST:
                 return motion_before / (motion_before + motion_after)

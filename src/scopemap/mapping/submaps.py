@@ -15,7 +15,7 @@ from scopemap.geometry.se3 import inverse
 from scopemap.mapping.backend import Backend
 from scopemap.mapping.feature_tracks import KeyframeMatches
 from scopemap.mapping.map_merging import Part
-from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.mapping.pose_interpolation import FrameCorrection, KeyframeStep, TrackedPose
 from scopemap.notices import Notice
 from scopemap.tracking.features import FeatureDetector
 from scopemap.tracking.track import Track
@@ -149,14 +149,21 @@ class Mapper:
         self._rows.keep(~np.isin(self._rows.read()["index"], list(indices)))
         self._read = {}
 
-    def add_keyframe(self, keyframe: Frame, track: Track, matches: KeyframeMatches | None = None) -> None:
+    def add_keyframe(
+        self,
+        keyframe: Frame,
+        track: Track,
+        matches: KeyframeMatches | None = None,
+        step: KeyframeStep | None = None,
+    ) -> None:
         """Take a keyframe with refined depth and pose, to be adjusted with the others; it may be observed already.
 
-        matches : what is known of its feature tracks.
+        matches : what is known of its feature tracks. step : by how much it was moved as it came.
         """
         if self._backend is not None:
             observed = self._last is not None and self._last[0] == track.index
-            self._backend.add(keyframe, self._last[1] if self._last and observed else self._pose(track), matches)
+            tracked = self._last[1] if self._last and observed else self._pose(track)
+            self._backend.add(keyframe, tracked, matches, step)
 
     def submaps(self) -> tuple[list[Submap], list[Notice]]:
         """Return the submaps, most frames first, and a notice of frames that are not in the first.
