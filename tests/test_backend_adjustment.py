@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 
+from scopemap.geometry.align import Similarity
 from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.mapping.bundle_adjustment import adjust, adjust_in_windows
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.mapping.lens_residual import lens_residual
+from scopemap.mapping.lens_residual import lens_residual, shape_change
 
 LOOSE = Priors(rotation_rad=10, translation_share=10)
 
@@ -53,6 +54,40 @@ def test_observations_ask_for_the_right_lens(factor: float, shift: tuple[float, 
     nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     unseen = replace(problem, observations=nothing)
     assert np.isnan(lens_residual(unseen, adjust(unseen).state)).all()
+
+
+def test_a_change_of_shape_is_measured_in_the_scale_of_the_path_and_without_a_turn_of_each_camera() -> None:
+    rng = np.random.default_rng(5)
+    T, points, observations = world(rng)
+    problem = BundleProblem(T, points, observations, LOOSE, LINE, FOCAL_PX)
+    one = problem.tracked
+    S = Similarity(1.7, se3_exp(np.array([0.3, -0.2, 0.5, 0, 0, 0]))[:3, :3], np.array([3.0, -2.0, 9.0]))
+    moved = one._replace(
+        T_camera_world=inverse(S.transform_poses(inverse(T))), log_depth=one.log_depth + np.log(S.scale)
+    )
+    assert shape_change(problem, one, moved) == pytest.approx((0, 0), abs=1e-9)
+    farther = moved._replace(log_depth=moved.log_depth + np.log(1.05))
+    assert shape_change(problem, one, farther) == pytest.approx((0.05, 0), abs=1e-6)
+    turned = moved._replace(T_camera_world=se3_exp(np.array([0.02, 0.01, 0, 0, 0, 0])) @ moved.T_camera_world)
+    assert shape_change(problem, one, turned)[0] == pytest.approx(0, abs=1e-9)
+    resting = one._replace(T_camera_world=np.repeat(T[:1], len(T), axis=0))
+    assert np.isnan(shape_change(problem, resting, one)).all()
+
+
+def test_a_lens_is_contradicted_where_the_one_asked_for_would_change_the_shape() -> None:
+    rng = np.random.default_rng(11)
+    T, points, observations = world(rng)
+    seen = replace(observations, pixel=observations.pixel + rng.normal(0, 0.1, observations.pixel.shape))
+    codes = []
+    for factor in (1.0, 0.8):
+        problem = BundleProblem(tracked(T, rng), points, seen, LOOSE, LINE, factor * FOCAL_PX)
+        found = adjust(problem).state
+        residual = lens_residual(problem, found)
+        codes.append([notice.code for notice in residual.notices])
+        right = adjust(replace(problem, start=found._replace(lens=np.array([np.log(FOCAL_PX), 0, 0])))).state
+        surface, path = shape_change(problem, found, right)
+        assert (residual.surface, residual.path) == pytest.approx((surface, path), abs=0.01)
+    assert codes == [[], ["camera-contradicted"]]
 
 
 @pytest.mark.parametrize("window", [2, 3])

@@ -75,6 +75,7 @@ def notices(*found: Notice) -> dict[str, Any]:
     return {"notices": [notice.as_json() for notice in found]}
 
 
+ANOTHER_LENS = {"change": -0.08, "x": 0.0, "y": 0.0, "surface": 0.06, "path": 0.01}
 MASKS = Notice("masks-missing", {"missing": 40, "frames": 50, "folder": "masks"})
 
 
@@ -146,8 +147,7 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
         (notices(Notice("camera-at-rest")), "hardly moves"),
         (notices(Notice("camera-distorted", {"share": 0.12})), "bends straight lines"),
         (notices(Notice("input-interlaced")), "is interlaced"),
-        (notices(Notice("camera-contradicted", {"change": -0.08})), "another focal length (-8%)"),
-        (notices(Notice("camera-off-centre", {"x": 0.1, "y": 0.0})), "another centre of the lens"),
+        (notices(Notice("camera-contradicted", ANOTHER_LENS)), "another lens (focal length -8%), which would change"),
         (notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})), "as tracked"),
         (notices(moving(30)), "moves on its own in 30 of 60"),
         (notices(Notice("shape-not-determined", {"error_px": 0.3, "other_px": 0.31})), "does not determine the shape"),

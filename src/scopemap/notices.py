@@ -56,17 +56,11 @@ KINDS: dict[str, _Kind] = {
     ),
     "camera-contradicted": _Kind(
         "doubtful",
-        "mapping: the views ask for another focal length than the one used ({change:+.0%}); check the calibration, or "
-        "the tissue moves",
-        "The motion asks for another focal length ({change:+.0%}): depth against width is wrong. Calibrate, or "
-        "check the calibration; if it is right, the tissue moves",
-    ),
-    "camera-off-centre": _Kind(
-        "doubtful",
-        "mapping: the views ask for another principal point than the one used (by {x:+.0%} and {y:+.0%} of the focal "
-        "length); check the calibration, and whether the pictures were cut, or the tissue moves",
-        "The motion asks for another centre of the lens: shapes are skewed. Check the calibration, and whether the "
-        "pictures were cut after it; if it is right, the tissue moves",
+        "mapping: the views ask for another lens: focal length {change:+.0%}, principal point {x:+.0%} and {y:+.0%} of "
+        "it, which would change the surface by {surface:.0%} and the path by {path:.0%} of its length; check the "
+        "calibration and whether the pictures were cut after it, or the tissue moves",
+        "The motion asks for another lens (focal length {change:+.0%}), which would change the surface by "
+        "{surface:.0%}. Check the calibration, and whether the pictures were cut after it; or the tissue moves",
     ),
     "camera-unconfirmed": _Kind(
         "doubtful",

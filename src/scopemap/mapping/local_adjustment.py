@@ -22,7 +22,7 @@ from scopemap.mapping.bundle_adjustment import HELD_SIGMA, RIGID_SIGMA_PX, Bundl
 from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State
 from scopemap.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
 from scopemap.mapping.feature_tracks import FeatureTracks, KeyframeMatches
-from scopemap.mapping.lens_residual import LensEvidence, lens_evidence
+from scopemap.mapping.lens_residual import LensEvidence, LensResidual, lens_evidence
 from scopemap.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.mapping.pose_interpolation import KeyframeStep
 from scopemap.notices import Notice
@@ -86,7 +86,8 @@ class LocalAdjustment:
         self._window: deque[_WindowKeyframe] = deque(maxlen=settings.constants.local_window)
         self._corrections: dict[int, KeyframeCorrection] = {}
         self._adjusted, self._refused = Counter[int](), Counter[int]()
-        self._lens: LensEvidence | None = None
+        self._lens_evidence: LensEvidence | None = None
+        self._lens = LensResidual()
         self._is_determined = False
         self._shapes: dict[int, ShapeTest] = {}
 
@@ -142,10 +143,8 @@ class LocalAdjustment:
             return []
         values = {"adjusted": adjusted, "refused": refused}
         moves = refused > _MOST_REFUSED * (adjusted + refused)
-        # So short windows do not tell the principal point well: a right lens of a real clip had -0.1 +- 0.02.
-        lens = [] if self._lens is None else self._lens.residual._replace(x=0.0, y=0.0).notices
         shape = self._shapes.get(map_number, ShapeTest()).notices
-        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *shape, *lens]
+        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *shape, *self._lens.notices]
 
     @property
     def _numbers(self) -> range:
@@ -205,10 +204,14 @@ class LocalAdjustment:
     def _test_lens(self, points: Points, observations: Observations, state: State, focal_px: float) -> None:
         """Ask one full window in a few what its views tell of the lens, until they tell it."""
         is_due = len(self._window) == self._window.maxlen and not self._adjusted.total() % _LENS_EVERY
-        if is_due and (self._lens is None or self._lens.residual.sigma > _LENS_SIGMA):
+        if is_due and not self._lens.sigma <= _LENS_SIGMA:
             problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
             evidence = lens_evidence(problem, state)
-            self._lens = self._lens if evidence is None else evidence.and_also(self._lens)
+            if evidence is not None:
+                self._lens_evidence = evidence.and_also(self._lens_evidence)
+                # So short windows do not tell the principal point well: a right lens of a real clip had -0.1 +- 0.02.
+                asked = self._lens_evidence.residual._replace(x=0.0, y=0.0)
+                self._lens = asked.with_effect(problem, state)
 
     def _update(self, points: Points, found: BundleSolution, camera: PinholeCamera) -> KeyframeCorrection:
         """Take over an adjustment; return the correction of the window's last keyframe."""
