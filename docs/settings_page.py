@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from scopemap.config import PRESETS, Config, Settings
-from scopemap.config.settings import StageSettings
+from scopemap.engine.config import PRESETS, Config, Settings
+from scopemap.engine.config.settings import StageSettings
 
 _HEAD = """# Settings
 

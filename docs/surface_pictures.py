@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.actions.inputs import open_truth
-from scopemap.frame import Frame
-from scopemap.fusion.agreement import compare_with_frame
-from scopemap.geometry.rendering import Rendering
-from scopemap.io.run_folder import RunFolder
+from scopemap.runner.frames_again import open_truth
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.agreement import compare_with_frame
+from scopemap.engine.geometry.rendering import Rendering
+from scopemap.result.run_folder import RunFolder
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     MeshView,

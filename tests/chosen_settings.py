@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
-from scopemap.config import Config, Preset, setting_names
-from scopemap.config.settings import StageSettings
+from scopemap.engine.config import Config, Preset, setting_names
+from scopemap.engine.config.settings import StageSettings
 
 Stage = TypeVar("Stage", bound=StageSettings)
 

@@ -12,9 +12,9 @@ import numpy as np
 import tifffile
 from drawn_scared import write_tar
 
-from scopemap.frame import Frame, Truth
-from scopemap.geometry.se3 import inverse
-from scopemap.io.opening import open_sequence
+from scopemap.engine.frame import Frame, Truth
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.input.opening import open_sequence
 
 Seen = list[tuple[Frame, Truth]]
 

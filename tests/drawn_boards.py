@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from scopemap.calibration.targets import CharucoBoard, Checkerboard
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.apps.calibrate.targets import CharucoBoard, Checkerboard
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera, OpenCvCamera
 
 SIZE = (320, 240)
 CHECKERBOARD = Checkerboard(9, 6, 3.0)

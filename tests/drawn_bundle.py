@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.geometry.se3 import inverse, se3_exp, transform
-from scopemap.mapping.bundle_problem import Observations, Points
+from scopemap.engine.geometry.se3 import inverse, se3_exp, transform
+from scopemap.engine.mapping.bundle_problem import Observations, Points
 
 FOCAL_PX = 150.0
 KEYFRAMES, PER_KEYFRAME = 6, 80

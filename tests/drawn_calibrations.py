@@ -6,8 +6,8 @@ import json
 import struct
 from pathlib import Path
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
 
 SIZE = (640, 480)
 PINHOLE = PinholeCamera(520.5, 525.25, 318.0, 245.0, *SIZE)

@@ -13,8 +13,8 @@ from foreign_layouts import colmap_text
 from sample_trajectories import as_trajectory, write_run
 from scipy.spatial.transform import Rotation
 
-from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.input.trajectory.trajectory import Trajectory
 
 
 def path_of(count: int, seed: int = 0) -> np.ndarray:

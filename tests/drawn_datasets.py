@@ -31,7 +31,7 @@ from drawn_inputs import picture, save, write_c3vd, write_sevenscenes, write_vid
 from drawn_scared import write_scared, write_scared_c
 from drawn_video_sets import write_endomapper_with_model, write_stereomis, write_stir
 
-from scopemap.cameras.formats.writing import write_calibration
+from scopemap.input.camera_files.writing import write_calibration
 
 
 def write_pictures(folder: Path) -> Path:

@@ -8,9 +8,9 @@ import av
 import cv2
 import numpy as np
 
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import se3_exp
-from scopemap.io.sequence import Sequence
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.input.sequence import Sequence
 
 SIZE = (135, 108)  # a tenth of C3VD's
 

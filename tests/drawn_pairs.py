@@ -11,10 +11,10 @@ import numpy as np
 import yaml
 from drawn_inputs import save
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.cameras.rectification import StereoPair
-from scopemap.geometry.se3 import inverse, se3_exp
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.engine.cameras.rectification import StereoPair
+from scopemap.engine.geometry.se3 import inverse, se3_exp
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom

@@ -11,20 +11,20 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.config import Config
-from scopemap.frame import Frame
-from scopemap.geometry.rendering import render_mesh
-from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.io.depth_maps import DepthWriter
-from scopemap.notices import of_input
-from scopemap.reconstruction import Reconstruction
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import Config
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.engine.geometry.se3 import se3, so3_exp
+from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.engine.notices import of_input
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.trajectory.trajectory import write_tum
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.trajectory.frame_table import ELSEWHERE, NOT_USED, ROTATED, FrameTable
-from scopemap.trajectory.frame_table import LOST as LOST_FRAME
-from scopemap.trajectory.tissue_states import TissueStates
-from scopemap.trajectory.trajectory import write_tum
+from scopemap.result.depth_maps import DepthWriter
+from scopemap.result.frame_table import ELSEWHERE, NOT_USED, ROTATED, FrameTable
+from scopemap.result.frame_table import LOST as LOST_FRAME
+from scopemap.result.reconstruction import Reconstruction
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 IN_RESULT, IN_FIRST_MAP, FRAMES = 14, 7, 24

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import tifffile
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.geometry.se3 import inverse, se3_exp
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.engine.geometry.se3 import inverse, se3_exp
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = OpenCvCamera(PinholeCamera(60.0, 61.0, 30.0, 25.0, WIDTH, HEIGHT), (-0.2, 0.05, 0.002, -0.003, 0.01))

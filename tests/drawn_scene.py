@@ -9,8 +9,8 @@ import numpy as np
 from drawn_inputs import picture
 from scipy.spatial.transform import Rotation
 
-from scopemap.cameras.camera import CameraModel
-from scopemap.geometry.se3 import se3_exp
+from scopemap.engine.cameras.camera import CameraModel
+from scopemap.engine.geometry.se3 import se3_exp
 
 COUNT = 7
 RATE_HZ = 25

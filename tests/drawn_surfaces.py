@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import FusionSettings
-from scopemap.config.mapping import FusionConstants
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import FusionSettings
+from scopemap.engine.config.mapping import FusionConstants
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import se3, so3_exp
 
 WIDE = PinholeCamera(46.0, 47.0, 59.3, 60.2, 120, 121)
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)

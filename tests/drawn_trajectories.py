@@ -17,7 +17,7 @@ from foreign_layouts import (
 )
 from sample_trajectories import as_trajectory, write_c3vd, write_run
 
-from scopemap.config import Config
+from scopemap.engine.config import Config
 from scopemap_bench.plan import shipped_plans
 
 

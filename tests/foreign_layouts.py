@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.input.trajectory.trajectory import Trajectory
 
 MM_PER = {"mm": 1.0, "m": 1000.0}
 

@@ -9,12 +9,12 @@ from functools import cache
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import MappingSettings
-from scopemap.flow.dis import DisFlow
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
-from scopemap.mapping import Backend, FrameCorrection
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, se3, so3_exp, transform
+from scopemap.engine.mapping import Backend, FrameCorrection
 
 CAMERA = PinholeCamera(150.0, 150.0, 119.5, 89.5, 240, 180)
 PLANE_MM = 50.0

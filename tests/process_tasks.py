@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 
 WHATS = ["work", "die", "refuse", "hang", "die once", "fault"]
 LIMIT_S = 12.0

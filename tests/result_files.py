@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 from typing import Any
 
-from scopemap.io.checkpoint import SavedState
+from scopemap.result.checkpoint import SavedState
 
 # They hold times, or what holds times.
 NOT_COMPARED = {"provenance.json", "SHA256SUMS", "report.html", "frames/measures.csv"}

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scopemap.geometry.se3 import se3, se3_exp, so3_exp
-from scopemap.trajectory.trajectory import Trajectory, write_tum
+from scopemap.engine.geometry.se3 import se3, se3_exp, so3_exp
+from scopemap.input.trajectory.trajectory import Trajectory, write_tum
 
 
 def write_run(folder: Path, trajectory: Trajectory) -> Path:

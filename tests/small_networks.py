@@ -17,7 +17,7 @@ from transformers import (
     DPTImageProcessor,
 )
 
-from scopemap.io.weights import REGISTRY
+from scopemap.engine.models.weights import REGISTRY
 
 _VIT = {
     "model_type": "dinov2",

@@ -10,12 +10,12 @@ import pytest
 from chosen_settings import chosen
 
 from scopemap import Config
-from scopemap.config import DepthSettings
-from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.estimate import DepthEstimate
-from scopemap.estimators import create_estimators
-from scopemap.frame import Frame
-from scopemap.preprocessing import Estimators
+from scopemap.engine.config import DepthSettings
+from scopemap.engine.depth.anchor import AnchoredDepth
+from scopemap.engine.depth.estimate import DepthEstimate
+from scopemap.engine.frame import Frame
+from scopemap.engine.preprocessing import Estimators
+from scopemap.runner.estimators import create_estimators
 
 
 class SpyDepth:

@@ -29,8 +29,8 @@ from stored_frames import (
     scene_points,
 )
 
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.geometry.se3 import inverse
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.input.camera_files.writing import write_calibration
 
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 

@@ -10,9 +10,9 @@ from front_door import call
 from result_files import batch_rows, compared_files
 from tiny_phantom import write_tiny
 
-from scopemap.cli.batch import videos_of
-from scopemap.errors import InputError
-from scopemap.io.inputs import RemoteFile, is_address, named_inputs, remote_files
+from scopemap.apps.batch.command import videos_of
+from scopemap.engine.errors import InputError
+from scopemap.input.inputs import RemoteFile, is_address, named_inputs, remote_files
 from scopemap_bench.scripts.batch import CAMERA, write_videos
 
 QUICK = ["--set", "mapping.method=no-triangulation"]

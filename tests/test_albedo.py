@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import FusionSettings
-from scopemap.config.mapping import FusionConstants
-from scopemap.frame import Frame
-from scopemap.fusion.agreement import compare_with_frame
-from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.geometry.se3 import se3
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import FusionSettings
+from scopemap.engine.config.mapping import FusionConstants
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.agreement import compare_with_frame
+from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.geometry.se3 import se3
 
 CAMERA = PinholeCamera(100.0, 100.0, 79.5, 59.5, 160, 120)
 TILT = np.array([-0.5, 0.0, np.sqrt(0.75)])  # normal of the wall normal . X = 40: one side near, one far

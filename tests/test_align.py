@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.errors import AlignmentError
-from scopemap.geometry.align import Similarity, align_trajectories, umeyama
-from scopemap.geometry.se3 import rotation_angle_rad, se3_exp, so3_exp
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.geometry.align import Similarity, align_trajectories, umeyama
+from scopemap.engine.geometry.se3 import rotation_angle_rad, se3_exp, so3_exp
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=25, deadline=None)

@@ -12,13 +12,13 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.errors import WeightsError
-from scopemap.frame import Frame
-from scopemap.tracking import alike
-from scopemap.tracking.alike import AlikeFeatures, descriptors_at, network_answer
+from scopemap.engine.errors import WeightsError
+from scopemap.engine.frame import Frame
+from scopemap.engine.tracking import alike
+from scopemap.engine.tracking.alike import AlikeFeatures, descriptors_at, network_answer
 
 ROOT = Path(__file__).resolve().parents[1]
-FILE = ROOT / "src" / "scopemap" / "tracking" / "alike.onnx"
+FILE = ROOT / "src" / "scopemap" / "engine" / "tracking" / "alike.onnx"
 RGB = plane_scene.see(plane_scene.pose()).rgb
 # What it gave when the weights were converted.
 EXPECTED_PIXELS = [[75.546, 26.454], [124.884, 75.129], [188.462, 81.918]]
@@ -85,7 +85,7 @@ def test_an_installation_without_the_network_is_told(monkeypatch: pytest.MonkeyP
 
 
 def test_the_notice_comes_with_the_weights() -> None:
-    notice = (resources.files("scopemap.tracking") / "alike.LICENSE.txt").read_text(encoding="utf-8")
+    notice = (resources.files("scopemap.engine.tracking") / "alike.LICENSE.txt").read_text(encoding="utf-8")
     assert "BSD 3-Clause" in notice
     assert "Copyright (c) 2022, Zhao Xiaoming" in notice
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -11,18 +11,18 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingConstants
-from scopemap.flow.corners import detect_corners, sample_flow
-from scopemap.flow.dis import DisFlow
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp, se3_log
-from scopemap.mapping import Backend, FrameCorrection, TrackedPose
-from scopemap.mapping import backend as backend_module
-from scopemap.mapping.bundle_problem import Observations, Points
-from scopemap.mapping.feature_tracks import FeatureTracks
-from scopemap.mapping.other_starts import ShapeTest
-from scopemap.mapping.pose_interpolation import KeyframeStep
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.config.mapping import MappingConstants
+from scopemap.engine.flow.corners import detect_corners, sample_flow
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp, se3_log
+from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose
+from scopemap.engine.mapping import backend as backend_module
+from scopemap.engine.mapping.bundle_problem import Observations, Points
+from scopemap.engine.mapping.feature_tracks import FeatureTracks
+from scopemap.engine.mapping.other_starts import ShapeTest
+from scopemap.engine.mapping.pose_interpolation import KeyframeStep
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)

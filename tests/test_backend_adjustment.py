@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping.bundle_adjustment import adjust, adjust_in_windows
-from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.mapping.lens_residual import lens_residual, shape_change
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.engine.mapping.bundle_adjustment import adjust, adjust_in_windows
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
+from scopemap.engine.mapping.lens_residual import lens_residual, shape_change
 
 LOOSE = Priors(rotation_rad=10, translation_share=10)
 

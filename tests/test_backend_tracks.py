@@ -10,15 +10,15 @@ import pytest
 from drawn_bundle import FOCAL_PX, LINE, tracked, world
 from plane_scene import CAMERA
 
-from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingConstants
-from scopemap.flow.corners import normalised_brightness, refined_corners
-from scopemap.flow.dis import DisFlow
-from scopemap.flow.estimator import FlowEstimator
-from scopemap.geometry.se3 import inverse
-from scopemap.mapping.bundle_adjustment import adjust
-from scopemap.mapping.bundle_problem import BundleProblem, Observations, Priors
-from scopemap.mapping.feature_tracks import FeatureTracks
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.config.mapping import MappingConstants
+from scopemap.engine.flow.corners import normalised_brightness, refined_corners
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.mapping.bundle_adjustment import adjust
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Priors
+from scopemap.engine.mapping.feature_tracks import FeatureTracks
 
 
 class _Biased(DisFlow):

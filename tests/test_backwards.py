@@ -10,13 +10,13 @@ from result_files import frame_rows
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.keyframe_alignment import Keyframe, KeyframeAligner
-from scopemap.tracking.rtdl import Alignment
-from scopemap.tracking.track import Track, TrackingLoss
-from scopemap.tracking.tracker import Tracker
-from scopemap.trajectory.causes import LossCause
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.tracking.causes import LossCause
+from scopemap.engine.tracking.keyframe_alignment import Keyframe, KeyframeAligner
+from scopemap.engine.tracking.rtdl import Alignment
+from scopemap.engine.tracking.track import Track, TrackingLoss
+from scopemap.engine.tracking.tracker import Tracker
 
 FRAMES, LOST = 16, range(6, 9)
 LIGHT = {

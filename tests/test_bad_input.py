@@ -23,11 +23,11 @@ from drawn_inputs import picture, save, write_video
 from front_door import call, refused
 from tiny_phantom import FRAMES, write_tiny
 
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.errors import InputError, ScopemapError
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import reference_trajectory
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.opening import open_sequence
+from scopemap.result.reference import reference_trajectory
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.datasets.survey import survey
 
 Capture = pytest.CaptureFixture[str]

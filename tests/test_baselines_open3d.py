@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import SettingsError
-from scopemap.frame import Frame
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.frame import Frame
+from scopemap.engine.tracking.track import FrameTracker, Track
+from scopemap.input.opening import open_sequence
 from scopemap.runner.reconstruct import reconstruct
-from scopemap.tracking.track import FrameTracker, Track
 from scopemap_bench.methods import baselines
 from scopemap_bench.methods.baselines import ICP_METHODS, RGBD_METHODS, Open3dTracker, load_open3d
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from tiny_phantom import FRAMES, true_poses, with_true_depth, write_tiny
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import TrackingSettings
-from scopemap.errors import AlignmentError
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import rotation_angle_rad
+from scopemap.engine.tracking.pyramid import build_pyramid
+from scopemap.engine.tracking.track import FrameTracker
 from scopemap.evaluation.poses import evaluate_poses
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import rotation_angle_rad
-from scopemap.io.opening import open_sequence
-from scopemap.reconstruction import Reconstruction
+from scopemap.input.opening import open_sequence
+from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reconstruct import reconstruct
-from scopemap.tracking.pyramid import build_pyramid
-from scopemap.tracking.track import FrameTracker
-from scopemap.trajectory.formats.opening import read_trajectory
 from scopemap_bench.methods.baselines import SETTINGS, StandingStill, create_endo_depth_and_motion
 
 PLAIN = {

@@ -15,11 +15,11 @@ from front_door import call, refused
 from result_files import batch_rows, compared_files
 from tiny_phantom import write_tiny
 
-import scopemap.cli.batch as batch_command
-from scopemap.cli.batch import videos_of
-from scopemap.io.inputs import named_inputs
+import scopemap.apps.batch.command as batch_command
+from scopemap.apps.batch.batch import folder_names
+from scopemap.apps.batch.command import videos_of
+from scopemap.input.inputs import named_inputs
 from scopemap.report.batch_page import BatchRow, write_batch_page
-from scopemap.runner.batch import folder_names
 
 QUICK = ["--set", "mapping.method=no-triangulation"]
 

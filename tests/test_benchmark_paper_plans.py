@@ -13,9 +13,9 @@ from front_door import call
 from small_networks import use_weights, write_weights
 from tiny_phantom import write_tiny
 
-from scopemap.errors import InputError
-from scopemap.io.opening import open_sequence
-from scopemap.io.weights import REGISTRY
+from scopemap.engine.errors import InputError
+from scopemap.engine.models.weights import REGISTRY
+from scopemap.input.opening import open_sequence
 from scopemap_bench import runner
 from scopemap_bench.comparison import FinishedRun, frame_pair, write_results
 from scopemap_bench.entry import Entry

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from sample_trajectories import write_c3vd
 
-from scopemap.config import Config
-from scopemap.errors import InputError, SettingsError
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError, SettingsError
 from scopemap_bench.entry import Entry, entries_of
 from scopemap_bench.methods.method import create_method
 from scopemap_bench.plan import Plan, found_sequences, read_plan, shipped_plans

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scopemap.cameras.scopes import SCOPES
+from scopemap.input.scopes import SCOPES
 from scopemap_bench.scripts import record
 from scopemap_bench.scripts.unknown_lenses import ENDOSCOPES
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from sample_trajectories import as_trajectory, vector_a
 
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.evaluation.poses import match, pose_report
 from scopemap_bench.evaluation.consistency import ConsistencyMeter
 from scopemap_bench.evaluation.depth import mean_depth_report, metric_consistency, scale_jitter

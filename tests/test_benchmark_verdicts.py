@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from drawn_run import CAMERA, FRAMES, draw_run, pose_of, tube
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.frame import Truth
-from scopemap.geometry.rendering import render_mesh
-from scopemap.io.run_folder import RunFolder
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.frame import Truth
+from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.evaluation.partial_truth import drift, pairs_in_order
 from scopemap_bench.scripts import measuring, verdicts
 from scopemap_bench.scripts.verdict_cases import Case, Known, other_cases, phantom_cases, real_cases

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from drawn_clips import Change, circle, clip, inside, text, write
 
-from scopemap.inspection.inspecting import Inspection, inspect
-from scopemap.inspection.letters import LetterFinder
+from scopemap.apps.inspect.inspecting import Inspection, inspect
+from scopemap.apps.inspect.letters import LetterFinder
 
 
 def inspected(folder: Path, *changes: Change) -> Inspection:

@@ -26,12 +26,12 @@ from drawn_calibrations import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.calibration import Calibration
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
-from scopemap.errors import CalibrationError
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.engine.errors import CalibrationError
+from scopemap.input.camera_files.calibration import Calibration
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.camera_files.writing import write_calibration
 
 FORMS = forms()
 

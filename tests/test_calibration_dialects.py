@@ -13,12 +13,12 @@ from drawn_bags import SIZE as BAG_SIZE
 from drawn_calibrations import ORB_SLAM, PINHOLE, RADTAN, RADTAN5, SIZE, kalibr
 from drawn_inputs import picture
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.calibration import Calibration
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.config import InputSettings
-from scopemap.errors import CalibrationError
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import InputSettings
+from scopemap.engine.errors import CalibrationError
+from scopemap.input.camera_files.calibration import Calibration
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.opening import open_sequence
 
 K = [[520.5, 0.0, 318.0], [0.0, 525.25, 245.0], [0.0, 0.0, 1.0]]
 FX = {"fx": 520.5, "fy": 525.25, "cx": 318.0, "cy": 245.0}

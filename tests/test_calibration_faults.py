@@ -14,8 +14,8 @@ from drawn_calibrations import forms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.errors import CalibrationError, ScopemapError
+from scopemap.engine.errors import CalibrationError, ScopemapError
+from scopemap.input.camera_files.reading import read_calibration
 
 MANY = 200_000
 LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
@@ -106,8 +106,8 @@ def test_a_pipe_and_a_loop_are_not_waited_for(tmp_path: Path) -> None:
 def test_bombs_take_little_memory(bomb: str, tmp_path: Path) -> None:
     (tmp_path / "bomb").write_text(BOMBS[bomb])
     code = (
-        "import resource, sys\nfrom scopemap.cameras.formats.reading import read_calibration\n"
-        "from scopemap.errors import CalibrationError\n"
+        "import resource, sys\nfrom scopemap.input.camera_files.reading import read_calibration\n"
+        "from scopemap.engine.errors import CalibrationError\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "try:\n    read_calibration(sys.argv[1], (640, 480))\nexcept CalibrationError:\n"
         "    sys.exit(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before > 150_000)\n"

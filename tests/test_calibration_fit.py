@@ -9,13 +9,13 @@ import pytest
 from drawn_calibrations import CAMERAS, PINHOLE, SIZE
 from drawn_datasets import write_pictures
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.calibration import Calibration, fitted
-from scopemap.cameras.formats.reading import read_calibration, stated_calibration
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.config import InputSettings
-from scopemap.errors import CalibrationError, SettingsError
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.config import InputSettings
+from scopemap.engine.errors import CalibrationError, SettingsError
+from scopemap.input.camera_files.calibration import Calibration, fitted
+from scopemap.input.camera_files.reading import read_calibration, stated_calibration
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.opening import open_sequence
 
 # The pictures of `write_pictures` are 135x108 px.
 LARGE = PinholeCamera(200.0, 201.0, 140.0, 105.0, 270, 216)

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera, source_pixel
-from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera, source_pixel
+from scopemap.engine.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
 
 PINHOLE = PinholeCamera(520.0, 525.0, 318.0, 245.0, 640, 480)
 OPENCV = OpenCvCamera(PINHOLE, (-0.3, 0.1, 1e-3, -5e-4, -0.01))

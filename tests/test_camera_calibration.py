@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from drawn_boards import CHECKERBOARD, FISHEYE, PINHOLE, SIZE, Studio
 
-from scopemap.calibration.camera_calibration import (
+from scopemap.apps.calibrate.camera_calibration import (
     FORMS,
     CameraCalibration,
     LensForm,
@@ -20,7 +20,7 @@ from scopemap.calibration.camera_calibration import (
     warnings_about,
     with_deviations,
 )
-from scopemap.calibration.targets import (
+from scopemap.apps.calibrate.targets import (
     BoardView,
     CharucoBoard,
     Checkerboard,
@@ -30,9 +30,9 @@ from scopemap.calibration.targets import (
     edge_width_px,
     nearest_px,
 )
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.errors import CalibrationError, InputError, SettingsError
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.engine.errors import CalibrationError, InputError, SettingsError
 
 CHARUCO = CharucoBoard(7, 5, 4.0, 3.0)
 WRONG, BLURRED = 100, 101

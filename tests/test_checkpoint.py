@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from result_files import through_checkpoint
 
-from scopemap.config import TrackingSettings
-from scopemap.errors import InputError
-from scopemap.flow.dis import DisFlow
-from scopemap.io.checkpoint import SavedState
-from scopemap.tracking.track import Track
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.errors import InputError
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.tracking.track import Track
+from scopemap.result.checkpoint import SavedState
 
 _LEAVES = st.one_of(
     *(st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.binary(), st.just(Path("a/b"))),
@@ -91,11 +91,11 @@ def test_own_objects_come_back_shared_and_keep_what_is_not_stored(tmp_path: Path
 def test_no_class_but_scopemaps_is_made(tmp_path: Path) -> None:
     file = tmp_path / "state"
     through_checkpoint(file, Track(3, "ok", "", np.eye(4), 1))
-    for name in ("subprocess:Popen", "scopemap.errors:sys", "scopemap.tracking.track:Nothing"):
+    for name in ("subprocess:Popen", "scopemap.engine.errors:sys", "scopemap.engine.tracking.track:Nothing"):
         forged = SavedState(file)
         forged.put("part", Track(3, "ok", "", np.eye(4), 1))
         (tree,) = forged._database.execute("select tree from states").fetchone()
-        tree = tree.replace("scopemap.tracking.track:Track", name)
+        tree = tree.replace("scopemap.engine.tracking.track:Track", name)
         forged._database.execute("update states set tree = ?", (tree,))
         forged._digests["part"] = hashlib.blake2b(tree.encode(), digest_size=20).hexdigest()
         forged.commit({})

@@ -199,7 +199,7 @@ def test_other_commands_refuse_in_one_line_too(tmp_path: Path, capfd: Capture, m
     for command in (("run", tmp_path, "--out", tmp_path / "out"), ("inspect", tmp_path, "--out", tmp_path / "a.png")):
         found = refused(capfd, *command)
         assert "it holds 2 video(s) (a.AVI, b.mp4) and no images; give one of them, such as" in found
-    monkeypatch.setattr("scopemap.cli.options.os.access", lambda *_: False)
+    monkeypatch.setattr("scopemap.terminal.options.os.access", lambda *_: False)
     found = refused(capfd, "inspect", tmp_path / "none.mp4", "--out", tmp_path / "new" / "a.png")
     assert f"no permission to write in {tmp_path}" in found
 

@@ -13,11 +13,11 @@ from drawn_inputs import save
 from drawn_videos import encode
 from front_door import call
 
-from scopemap.cameras.camera import source_pixel
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.io.images import read_image
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import source_pixel
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.images import read_image
+from scopemap.input.opening import open_sequence
 
 Say = Callable[..., tuple[int, str, str]]
 BOARD = ("--board", "9x6", "--square-mm", 3)

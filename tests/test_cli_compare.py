@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.cli.app import app
-from scopemap.errors import InputError
-from scopemap.trajectory.trajectory import write_kitti
+from scopemap.engine.errors import InputError
+from scopemap.input.trajectory.trajectory import write_kitti
 from scopemap_bench.result import RunResult
 
 

@@ -12,7 +12,7 @@ import pytest
 from drawn_inputs import picture, save, write_c3vd
 
 from scopemap.cli.app import main
-from scopemap.io.opening import readers
+from scopemap.input.opening import readers
 
 Say = Callable[..., tuple[int, str, str]]
 

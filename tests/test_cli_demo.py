@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from front_door import call
 
-from scopemap.actions import demo as demonstration
-from scopemap.actions.demo import Demonstration
-from scopemap.config import Config
-from scopemap.io import weights
+from scopemap.apps.demo import demo as demonstration
+from scopemap.apps.demo.demo import Demonstration
+from scopemap.engine.config import Config
+from scopemap.engine.models import weights
 
 COUNT = 12
 

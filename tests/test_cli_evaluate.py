@@ -17,9 +17,9 @@ from tiny_phantom import write_tiny
 from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.errors import AlignmentError, InputError, SettingsError
-from scopemap.geometry.align import align_trajectories
-from scopemap.trajectory.trajectory import write_kitti
+from scopemap.engine.errors import AlignmentError, InputError, SettingsError
+from scopemap.engine.geometry.align import align_trajectories
+from scopemap.input.trajectory.trajectory import write_kitti
 from scopemap_bench.cli.evaluate import evaluate
 
 KEYS = [

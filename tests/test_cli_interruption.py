@@ -14,12 +14,12 @@ import pytest
 from front_door import call
 from tiny_phantom import FRAMES, write_tiny
 
-from scopemap.cli.interruption import Interruption
-from scopemap.frame import Frame
-from scopemap.io.sequence import Sequence
-from scopemap.mapping.submaps import Mapper, Submap
-from scopemap.odometry import Step
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.frame import Frame
+from scopemap.engine.mapping.submaps import Mapper, Submap
+from scopemap.engine.odometry import Step
+from scopemap.input.sequence import Sequence
+from scopemap.result.trajectories import read_trajectory
+from scopemap.terminal.interruption import Interruption
 
 STOPPED = FRAMES - 3
 

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from scopemap.cli import progress
-from scopemap.cli.options import (
+from scopemap.engine.errors import SettingsError
+from scopemap.terminal import progress
+from scopemap.terminal.options import (
     parse_box,
     parse_memory,
     parse_near_far,
@@ -18,8 +19,7 @@ from scopemap.cli.options import (
     parse_size,
     parse_slice,
 )
-from scopemap.cli.progress import run_progress
-from scopemap.errors import SettingsError
+from scopemap.terminal.progress import run_progress
 
 
 @pytest.mark.parametrize(

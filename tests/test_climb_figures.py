@@ -12,10 +12,10 @@ from drawn_climb import frames_of, path_of, write_foreign_run, write_reference
 from typer.testing import CliRunner
 
 from scopemap.cli.app import app
-from scopemap.errors import InputError
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import se3_exp, so3_exp
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import se3_exp, so3_exp
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.climb import figures as climb
 from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures, climb_score
 from scopemap_bench.trajectories.climb import read_climb_reference, read_submap, write_submap

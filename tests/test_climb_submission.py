@@ -19,8 +19,8 @@ from drawn_video_sets import write_frames
 from front_door import call, refused
 from tiny_phantom import write_tiny
 
-from scopemap.errors import InputError
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.errors import InputError
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.climb.submission import submission_problems, write_submission
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,9 +8,9 @@ import cv2
 import pytest
 from tiny_phantom import write_tiny
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 from scopemap.evaluation.poses import evaluate_poses
-from scopemap.io.opening import open_sequence
+from scopemap.input.opening import open_sequence
 from scopemap_bench.methods.method import create_method
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom

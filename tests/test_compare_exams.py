@@ -13,15 +13,15 @@ from drawn_run import Shown, drawn_result
 from front_door import call, refused
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, pose, see
 
-from scopemap.actions.compare_exams import ExamComparison, compare_exams
-from scopemap.errors import InputError
-from scopemap.frame import Frame
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import so3_exp
-from scopemap.io.depth_maps import DepthWriter
-from scopemap.io.run_folder import RunFolder
+from scopemap.apps.exams.compare_exams import ExamComparison, compare_exams
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import so3_exp
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.result.depth_maps import DepthWriter
+from scopemap.result.frame_table import FrameTable
+from scopemap.result.run_folder import RunFolder
 
 CAMERA_FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 ANOTHER_WORLD = Similarity(1.3, so3_exp(np.array([0.2, -0.5, 0.9])), np.array([30.0, -8.0, 4.0]))

@@ -10,27 +10,27 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import scopemap.config
+import scopemap.engine.config
 from docs.settings_page import settings_page
-from scopemap.config import PRESETS, Config, setting_names
-from scopemap.config.settings import StageSettings
-from scopemap.errors import SettingsError
+from scopemap.engine.config import PRESETS, Config, setting_names
+from scopemap.engine.config.settings import StageSettings
+from scopemap.engine.errors import SettingsError
 
-SOURCE = Path(scopemap.config.__file__).parents[1]
+SOURCE = Path(scopemap.engine.config.__file__).parents[2]
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = {name: part for name, part in Config() if isinstance(part, StageSettings)}
-# Where the settings of a group are read. A room's own `settings` object counts only in that room.
+# Where the settings of a group are read. A package's own `settings` object counts only in that package.
 READERS = {
     "run": ["runner/memory.py"],
-    "input": ["io/*.py", "cameras/**/*.py", "calibration/**/*.py", "runner/*.py"],
-    "mask": ["masking/*.py"],
-    "depth": ["depth/*.py", "estimators.py", "preprocessing.py"],
-    "mapis": ["depth/*.py", "preprocessing.py", "odometry.py"],
-    "networks": ["estimators.py"],
-    "tracking": ["tracking/*.py", "estimators.py", "preprocessing.py"],
-    "smoothing": ["tracking/smoothing.py"],
-    "mapping": ["mapping/*.py", "estimators.py", "pipeline.py", "runner/*.py"],
-    "fusion": ["fusion/*.py", "pipeline.py", "runner/run.py"],
+    "input": ["input/**/*.py", "runner/*.py"],
+    "mask": ["input/mask_files.py", "engine/masking/*.py"],
+    "depth": ["engine/depth/*.py", "input/depth_files.py", "runner/*.py", "engine/preprocessing.py"],
+    "mapis": ["engine/depth/*.py", "engine/preprocessing.py", "engine/odometry.py"],
+    "networks": ["runner/estimators.py"],
+    "tracking": ["engine/tracking/*.py", "runner/estimators.py", "engine/preprocessing.py"],
+    "smoothing": ["engine/tracking/smoothing.py"],
+    "mapping": ["engine/mapping/*.py", "runner/*.py", "engine/pipeline.py"],
+    "fusion": ["engine/fusion/*.py", "engine/pipeline.py", "runner/run.py"],
 }
 
 

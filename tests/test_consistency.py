@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, View, pose, see, true_flow
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import SettingsError
-from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.geometry.se3 import inverse, se3, se3_exp, so3_exp
 from scopemap_bench.evaluation.consistency import (
     ConsistencyMeter,
     FrameCorrespondences,

@@ -15,18 +15,18 @@ from result_files import through_checkpoint
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.config import TrackingSettings
-from scopemap.depth.mapis import DenseCorrespondence
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.mapping.submaps import Submap
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.depth.mapis import DenseCorrespondence
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.mapping.submaps import Submap
+from scopemap.engine.tracking.causes import ADVICE, LossCause, causes_of_loss
+from scopemap.engine.tracking.relocalisation import RotationFollower, rotation_by_flow
+from scopemap.engine.tracking.track import Track
+from scopemap.engine.tracking.tracker import Tracker
+from scopemap.result.frame_table import LOST, ROTATED, FrameTable
+from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.submap_frames import frames_of_submap
-from scopemap.tracking.relocalisation import RotationFollower, rotation_by_flow
-from scopemap.tracking.track import Track
-from scopemap.tracking.tracker import Tracker
-from scopemap.trajectory.causes import ADVICE, LossCause, causes_of_loss
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.frame_table import LOST, ROTATED, FrameTable
 
 FIRST = plane_scene.pose(turn_rad=(0.3, 0.1, 0.0))
 SECOND = FIRST @ plane_scene.pose(at_mm=(3.0, -1.0, 2.0), turn_rad=(0.03, -0.06, 0.02))

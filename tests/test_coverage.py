@@ -17,18 +17,18 @@ from drawn_run import CAMERA, drawn_result, tube
 from front_door import call, refused
 from test_true_surface import write_coverage
 
-from scopemap.actions.coverage.coverage import BLIND, NOT_SEEN, Coverage, coverage, regions
-from scopemap.actions.coverage.layout import Cavity, Lumen, binned
-from scopemap.actions.coverage.unseen import features, views_of
-from scopemap.config import Config
-from scopemap.errors import InputError
-from scopemap.frame import Frame
-from scopemap.geometry.centreline import Centreline, centreline, clock
-from scopemap.geometry.rendering import render_mesh
-from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.io.depth_maps import DepthWriter
-from scopemap.io.run_folder import RunFolder
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.apps.coverage.coverage import BLIND, NOT_SEEN, Coverage, coverage, regions
+from scopemap.apps.coverage.layout import Cavity, Lumen, binned
+from scopemap.apps.coverage.unseen import features, views_of
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.centreline import Centreline, centreline, clock
+from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.engine.geometry.se3 import se3, so3_exp
+from scopemap.result.depth_maps import DepthWriter
+from scopemap.result.frame_table import FrameTable
+from scopemap.result.run_folder import RunFolder
 from scopemap_bench.scripts import coverage as scoring
 
 HOLE_AT, HOLE_CLOCK, HOLE_MM = 40.0, 3.0, 12.0

@@ -12,8 +12,8 @@ import pytest
 from drawn_run import draw_run
 from front_door import refused
 
-from scopemap.errors import InputError
-from scopemap.io.run_folder import read_mesh
+from scopemap.engine.errors import InputError
+from scopemap.result.run_folder import read_mesh
 
 
 @pytest.fixture(scope="module")

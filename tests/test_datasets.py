@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from drawn_inputs import SIZE, frames_of, number_in, picture, save, write_c3vd, write_video
 
-from scopemap.config import InputSettings
-from scopemap.errors import CalibrationError, InputError
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.opening import open_sequence
+from scopemap.engine.config import InputSettings
+from scopemap.engine.errors import CalibrationError, InputError
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.input.opening import open_sequence
 
 # ---- folders of images
 

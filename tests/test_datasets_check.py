@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from drawn_inputs import picture, save
 
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import ScopemapError
-from scopemap.geometry.se3 import inverse, se3_exp
-from scopemap.io.opening import open_sequence
-from scopemap.io.sequence import Sequence
-from scopemap.io.source import SourceFrame, SourceTruth
-from scopemap.trajectory.formats.text import read_poses
+from scopemap.engine.errors import ScopemapError
+from scopemap.engine.geometry.se3 import inverse, se3_exp
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.opening import open_sequence
+from scopemap.input.sequence import Sequence
+from scopemap.input.source import SourceFrame, SourceTruth
+from scopemap.input.trajectory.text import read_poses
 from scopemap_bench.datasets.checking import Finding, check, check_path, refusal
 from scopemap_bench.datasets.survey import FrameFigures, PoseDepthTest, Survey, survey
 from scopemap_bench.phantom.spec import PhantomSpec

@@ -10,11 +10,11 @@ from drawn_colmap import CAMERA, NAMES, NUMBERS, SIZE, UNPOSED, images, stored_p
 from drawn_colmap import write_numbered as write_pictures
 from drawn_inputs import number_in
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
-from scopemap.errors import CalibrationError, InputError
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.engine.errors import CalibrationError, InputError
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.opening import open_sequence
 
 PLANE, SAME = PinholeCamera(61.0, 62.0, 40.5, 29.5, *SIZE), PinholeCamera(61.0, 61.0, 40.5, 29.5, *SIZE)
 

@@ -22,9 +22,9 @@ from drawn_colmap import (
     write_colmap,
 )
 
-from scopemap.cameras.formats.colmap_model import read_cameras, read_images
-from scopemap.errors import ScopemapError
-from scopemap.io.opening import open_sequence
+from scopemap.engine.errors import ScopemapError
+from scopemap.input.camera_files.colmap_model import read_cameras, read_images
+from scopemap.input.opening import open_sequence
 
 ROW = "1 1 0 0 0 0 0 0 1 frame_2.png"
 CAMERA_ROW = "1 PINHOLE 80 64 61 62 41 30"

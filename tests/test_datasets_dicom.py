@@ -26,10 +26,10 @@ from pydicom.uid import (
     RLELossless,
 )
 
-from scopemap.errors import InputError
-from scopemap.io.datasets.dicom import Dicom
-from scopemap.io.opening import open_sequence
-from scopemap.notices import Notice
+from scopemap.engine.errors import InputError
+from scopemap.engine.notices import Notice
+from scopemap.input.datasets.dicom import Dicom
+from scopemap.input.opening import open_sequence
 
 YBR = {"PhotometricInterpretation": "YBR_FULL"}
 GREY = {"SamplesPerPixel": 1, "PhotometricInterpretation": "MONOCHROME2", "PlanarConfiguration": None}

@@ -11,10 +11,10 @@ from drawn_image_sets import ROOM, STAMPS, TUM_SIZE, buffer, replace_line, write
 from drawn_inputs import picture, save
 from drawn_video_sets import FRAMES, archive_of, images_bin, write_endomapper, write_models, write_stereomis
 
-from scopemap.cameras.formats.colmap_model import read_largest_model
-from scopemap.errors import InputError
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import reference_trajectory
+from scopemap.engine.errors import InputError
+from scopemap.input.camera_files.colmap_model import read_largest_model
+from scopemap.input.opening import open_sequence
+from scopemap.result.reference import reference_trajectory
 from scopemap_bench.datasets import endoslam, posed_video
 from scopemap_bench.datasets.endomapper_sim import read_exr_red
 from scopemap_bench.datasets.endoslam import read_sheet

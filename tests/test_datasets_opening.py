@@ -15,8 +15,8 @@ from drawn_dicom import save as save_dicom
 from drawn_image_sets import at_rest, llff, write_endonerf, write_json, write_oneslam
 from drawn_inputs import picture, save, write_c3vd, write_video
 
-from scopemap.errors import CalibrationError, InputError, ScopemapError
-from scopemap.io.opening import open_sequence, open_source
+from scopemap.engine.errors import CalibrationError, InputError, ScopemapError
+from scopemap.input.opening import open_sequence, open_source
 
 
 @pytest.mark.parametrize("write", [write_oneslam, write_colmap, write_endonerf])

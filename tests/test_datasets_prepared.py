@@ -11,13 +11,13 @@ from drawn_clips import RATE, clip, tissue, write
 from drawn_inputs import frames_of, save, write_c3vd
 from drawn_videos import HEIGHT, WIDTH, above, beside, beside_squeezed, encode, half, stereo, woven
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.config import InputSettings
-from scopemap.errors import CalibrationError, InputError
-from scopemap.io.opening import open_sequence
-from scopemap.io.video_format.interlacing import combing
-from scopemap.notices import Notice
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import InputSettings
+from scopemap.engine.errors import CalibrationError, InputError
+from scopemap.engine.notices import Notice
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.opening import open_sequence
+from scopemap.input.video_format.interlacing import combing
 
 COUNT = 12
 Draw = Callable[[int], np.ndarray]

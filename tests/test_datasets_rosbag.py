@@ -12,10 +12,10 @@ import pytest
 from drawn_bags import IMAGE, SIZE, START_NS, STEP_NS, Bag, small_bag, write_bag1, write_mcap, write_ros2
 from drawn_inputs import number_in, picture
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
-from scopemap.io.datasets.rosbag import RosBag
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.input.datasets.rosbag import RosBag
+from scopemap.input.opening import open_sequence
 
 
 def first_picture(source: RosBag) -> np.ndarray:

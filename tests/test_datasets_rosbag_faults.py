@@ -11,9 +11,9 @@ from drawn_bags import IMAGE, INFO, SIZE, START_NS, STEP_NS, Bag, small_bag, wri
 from drawn_dicom import jpeg
 from drawn_inputs import number_in, picture
 
-from scopemap.errors import CalibrationError, InputError
-from scopemap.io.datasets.rosbag import RosBag
-from scopemap.io.opening import open_sequence
+from scopemap.engine.errors import CalibrationError, InputError
+from scopemap.input.datasets.rosbag import RosBag
+from scopemap.input.opening import open_sequence
 
 JPEG_START = b"\xff\xd8\xff"
 
@@ -170,6 +170,6 @@ def test_a_count_beyond_the_file_is_bounded(tmp_path: Path) -> None:
 
 def test_the_package_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = write_bag1(tmp_path / "a")
-    monkeypatch.setattr("scopemap.io.datasets.rosbag.find_spec", lambda name: None)
+    monkeypatch.setattr("scopemap.input.datasets.rosbag.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install -e '\.\[ros\]'"):
         open_sequence(file)

@@ -34,14 +34,14 @@ from drawn_scared import (
     write_tar,
 )
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.errors import InputError, ScopemapError
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import reference_trajectory
-from scopemap.io.sequence import Sequence
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.opening import open_sequence
+from scopemap.input.sequence import Sequence
+from scopemap.result.reference import reference_trajectory
 
 NUMBERS = [1, 2, 4, 7, 8]
 Edit = Callable[[Path], object]

@@ -16,9 +16,9 @@ from drawn_videos import encode, one_colour
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scopemap.errors import InputError
-from scopemap.io.opening import open_sequence
-from scopemap.io.video import TimeStamps, VideoFile
+from scopemap.engine.errors import InputError
+from scopemap.input.opening import open_sequence
+from scopemap.input.video import TimeStamps, VideoFile
 
 
 def test_a_video_whose_title_is_no_utf8_is_read(tmp_path: Path) -> None:

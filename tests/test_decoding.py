@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap.errors import InputError
-from scopemap.io.decoding import decoded, read_decoded
+from scopemap.engine.errors import InputError
+from scopemap.input.decoding import decoded, read_decoded
 
 HUGE = 60_000
 

@@ -11,10 +11,10 @@ from drawn_image_sets import levels, write_d4d
 from drawn_run import write_placed
 from drawn_video_sets import FRAMES, STIR_K, TATTOOS, write_stir
 
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.errors import CalibrationError, InputError
-from scopemap.io.opening import open_sequence
-from scopemap.trajectory.tissue_states import TissueStates
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.engine.errors import CalibrationError, InputError
+from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.input.opening import open_sequence
 from scopemap_bench.datasets.d4d import D4dClip
 from scopemap_bench.datasets.stir import StirClip
 from scopemap_bench.evaluation.tattoos import accuracy, followed

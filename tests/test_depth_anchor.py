@@ -11,11 +11,11 @@ from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import DepthSettings
-from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.estimate import DepthEstimate
-from scopemap.frame import Frame
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import DepthSettings
+from scopemap.engine.depth.anchor import AnchoredDepth
+from scopemap.engine.depth.estimate import DepthEstimate
+from scopemap.engine.frame import Frame
 
 CAMERA = PinholeCamera(60.0, 60.0, 29.5, 19.5, 60, 40)
 TRUTH_MM = np.random.default_rng(0).uniform(13.5, 100.0, (40, 60)).astype(np.float32)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scopemap.depth.pseudo_stereo import (
+from scopemap.engine.depth.pseudo_stereo import (
     fit_affine_disparity,
     fit_baseline_lbfgsb,
 )
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 
 
 def closed_form(depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float) -> float:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.frame import Frame
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.frame import Frame
 from scopemap_bench.scripts import depth_without_download as bench
 from scopemap_bench.scripts.depth_without_download import drawn
 

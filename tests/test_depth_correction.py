@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingConstants
-from scopemap.frame import Frame
-from scopemap.mapping import MAX_LOG_FACTOR, FrameCorrection
-from scopemap.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthCorrectionField, fit_depth_correction
-from scopemap.mapping.submaps import corrected_frame
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.config.mapping import MappingConstants
+from scopemap.engine.frame import Frame
+from scopemap.engine.mapping import MAX_LOG_FACTOR, FrameCorrection
+from scopemap.engine.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthCorrectionField, fit_depth_correction
+from scopemap.engine.mapping.submaps import corrected_frame
 
 HEIGHT, WIDTH = 120, 160
 

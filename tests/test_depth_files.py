@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from chosen_settings import chosen
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import FisheyeCamera
-from scopemap.cameras.rectification import Rectifier, working_camera
-from scopemap.config import DepthSettings
-from scopemap.depth.files import FilesDepth
-from scopemap.errors import InputError
-from scopemap.frame import Frame
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera
+from scopemap.engine.cameras.rectification import Rectifier, working_camera
+from scopemap.engine.config import DepthSettings
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import Frame
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.depth_files import FilesDepth
 
 SOURCE = PinholeCamera(100.0, 100.0, 59.5, 49.5, 120, 100)
 TARGET = SOURCE.resized(60, 50)

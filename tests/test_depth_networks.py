@@ -11,15 +11,15 @@ import pytest
 import torch
 from small_networks import saved, small_depth_anything, small_depth_pro
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import DepthSettings
-from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.backends import create_anchor, create_depth
-from scopemap.depth.depth_anything import DepthAnything
-from scopemap.depth.depth_pro import DepthPro
-from scopemap.depth.estimate import DepthEstimate
-from scopemap.errors import WeightsError
-from scopemap.frame import Frame
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import DepthSettings
+from scopemap.engine.depth.anchor import AnchoredDepth
+from scopemap.engine.depth.depth_anything import DepthAnything
+from scopemap.engine.depth.depth_pro import DepthPro
+from scopemap.engine.depth.estimate import DepthEstimate
+from scopemap.engine.errors import WeightsError
+from scopemap.engine.frame import Frame
+from scopemap.runner.depth_backends import create_anchor, create_depth
 
 HEIGHT, WIDTH = 50, 61
 

@@ -13,13 +13,13 @@ import trimesh
 from tiny_phantom import FRAMES, only_images, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.cli.run import summary_lines
-from scopemap.config import Config
-from scopemap.frame import Frame
-from scopemap.io.depth_maps import DepthReader, DepthWriter
-from scopemap.io.sequence import Sequence
-from scopemap.notices import scale_words
+from scopemap.apps.run.command import summary_lines
+from scopemap.engine.config import Config
+from scopemap.engine.frame import Frame
+from scopemap.engine.notices import scale_words
+from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import write_previews
+from scopemap.result.depth_maps import DepthReader, DepthWriter
 
 UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
 

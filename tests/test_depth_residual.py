@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from chosen_settings import chosen
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import TrackingSettings
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.tracking.residuals import Loss, View, depth_residuals, normal_equations
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.engine.tracking.residuals import Loss, View, depth_residuals, normal_equations
+from scopemap.engine.tracking.tracker import Tracker
 
 CAMERA = PinholeCamera(70.0, 72.0, 39.2, 31.4, 80, 64)
 UNIT_MM = 40.0

@@ -13,17 +13,17 @@ import torch
 from chosen_settings import chosen
 from torch import nn
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.rectification import Rectifier
-from scopemap.config import DepthSettings
-from scopemap.depth.backends import create_depth
-from scopemap.depth.scopenet import estimator as module
-from scopemap.depth.scopenet.colours import one_colour
-from scopemap.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth
-from scopemap.depth.scopenet.planes import LINEAR, input_planes
-from scopemap.errors import WeightsError
-from scopemap.frame import Frame
-from scopemap.io import weights
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.rectification import Rectifier
+from scopemap.engine.config import DepthSettings
+from scopemap.engine.depth.scopenet import estimator as module
+from scopemap.engine.depth.scopenet.colours import one_colour
+from scopemap.engine.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth
+from scopemap.engine.depth.scopenet.planes import LINEAR, input_planes
+from scopemap.engine.errors import WeightsError
+from scopemap.engine.frame import Frame
+from scopemap.engine.models import weights
+from scopemap.runner.depth_backends import create_depth
 from training.export import export
 from training.network import ScopeNet
 

@@ -11,10 +11,10 @@ from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import DepthSettings
-from scopemap.depth.shading import ShadingDepth
-from scopemap.frame import Frame
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import DepthSettings
+from scopemap.engine.depth.shading import ShadingDepth
+from scopemap.engine.frame import Frame
 
 CAMERA = PinholeCamera(90.0, 90.0, 79.5, 63.5, 160, 128)
 UNIT_Z = 1 / np.linalg.norm(CAMERA.rays, axis=-1)

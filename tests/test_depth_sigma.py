@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from chosen_settings import chosen
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import DepthSettings, FusionSettings, MapisSettings
-from scopemap.config.mapping import FusionConstants
-from scopemap.depth.anchor import AnchoredDepth
-from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
-from scopemap.depth.shading import ShadingDepth
-from scopemap.frame import Frame
-from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.geometry.uncertainty import blended_sigma, by_variance, depth_trust, faded_sigma, relative_sigma
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import DepthSettings, FusionSettings, MapisSettings
+from scopemap.engine.config.mapping import FusionConstants
+from scopemap.engine.depth.anchor import AnchoredDepth
+from scopemap.engine.depth.estimate import DepthEstimate
+from scopemap.engine.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
+from scopemap.engine.depth.shading import ShadingDepth
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.geometry.uncertainty import blended_sigma, by_variance, depth_trust, faded_sigma, relative_sigma
 
 SHAPE = (48, 64)
 CAMERA = PinholeCamera(60.0, 60.0, 31.5, 23.5, 64, 48)

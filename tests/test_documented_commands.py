@@ -13,7 +13,7 @@ import typer
 import typer.main
 from front_door import call
 
-from scopemap.actions import demo as demonstration
+from scopemap.apps.demo import demo as demonstration
 from scopemap.cli.app import app
 from scopemap_bench.scripts.demo_clip import SPEC, write_clip
 

@@ -15,10 +15,10 @@ import scopemap_bench
 from docs.api_page import api_page
 from scopemap import __version__
 from scopemap.cli.app import app
-from scopemap.config import PRESETS, setting_names
-from scopemap.io.opening import readers
-from scopemap.io.weights import REGISTRY
-from scopemap.trajectory.frame_table import COLUMNS
+from scopemap.engine.config import PRESETS, setting_names
+from scopemap.engine.models.weights import REGISTRY
+from scopemap.input.opening import readers
+from scopemap.result.frame_table import COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "bench").glob("*.md")])
@@ -159,7 +159,7 @@ def test_every_extra_is_documented() -> None:
 def test_source_files_that_are_named_exist(name: str) -> None:
     named = re.findall(r"`((?:[\w-]+/)*[\w-]+\.py)`", _text(f"docs/{name}.md"))
     assert named
-    folders = ("", "src/scopemap", "bench/src/scopemap_bench", "src/scopemap/depth/scopenet", "training")
+    folders = ("", "src/scopemap", "bench/src/scopemap_bench", "src/scopemap/engine/depth/scopenet", "training")
     places = [ROOT / folder for folder in folders]
     assert [one for one in named if "NAME" not in one and not any((place / one).exists() for place in places)] == []
 

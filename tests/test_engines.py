@@ -15,11 +15,11 @@ import pytest
 from front_door import refused
 from process_tasks import FAULTS, LIMIT_S, WHATS, act, soon
 
-from scopemap.errors import InputError
-from scopemap.runner.engines import Engine, WorkerNeeds
+from scopemap.apps.batch.engines import Engine, WorkerNeeds
+from scopemap.apps.batch.ray_engine import RayEngine
+from scopemap.apps.batch.slurm_engine import SlurmEngine
+from scopemap.engine.errors import InputError
 from scopemap.runner.processes import ProcessLimits, run_in_processes, usable_cores
-from scopemap.runner.ray_engine import RayEngine
-from scopemap.runner.slurm_engine import SlurmEngine
 from scopemap_bench.scripts.batch import POISONED, single_runs, trial, write_videos
 
 NEEDS = WorkerNeeds(cores=1, memory_gb=0.5)
@@ -115,7 +115,7 @@ def _runs(pid: str) -> bool:
 
 @CLUSTER
 def test_what_no_node_has_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.runner.ray_engine._LONGEST_START_S", 3.0)
+    monkeypatch.setattr("scopemap.apps.batch.ray_engine._LONGEST_START_S", 3.0)
     with pytest.raises(InputError, match="no worker has started on Ray in 3 s: has a node the cores"):
         list(RayEngine(WorkerNeeds(1, 0.5, gpus=64))(act, [("work", tmp_path / "a")], ProcessLimits(1)))
 
@@ -124,8 +124,8 @@ def test_what_no_node_has_is_a_sentence(tmp_path: Path, monkeypatch: pytest.Monk
 def test_ray_of_this_machine_is_reached_from_nowhere_else_and_tells_nobody(tmp_path: Path) -> None:
     """In a process of its own, as a Ray that was imported before has chosen its address."""
     code = (
-        "import os\nfrom scopemap.runner.ray_engine import RayEngine\n"
-        "from scopemap.runner.engines import WorkerNeeds\n"
+        "import os\nfrom scopemap.apps.batch.ray_engine import RayEngine\n"
+        "from scopemap.apps.batch.engines import WorkerNeeds\n"
         "def listening():\n"
         "    lines = [line.split() for name in ('tcp', 'tcp6') for line in open(f'/proc/net/{name}')]\n"
         "    return [line[1] for line in lines if line[3] == '0A']\n"

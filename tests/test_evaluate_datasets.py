@@ -13,12 +13,12 @@ from drawn_datasets import WRITERS
 from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.actions.inputs import open_truth
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import CalibrationError, InputError, SettingsError
-from scopemap.io.depth_maps import DepthReader
-from scopemap.io.reference import read_reference, reference_trajectory
-from scopemap.trajectory.trajectory import write_tum
+from scopemap.engine.errors import CalibrationError, InputError, SettingsError
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.trajectory.trajectory import write_tum
+from scopemap.result.depth_maps import DepthReader
+from scopemap.result.reference import read_reference, reference_trajectory
+from scopemap.runner.frames_again import open_truth
 from scopemap_bench.cli.evaluate import evaluate
 from scopemap_bench.scoring import default_protocol
 

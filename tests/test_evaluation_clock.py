@@ -13,11 +13,11 @@ import typer
 from sample_trajectories import as_trajectory, write_c3vd, write_run
 from typer.testing import CliRunner
 
-from scopemap.errors import AlignmentError
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.geometry.se3 import rotation_angle_rad, se3, so3_exp
 from scopemap.evaluation.clock import PoseCurve, by_clock, clock_sentence, fitted_offset, read_later
 from scopemap.evaluation.poses import match, pose_report
-from scopemap.geometry.se3 import rotation_angle_rad, se3, so3_exp
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.input.trajectory.trajectory import Trajectory
 
 SCALE, TURN = 0.4, so3_exp(np.array([0.3, -0.5, 0.8]))
 
@@ -115,7 +115,7 @@ def test_poses_are_read_between_their_neighbours() -> None:
 
 
 def run(*arguments: object, code: int = 0, bench: bool = True) -> Any:
-    from scopemap.cli.evaluate import evaluate as plain
+    from scopemap.apps.evaluate.command import evaluate as plain
     from scopemap_bench.cli.evaluate import evaluate
 
     app = typer.Typer()
@@ -145,7 +145,7 @@ def test_c3vd_recorded_poses_are_ahead_of_the_pictures(real_data: Path) -> None:
     """By the pictures alone: motion between them ends two frames after the recorded camera's has."""
     import cv2
 
-    from scopemap.io.reference import read_reference
+    from scopemap.result.reference import read_reference
 
     folder = real_data / "endoscopy" / "c3vd" / "trans_t2_a"
     truth = read_reference(folder)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.errors import SettingsError
+from scopemap.engine.errors import SettingsError
 from scopemap_bench.evaluation.depth import (
     DEPTH_RANGES_MM,
     depth_scale,

@@ -9,8 +9,8 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA, EVERYWHERE
 
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import se3_exp, so3_exp
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import se3_exp, so3_exp
 from scopemap_bench.evaluation.failure import FailureMeter
 
 FRAMES, AT = 24, 12

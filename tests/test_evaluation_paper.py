@@ -11,9 +11,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from sample_trajectories import as_trajectory, evo_pair, last_digit, vector_a
 
+from scopemap.engine.geometry.align import Similarity, align_trajectories
+from scopemap.engine.geometry.se3 import se3_exp, so3_exp
 from scopemap.evaluation.poses import ErrorSummary, match, translation_errors_mm
-from scopemap.geometry.align import Similarity, align_trajectories
-from scopemap.geometry.se3 import se3_exp, so3_exp
 from scopemap_bench.evaluation.paper import paper_figures
 
 seeds = st.integers(0, 2**32 - 1)

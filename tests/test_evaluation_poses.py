@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_trajectories import as_trajectory, evo_pair, last_digit, random_pair, vector_a
 
-from scopemap.errors import AlignmentError
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.geometry.align import align_trajectories
+from scopemap.engine.geometry.se3 import se3_exp
 from scopemap.evaluation.poses import (
     ErrorSummary,
     associate,
@@ -24,10 +26,8 @@ from scopemap.evaluation.poses import (
     rotation_errors_rad,
     translation_errors_mm,
 )
-from scopemap.geometry.align import align_trajectories
-from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.input.trajectory.trajectory import Trajectory
+from scopemap.result.trajectories import read_trajectory
 
 MODES = ("none", "origin", "se3", "sim3", "scale")
 

@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap_bench.evaluation.surface import (
     compare_surfaces,
     distance_to_mesh,

@@ -18,7 +18,7 @@ from evo.tools import file_interface
 from front_door import call, refused
 from PIL import Image
 
-from scopemap.geometry.rendering import render_mesh
+from scopemap.engine.geometry.rendering import render_mesh
 
 POSES = np.stack([pose_of(index) for index in range(IN_RESULT)])
 UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"

@@ -20,11 +20,11 @@ from mcap.reader import make_reader
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from scopemap.actions.export.image_layouts import write_endonerf
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.fusion.mesh_files import save_mesh
-from scopemap.geometry.rendering import render_mesh
-from scopemap.io.run_folder import RunFolder
+from scopemap.apps.export.image_layouts import write_endonerf
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.fusion.mesh_files import save_mesh
+from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.result.run_folder import RunFolder
 
 UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
 
@@ -195,7 +195,7 @@ def test_endonerf(run: Path, tmp_path: Path) -> None:
 
 
 def test_endonerf_has_its_principal_point_in_the_middle(run: Path, tmp_path: Path) -> None:
-    from scopemap.actions.export.exported_run import read_exported
+    from scopemap.runner.exported_run import read_exported
 
     lens = PinholeCamera(60.0, 48.0, 36.5, 29.0, 80, 64)
     exported = read_exported(run)

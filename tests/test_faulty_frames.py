@@ -16,16 +16,16 @@ from result_files import frame_rows
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.config import Config
-from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.files import FilesDepth
-from scopemap.depth.mapis import DenseMatcher
-from scopemap.depth.scopenet.estimator import ScopeNetDepth
-from scopemap.frame import Frame
-from scopemap.io.images import ImageFolder
-from scopemap.io.source import Source
-from scopemap.masking.masker import Masker
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.config import Config
+from scopemap.engine.depth.estimate import DepthEstimate
+from scopemap.engine.depth.mapis import DenseMatcher
+from scopemap.engine.depth.scopenet.estimator import ScopeNetDepth
+from scopemap.engine.frame import Frame
+from scopemap.engine.masking.masker import Masker
+from scopemap.engine.tracking.tracker import Tracker
+from scopemap.input.depth_files import FilesDepth
+from scopemap.input.images import ImageFolder
+from scopemap.input.source import Source
 
 
 @pytest.fixture(scope="module")

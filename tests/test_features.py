@@ -9,9 +9,9 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.alike import AlikeFeatures
-from scopemap.tracking.features import FeatureDetector, SiftFeatures, match_features, relative_pose_pnp
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.tracking.alike import AlikeFeatures
+from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures, match_features, relative_pose_pnp
 
 HERE = plane_scene.pose()
 # Half of the picture's width to the side, turned by some 20 degrees about the axis: far beyond what alignment bridges.

@@ -13,8 +13,8 @@ import pytest
 from front_door import call
 from tiny_phantom import write_tiny
 
-from scopemap.io import result_folder
-from scopemap.io.depth_maps import DepthReader
+from scopemap.result import result_folder
+from scopemap.result.depth_maps import DepthReader
 
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "scopemap"
 NAME = "Jörg, 内視鏡 №1"

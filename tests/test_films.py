@@ -10,10 +10,10 @@ import pytest
 from drawn_run import IN_RESULT, draw_run, wavering
 from front_door import call, refused
 
-from scopemap.actions.fly_through import _centreline, _place_and_clock, smoothed_poses
-from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.io.run_folder import RunFolder
+from scopemap.apps.view.fly_through import _centreline, _place_and_clock, smoothed_poses
+from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.report.films import write_turntable
+from scopemap.result.run_folder import RunFolder
 
 
 def pictures_of(film: Path) -> list[np.ndarray]:

@@ -11,9 +11,9 @@ from drawn_run import draw_run
 from front_door import call, refused
 from test_lesion import RADIUS
 
-from scopemap.actions.export.findings import write_findings
-from scopemap.actions.export.markups import SurfaceFinding
-from scopemap.actions.measure import Measure
+from scopemap.apps.measure.findings import write_findings
+from scopemap.apps.measure.measure import Measure
+from scopemap.apps.measure.surface_finding import SurfaceFinding
 
 OUTLINE = "30,44 40,48 50,44 40,40"
 SPOT = SurfaceFinding("blind spot 1", np.array([[1.0, 2, 3]]), [Measure("area not seen", 7.0, np.nan, np.nan, "unit2")])

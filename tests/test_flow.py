@@ -13,12 +13,12 @@ import pytest
 import torch
 from torchvision.models.optical_flow import raft_large, raft_small
 
-from scopemap.errors import WeightsError
-from scopemap.flow.dis import DisFlow
-from scopemap.flow.estimator import agree, pair_flow
-from scopemap.flow.flows import create_flow
-from scopemap.flow.raft import RaftFlow, torchvision_names
-from scopemap.geometry.warp import pull
+from scopemap.engine.errors import WeightsError
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.flow.estimator import agree, pair_flow
+from scopemap.engine.flow.flows import create_flow
+from scopemap.engine.flow.raft import RaftFlow, torchvision_names
+from scopemap.engine.geometry.warp import pull
 
 SHAPE = (140, 171)
 

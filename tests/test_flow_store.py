@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.flow.dis import DisFlow
-from scopemap.flow.estimator import FlowPair
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.flow.estimator import FlowPair
 from scopemap_bench.scoring import flow_to_previous
 
 

@@ -12,19 +12,19 @@ import pytest
 from front_door import said
 from turning_clip import focal_of, write_clip
 
-from scopemap.calibration.focal_length.from_motion import (
+from scopemap.engine.config import Config
+from scopemap.engine.errors import CalibrationError
+from scopemap.engine.geometry.se3 import so3_exp
+from scopemap.input.focal_length.from_motion import (
     FocalEstimate,
     WindowFit,
     adjust_window,
     combine,
     with_focal_from_motion,
 )
-from scopemap.calibration.focal_length.windows import Window
-from scopemap.config import Config
-from scopemap.errors import CalibrationError
-from scopemap.geometry.se3 import so3_exp
-from scopemap.io.opening import open_sequence
-from scopemap.io.sequence import Sequence
+from scopemap.input.focal_length.windows import Window
+from scopemap.input.opening import open_sequence
+from scopemap.input.sequence import Sequence
 from scopemap.runner.reconstruct import reconstruct
 
 HALF_PX = 160.0
@@ -220,7 +220,7 @@ def test_which_estimate_is_taken(
     still: Sequence, monkeypatch: pytest.MonkeyPatch, name: str, focal: str, taken: bool, message: str
 ) -> None:
     estimate = ESTIMATES[name]
-    monkeypatch.setattr("scopemap.calibration.focal_length.from_motion.focal_from_motion", lambda *_: estimate)
+    monkeypatch.setattr("scopemap.input.focal_length.from_motion.focal_from_motion", lambda *_: estimate)
     found, notes = with_focal_from_motion(still, _settings(focal))
     assert message in " ".join([found.camera_source, *map(str, notes)])
     if taken:

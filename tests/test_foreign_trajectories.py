@@ -26,10 +26,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_trajectories import as_trajectory, write_c3vd, write_run
 
-from scopemap.errors import InputError, SettingsError
-from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectory.formats.opening import read_trajectory, trajectory_kinds
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.input.trajectory.trajectory import Trajectory
+from scopemap.result.trajectories import read_trajectory, trajectory_kinds
 from scopemap_bench.trajectories import splatam
 
 # ---- SCARED

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.frame import Frame, percentiles
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.frame import Frame, percentiles
 
 CAMERA = PinholeCamera(50.0, 50.0, 19.5, 14.5, 40, 30)
 

@@ -11,10 +11,10 @@ import pytest
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.frame import Frame
-from scopemap.fusion.free_space import FreeSpace, views_among
-from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.free_space import FreeSpace, views_among
+from scopemap.engine.geometry.se3 import se3, so3_exp
 
 CAMERA = PinholeCamera(150.0, 150.0, 119.5, 89.5, 240, 180)
 WALL_MM, FRONT_MM, WIDTH_MM = 60.0, 40.0, 12.0

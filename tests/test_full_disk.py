@@ -12,8 +12,8 @@ import pytest
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.errors import InputError
-from scopemap.io.result_folder import UNFINISHED
+from scopemap.engine.errors import InputError
+from scopemap.result.result_folder import UNFINISHED
 
 _LIMITED = """
 import resource, signal, sys

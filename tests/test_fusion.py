@@ -12,9 +12,9 @@ from drawn_surfaces import AHEAD, LENIENT, VIEW, all_around, frame_of, plane_fra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.config import FusionSettings
-from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.engine.config import FusionSettings
+from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.geometry.se3 import se3, so3_exp
 
 
 def _lenient(**advanced: float) -> FusionSettings:

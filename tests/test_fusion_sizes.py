@@ -11,13 +11,13 @@ from front_door import said
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import Config, FusionSettings
-from scopemap.config.mapping import FusionConstants
-from scopemap.errors import InputError
-from scopemap.frame import Frame, Rows
-from scopemap.fusion.frame_store import FrameStore
-from scopemap.fusion.surface_fusion import SurfaceFusion, TsdfVolume, choose_parameters
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import Config, FusionSettings
+from scopemap.engine.config.mapping import FusionConstants
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import Frame, Rows
+from scopemap.engine.fusion.frame_store import FrameStore
+from scopemap.engine.fusion.surface_fusion import SurfaceFusion, TsdfVolume, choose_parameters
 
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
 

@@ -18,20 +18,20 @@ from tiny_phantom import with_true_depth, write_tiny
 from typer.testing import CliRunner
 
 from scopemap import open_sequence, reconstruct
-from scopemap.actions.against_video import RunFrames
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.apps.evaluate.against_video import RunFrames
+from scopemap.apps.run.command import summary_lines
 from scopemap.cli.app import app
-from scopemap.cli.run import summary_lines
-from scopemap.depth.perceptual import StructureDistance
-from scopemap.frame import Frame
-from scopemap.fusion.agreement import (
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.depth.perceptual import StructureDistance
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.agreement import (
     FrameAgreement,
     agreement_figures,
     compare_rendering,
     compare_with_frame,
     vertex_sigmas,
 )
-from scopemap.geometry.rendering import render_mesh
+from scopemap.engine.geometry.rendering import render_mesh
 from scopemap_bench.evaluation.surface import distances_mm
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)

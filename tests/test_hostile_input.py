@@ -22,10 +22,10 @@ from drawn_datasets import WRITERS
 from drawn_image_sets import write_real
 from drawn_trajectories import write_trajectories
 
-from scopemap.errors import InputError, ScopemapError
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import reference_trajectory
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.input.opening import open_sequence
+from scopemap.result.reference import reference_trajectory
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.datasets.survey import survey
 
 
@@ -142,7 +142,8 @@ def test_a_video_of_pictures_beyond_the_limit_takes_no_memory(tmp_path: Path) ->
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((8192, 8192), np.uint8), format="gray")))
         container.mux(stream.encode())
     code = (
-        "import resource, sys\nfrom scopemap.io.video import VideoFile\nfrom scopemap.errors import InputError\n"
+        "import resource, sys\nfrom scopemap.input.video import VideoFile\n"
+        "from scopemap.engine.errors import InputError\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "try: VideoFile(__import__('pathlib').Path(sys.argv[1]))\nexcept InputError as error: print(error)\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"

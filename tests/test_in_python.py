@@ -12,7 +12,7 @@ from tiny_phantom import write_tiny
 import scopemap
 import scopemap_bench
 from scopemap import Reconstructor, evaluate_poses, open_sequence, read_trajectory, reconstruct
-from scopemap.errors import ScopemapError
+from scopemap.engine.errors import ScopemapError
 
 
 @pytest.fixture(scope="module")

@@ -30,13 +30,13 @@ from drawn_clips import (
 )
 from drawn_dicom import write_dicom_video
 
-from scopemap.cameras.scopes import SCOPES
-from scopemap.errors import InputError
-from scopemap.inspection.clip import VideoFinding
-from scopemap.inspection.inspecting import Inspection, inspect
-from scopemap.inspection.inspection_sheet import write_mask
-from scopemap.io.opening import open_sequence
-from scopemap.masking.mask_files import MaskFiles
+from scopemap.apps.inspect.clip import VideoFinding
+from scopemap.apps.inspect.inspecting import Inspection, inspect
+from scopemap.apps.inspect.inspection_sheet import write_mask
+from scopemap.engine.errors import InputError
+from scopemap.input.mask_files import MaskFiles
+from scopemap.input.opening import open_sequence
+from scopemap.input.scopes import SCOPES
 
 COUNT = 50
 

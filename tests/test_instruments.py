@@ -12,18 +12,18 @@ from chosen_settings import chosen
 from tiny_phantom import write_tiny
 
 from scopemap import open_sequence
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.rectification import Rectifier
-from scopemap.config import Config, MaskSettings
-from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.scopenet import estimator as module
-from scopemap.depth.scopenet.estimator import WEIGHTS_NAME
-from scopemap.errors import SettingsError
-from scopemap.estimators import create_estimators
-from scopemap.frame import Frame
-from scopemap.masking.mask_files import create_masks
-from scopemap.masking.masker import Masker, without_instruments
-from scopemap.pipeline import Pipeline
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.rectification import Rectifier
+from scopemap.engine.config import Config, MaskSettings
+from scopemap.engine.depth.estimate import DepthEstimate
+from scopemap.engine.depth.scopenet import estimator as module
+from scopemap.engine.depth.scopenet.estimator import WEIGHTS_NAME
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.frame import Frame
+from scopemap.engine.masking.masker import Masker, without_instruments
+from scopemap.engine.pipeline import Pipeline
+from scopemap.input.mask_files import create_masks
+from scopemap.runner.estimators import create_estimators
 from training.export import read_network
 
 HEIGHT, WIDTH = 70, 94

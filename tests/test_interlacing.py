@@ -15,7 +15,7 @@ from drawn_videos import HEIGHT, WIDTH, woven
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.io.video_format.interlacing import LEAST_COMBING, combing, deinterlaced, is_interlaced
+from scopemap.input.video_format.interlacing import LEAST_COMBING, combing, deinterlaced, is_interlaced
 
 NUMBERS = range(0, 40, 5)
 C3VD = "endoscopy/c3vd"

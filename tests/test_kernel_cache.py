@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from numba import njit
 
-from scopemap.cli.run import compiling_words
+from scopemap.apps.run.command import compiling_words
 from scopemap.runner.run import compiling_s
 
 _READ_ONLY = """
@@ -22,7 +22,7 @@ from numba.core import caching
 for kind in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
     kind.from_function = classmethod(lambda *_: None)
 import numpy as np
-from scopemap.geometry import warp
+from scopemap.engine.geometry import warp
 print(os.environ["NUMBA_CACHE_DIR"])
 """
 

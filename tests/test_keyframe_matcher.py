@@ -10,13 +10,13 @@ import pytest
 from chosen_settings import chosen
 from plane_scene import CAMERA
 
-from scopemap.config import TrackingSettings
-from scopemap.flow.corners import KeyframeMatcher
-from scopemap.flow.dis import DisFlow
-from scopemap.flow.estimator import FlowEstimator, FlowPair, NoFlow
-from scopemap.geometry.se3 import inverse
-from scopemap.tracking.track import Track
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.flow.corners import KeyframeMatcher
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.flow.estimator import FlowEstimator, FlowPair, NoFlow
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.tracking.track import Track
+from scopemap.engine.tracking.tracker import Tracker
 
 HERE = plane_scene.pose()
 THERE = plane_scene.pose(at_mm=(2.0, 0.6, 0.5), turn_rad=(0.01, -0.01, 0.02))
@@ -159,7 +159,7 @@ def test_a_camera_that_comes_back_is_tracked_against_the_keyframes_it_passed(mon
     assert again[-1].keyframe == 0
     assert len({track.keyframe for track in again}) <= 6
     assert np.linalg.norm(again[-1].T_world_camera[:3, 3]) < 0.1
-    monkeypatch.setattr("scopemap.tracking.tracker.nearer_keyframe", lambda *_: None)
+    monkeypatch.setattr("scopemap.engine.tracking.tracker.nearer_keyframe", lambda *_: None)
     onwards = _to_and_fro(Tracker(settings, DisFlow()))
     assert np.linalg.norm(onwards[-1].T_world_camera[:3, 3]) > 0.5
     assert onwards[-1].keyframe > 10

@@ -10,16 +10,16 @@ import pytest
 from chosen_settings import chosen
 from plane_scene import CAMERA
 
-from scopemap.config import TrackingSettings
-from scopemap.flow.corners import KeyframeMatcher
-from scopemap.flow.dis import DisFlow
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.alike import AlikeFeatures
-from scopemap.tracking.keyframe_alignment import is_obscured
-from scopemap.tracking.rtdl import Alignment, Motion
-from scopemap.tracking.track import Track
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.flow.corners import KeyframeMatcher
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.tracking.alike import AlikeFeatures
+from scopemap.engine.tracking.keyframe_alignment import is_obscured
+from scopemap.engine.tracking.rtdl import Alignment, Motion
+from scopemap.engine.tracking.track import Track
+from scopemap.engine.tracking.tracker import Tracker
 
 # Each frame some 50 px and 14 degrees from the one before; the first and the fifth have hardly anything in common.
 FAST = [plane_scene.pose(at_mm=(14.0 * n, 6.0 * n, 0.0), turn_rad=(0.0, 0.0, 0.25 * n)) for n in range(5)]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from scopemap.geometry.least_squares import DenseModel, Options, Problem, dogleg_step, minimise
+from scopemap.engine.geometry.least_squares import DenseModel, Options, Problem, dogleg_step, minimise
 
 
 def _model(seed: int, size: int = 6) -> DenseModel:

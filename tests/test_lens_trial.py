@@ -11,18 +11,18 @@ import pytest
 from front_door import refused, warned
 from turning_clip import write_clip
 
-from scopemap.calibration.focal_length import trial
-from scopemap.calibration.focal_length.from_motion import FocalEstimate, with_focal_from_motion
-from scopemap.calibration.focal_length.trial import LensTrial, try_lenses
-from scopemap.calibration.focal_length.windows import Window
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.lenses import FisheyeCamera
-from scopemap.cameras.scopes import KINDS, SCOPES
-from scopemap.config import Config
-from scopemap.geometry.se3 import so3_exp
-from scopemap.io.opening import open_sequence
-from scopemap.report.verdict import verdict
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera
+from scopemap.engine.config import Config
+from scopemap.engine.geometry.se3 import so3_exp
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.focal_length import trial
+from scopemap.input.focal_length.from_motion import FocalEstimate, with_focal_from_motion
+from scopemap.input.focal_length.trial import LensTrial, try_lenses
+from scopemap.input.focal_length.windows import Window
+from scopemap.input.opening import open_sequence
+from scopemap.input.scopes import KINDS, SCOPES
+from scopemap.result.verdict import verdict
 from scopemap.runner.reconstruct import reconstruct
 
 HALF_PX, POINTS = 160.0, 150
@@ -132,7 +132,7 @@ def clip(tmp_path: Path) -> Path:
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[LensTrial | None]:
     """What the trial says, to be filled in; the motion tells nothing."""
     said: list[LensTrial | None] = []
-    place = "scopemap.calibration.focal_length.from_motion"
+    place = "scopemap.input.focal_length.from_motion"
     window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
 
     def motion(*arguments: object) -> FocalEstimate:
@@ -221,7 +221,7 @@ def test_what_is_seen_is_weighed_with_what_is_expected_of_a_kind_of_endoscope(
 ) -> None:
     tried.append(said)
     window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
-    place = "scopemap.calibration.focal_length.from_motion.focal_from_motion"
+    place = "scopemap.input.focal_length.from_motion.focal_from_motion"
     monkeypatch.setattr(place, lambda *arguments: arguments[2].append(window) or motion)
     config = Config.load(settings=LIGHT | {"input.scope": scope})
     sequence, _ = with_focal_from_motion(open_sequence(clip, settings=config.input), config)

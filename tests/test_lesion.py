@@ -12,13 +12,13 @@ import pytest
 from drawn_run import CAMERA, FRAMES, draw_run, pose_of, tube
 from front_door import call, refused
 
-from scopemap.actions.export.exported_run import read_exported
-from scopemap.actions.lesion import carried_masks, measure_lesion, shaft_width
-from scopemap.actions.measure import Known, known_scale
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.lesion_shape import LesionView, extents, view_shape
-from scopemap.geometry.rendering import render_mesh
-from scopemap.geometry.se3 import transform
+from scopemap.apps.measure.lesion import carried_masks, measure_lesion, shaft_width
+from scopemap.apps.measure.measure import Known, known_scale
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.lesion_shape import LesionView, extents, view_shape
+from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.engine.geometry.se3 import transform
+from scopemap.runner.exported_run import read_exported
 
 WALL_MM, RADIUS_MM = 40.0, 5.0
 WIDE = PinholeCamera(200.0, 200.0, 119.5, 95.5, 240, 192)
@@ -126,7 +126,7 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_a_reference_beside_the_lesion_errs_less_than_its_frame(unknown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.actions.measure._depth_errors", lambda *of: np.full(2, 0.1))
+    monkeypatch.setattr("scopemap.apps.measure.measure._depth_errors", lambda *of: np.full(2, 0.1))
     scale = known_scale(read_exported(unknown), Known(0, np.array([[10.0, 20], [10, 44]]), 5.0))
     of_frame, of_views = (np.log(draws).std() for draws in (scale.draws, scale.from_views))
     picking = np.sqrt(2) / 24
@@ -144,8 +144,8 @@ def test_a_mask_is_carried_to_the_other_frames(known: Path) -> None:
 
 def test_frames_to_which_a_part_is_carried_do_not_count(known: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part = {n: patch(n) & (np.cumsum(patch(n).any(axis=0)) <= 5) for n in (0, 1)}
-    monkeypatch.setattr("scopemap.actions.lesion.carried_masks", lambda *of: part | {2: patch(2)})
-    monkeypatch.setattr("scopemap.actions.lesion._LEAST_PX", 20)
+    monkeypatch.setattr("scopemap.apps.measure.lesion.carried_masks", lambda *of: part | {2: patch(2)})
+    monkeypatch.setattr("scopemap.apps.measure.lesion._LEAST_PX", 20)
     found = measure_lesion(known, patch(2), 2)
     assert list(found.masks) == [2]
 

@@ -22,11 +22,11 @@ from front_door import call, refused
 from tiny_phantom import write_tiny
 
 from scopemap import Config
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.io.live_source import LiveSource
-from scopemap.io.opening import sequence_of
+from scopemap.apps.live.live import LiveSession
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.input.live_source import LiveSource
+from scopemap.input.opening import sequence_of
 from scopemap.report.serving import LocalServer
-from scopemap.runner.live import LiveSession
 
 FPS = 10
 SETTINGS = {"input.focal": "assume", "fusion.every": 1}
@@ -210,7 +210,7 @@ def test_the_last_map_of_the_page_is_that_of_the_result(
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals here")
 def test_keys_of_a_terminal_call_their_actions(monkeypatch: pytest.MonkeyPatch) -> None:
-    from scopemap.cli.terminal_keys import terminal_keys
+    from scopemap.terminal.terminal_keys import terminal_keys
 
     keyboard, terminal = os.openpty()
     pressed: list[str] = []
@@ -232,7 +232,7 @@ def test_keys_of_a_terminal_call_their_actions(monkeypatch: pytest.MonkeyPatch) 
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
     pyigtl = pytest.importorskip("pyigtl", reason="the extra igtl is not installed")
-    from scopemap.io.igtl import IgtlServer
+    from scopemap.apps.live.igtl import IgtlServer
 
     class Surface(pyigtl.messages.PolyDataMessage):
         """Reads what pyigtl 0.3.4 can write and not read."""

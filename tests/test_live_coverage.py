@@ -15,16 +15,16 @@ import trimesh
 from drawn_run import CAMERA, drawn_result, tube
 from test_coverage import ALONG_THE_TUBE, without
 
-from scopemap.actions.coverage import live_map
-from scopemap.actions.coverage.coverage import coverage
-from scopemap.actions.coverage.live_map import KeptDepth, LiveCoverage
-from scopemap.config import Config
-from scopemap.frame import Frame
-from scopemap.geometry.rendering import render_mesh
-from scopemap.geometry.se3 import se3
-from scopemap.io.depth_maps import DepthReader, DepthWriter
-from scopemap.reconstruction import Reconstruction
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.apps.coverage import live_map
+from scopemap.apps.coverage.coverage import coverage
+from scopemap.apps.coverage.live_map import KeptDepth, LiveCoverage
+from scopemap.engine.config import Config
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.engine.geometry.se3 import se3
+from scopemap.result.depth_maps import DepthReader, DepthWriter
+from scopemap.result.frame_table import FrameTable
+from scopemap.result.reconstruction import Reconstruction
 
 NO_SURFACE = "the run so far has no surface"
 

@@ -12,13 +12,13 @@ import plane_scene
 import pytest
 from turning_clip import focal_of, write_clip
 
-from scopemap.config import Config, MappingSettings
-from scopemap.flow.dis import DisFlow
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, se3_exp
-from scopemap.io.opening import open_sequence
-from scopemap.mapping.feature_tracks import FeatureTracks
-from scopemap.mapping.local_adjustment import LocalAdjustment
+from scopemap.engine.config import Config, MappingSettings
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, se3_exp
+from scopemap.engine.mapping.feature_tracks import FeatureTracks
+from scopemap.engine.mapping.local_adjustment import LocalAdjustment
+from scopemap.input.opening import open_sequence
 from scopemap.runner.reconstruct import reconstruct
 
 LOCAL = MappingSettings(method="local")

@@ -15,14 +15,14 @@ from drawn_run import Shown, drawn_result
 from front_door import call, refused
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, pose, see
 
-from scopemap.actions.locate import NOT_FOUND, LocatedFrame, PlaceMap, write_located
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import InputError
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.io.depth_maps import DepthWriter
+from scopemap.apps.locate.locate import NOT_FOUND, LocatedFrame, PlaceMap, write_located
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.input.camera_files.writing import write_calibration
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.result.depth_maps import DepthWriter
+from scopemap.result.frame_table import FrameTable
 
 # Where the keyframes are; the last two are in a submap, whose world is another one.
 KEYFRAMES = [pose(at_mm=(x, 0.0, z)) for x, z in ((-30, 0), (-22, -2), (22, 2), (30, 0))]

@@ -13,17 +13,17 @@ import plane_scene
 import pytest
 from plane_scene import CAMERA
 
-from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingConstants
-from scopemap.flow.dis import DisFlow
-from scopemap.frame import REGIONS, Frame, rows_in_memory
-from scopemap.fusion.frame_store import FrameStore, SpreadFrames
-from scopemap.mapping import Backend
-from scopemap.mapping.feature_tracks import FeatureTracks
-from scopemap.mapping.submaps import Mapper
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.config.mapping import MappingConstants
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.frame import REGIONS, Frame, rows_in_memory
+from scopemap.engine.fusion.frame_store import FrameStore, SpreadFrames
+from scopemap.engine.mapping import Backend
+from scopemap.engine.mapping.feature_tracks import FeatureTracks
+from scopemap.engine.mapping.submaps import Mapper
+from scopemap.engine.tracking.track import Track
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.tracking.track import Track
-from scopemap.trajectory.frame_table import ROW, FrameTable, GrowingFrameTable
+from scopemap.result.frame_table import ROW, FrameTable, GrowingFrameTable
 
 
 def _row(number: int) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def test_a_keyframe_leaves_little_in_memory(tmp_path: Path) -> None:
 
 
 def test_of_many_maps_the_last_ones_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.mapping.feature_tracks._MOST_MAPS", 2)
+    monkeypatch.setattr("scopemap.engine.mapping.feature_tracks._MOST_MAPS", 2)
     tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(1,))), DisFlow())
     for number, map_number in enumerate((0, 1, 0, 2, 0, 1)):
         view = plane_scene.see(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)))

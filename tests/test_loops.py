@@ -11,12 +11,12 @@ import plane_scene
 import pytest
 from chosen_settings import chosen
 
-from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingConstants
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.mapping.loop_closure import Loop, LoopFinder, is_verified, small_view
-from scopemap.mapping.pose_graph import optimise_pose_graph
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.config.mapping import MappingConstants
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.engine.mapping.loop_closure import Loop, LoopFinder, is_verified, small_view
+from scopemap.engine.mapping.pose_graph import optimise_pose_graph
 
 # Out to the side and back again.
 OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 * n)) for n in range(9)]
@@ -63,7 +63,7 @@ def test_a_revisited_place_is_found_with_its_relative_pose() -> None:
 
 @pytest.mark.parametrize("candidates", [0, 3])
 def test_all_keyframes_of_two_maps_are_compared_at_the_end(candidates: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.mapping.loop_closure._CANDIDATES", candidates)
+    monkeypatch.setattr("scopemap.engine.mapping.loop_closure._CANDIDATES", candidates)
     finder, map_of = LoopFinder(SETTINGS), [0] * len(OUT) + [1] * (COUNT - len(OUT))
     first = [loop for number in range(COUNT) for loop in finder.add(_frame(number), map_of[number])]
     assert bool(first) == bool(candidates)
@@ -80,7 +80,7 @@ def test_all_keyframes_of_two_maps_are_compared_at_the_end(candidates: int, monk
 
 
 def test_memory_of_places_is_bounded_and_a_return_is_still_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scopemap.mapping.loop_closure.MOST_SEARCHED", 6)
+    monkeypatch.setattr("scopemap.engine.mapping.loop_closure.MOST_SEARCHED", 6)
     finder, kept, loops = LoopFinder(MappingSettings(constants=MappingConstants(keyframe_gaps=(1,)))), [], []
     for number, x_mm in enumerate([*np.linspace(-60.0, 60.0, 17), -60.0]):
         loops = finder.add(_sideways(number, x_mm))
@@ -102,8 +102,8 @@ def test_dirt_on_the_lens_closes_no_loop(map_number: int, height_px: int, monkey
         return [loop for loop in found if loop.past < 5 <= loop.new]
 
     assert not loops()
-    monkeypatch.setattr("scopemap.mapping.loop_closure.is_verified", lambda *_: True)
-    monkeypatch.setattr("scopemap.mapping.loop_closure._STATIC_PX", -1.0)
+    monkeypatch.setattr("scopemap.engine.mapping.loop_closure.is_verified", lambda *_: True)
+    monkeypatch.setattr("scopemap.engine.mapping.loop_closure._STATIC_PX", -1.0)
     assert loops()  # by its features alone
 
 

@@ -9,13 +9,13 @@ import pytest
 from drawn_run import placed_frames
 
 from scopemap import open_sequence, reconstruct
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import Config
-from scopemap.frame import Frame
-from scopemap.report.losses import in_words, losses
-from scopemap.tracking.track import unusable
-from scopemap.trajectory.causes import ADVICE, LossCause, causes_of_loss
-from scopemap.trajectory.frame_table import ELSEWHERE, LOST, NOT_USED
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import Config
+from scopemap.engine.frame import Frame
+from scopemap.engine.tracking.causes import ADVICE, LossCause, causes_of_loss
+from scopemap.engine.tracking.track import unusable
+from scopemap.result.frame_table import ELSEWHERE, LOST, NOT_USED
+from scopemap.result.losses import in_words, losses
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 

@@ -12,13 +12,13 @@ import pytest
 from chosen_settings import chosen
 from plane_scene import CAMERA
 
-from scopemap.config import TrackingSettings
-from scopemap.flow.dis import DisFlow
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking import keyframe_alignment, relocalisation
-from scopemap.tracking.track import Track
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.tracking import keyframe_alignment, relocalisation
+from scopemap.engine.tracking.track import Track
+from scopemap.engine.tracking.tracker import Tracker
 
 SETTINGS = chosen(TrackingSettings, keyframe_every=3, finest_level=0)
 # Slowly on, then, unseen, far away and turned.

@@ -8,10 +8,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import inverse, se3_exp, so3_exp
-from scopemap.mapping.loop_closure import Loop
-from scopemap.mapping.map_merging import merge_maps
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import inverse, se3_exp, so3_exp
+from scopemap.engine.mapping.loop_closure import Loop
+from scopemap.engine.mapping.map_merging import merge_maps
 
 DEPTH_MM = 50.0
 # Of nine keyframes; the second map is left and entered again.

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from chosen_settings import chosen
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import Config, MapisSettings
-from scopemap.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth, robust_scale
-from scopemap.geometry.se3 import se3
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import Config, MapisSettings
+from scopemap.engine.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth, robust_scale
+from scopemap.engine.geometry.se3 import se3
 
 SHAPE = (48, 64)
 CAMERA = PinholeCamera(60.0, 60.0, 31.5, 23.5, 64, 48)

@@ -18,22 +18,22 @@ from result_files import frame_rows
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingConstants
-from scopemap.depth.mapis import Mapis
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.config.mapping import MappingConstants
+from scopemap.engine.depth.mapis import Mapis
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, so3_exp
+from scopemap.engine.mapping import Backend, Mapper, TrackedPose
+from scopemap.engine.mapping.pose_graph import PoseGraph, optimise_pose_graph
+from scopemap.engine.mapping.submaps import corrected_frame
+from scopemap.engine.tracking.relocalisation import Relocaliser
+from scopemap.engine.tracking.track import Track
 from scopemap.evaluation.poses import match, pose_report
-from scopemap.flow.dis import DisFlow
-from scopemap.frame import Frame
-from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, so3_exp
-from scopemap.io.depth_maps import DepthReader
-from scopemap.mapping import Backend, Mapper, TrackedPose
-from scopemap.mapping.pose_graph import PoseGraph, optimise_pose_graph
-from scopemap.mapping.submaps import corrected_frame
-from scopemap.tracking.relocalisation import Relocaliser
-from scopemap.tracking.track import Track
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.result.depth_maps import DepthReader
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.climb.submission import submission_problems, write_submission
 from scopemap_bench.datasets.c3vd import C3vdFolder
 from scopemap_bench.phantom.spec import PhantomSpec
@@ -210,7 +210,7 @@ def test_the_pose_graph_merges_no_maps_whose_depths_then_disagree(zoom: float, m
         graph = optimise_pose_graph(*given)
         return graph._replace(log_scale=graph.log_scale + zoom * (np.arange(len(graph.log_scale)) % 2))
 
-    monkeypatch.setattr("scopemap.mapping.backend.optimise_pose_graph", with_other_scales)
+    monkeypatch.setattr("scopemap.engine.mapping.backend.optimise_pose_graph", with_other_scales)
     # No adjustment is so exact: all are refused, as where tissue moves.
     backend = Backend(MappingSettings(constants=MappingConstants(max_sigma_px=1e-3)), DisFlow())
     for number in range(10):

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes as reference
 
-from scopemap.fusion.mesh import marching_cubes
+from scopemap.engine.fusion.mesh import marching_cubes
 
 SIDE = 24
 

@@ -11,16 +11,16 @@ import pytest
 from chosen_settings import chosen, configured
 from drawn_inputs import frames_of, picture, save
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.rectification import Rectifier, working_camera
-from scopemap.config import MaskSettings
-from scopemap.errors import CalibrationError, InputError
-from scopemap.estimators import create_estimators
-from scopemap.frame import Frame
-from scopemap.io.opening import open_sequence
-from scopemap.masking.mask_files import MaskFiles, create_masks
-from scopemap.masking.masker import Masker
-from scopemap.pipeline import Pipeline
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.rectification import Rectifier, working_camera
+from scopemap.engine.config import MaskSettings
+from scopemap.engine.errors import CalibrationError, InputError
+from scopemap.engine.frame import Frame
+from scopemap.engine.masking.masker import Masker
+from scopemap.engine.pipeline import Pipeline
+from scopemap.input.mask_files import MaskFiles, create_masks
+from scopemap.input.opening import open_sequence
+from scopemap.runner.estimators import create_estimators
 from scopemap.runner.provenance import estimators_provenance
 
 SOURCE = PinholeCamera(400.0, 400.0, 319.5, 239.5, 640, 480)

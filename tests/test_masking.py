@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from chosen_settings import chosen
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import MaskSettings
-from scopemap.frame import Frame, is_constant
-from scopemap.io.opening import open_sequence
-from scopemap.masking.masker import Masker
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import MaskSettings
+from scopemap.engine.frame import Frame, is_constant
+from scopemap.engine.masking.masker import Masker
+from scopemap.input.opening import open_sequence
 
 SETTINGS = MaskSettings()
 CAMERA = PinholeCamera(200.0, 200.0, 159.5, 119.5, 320, 240)

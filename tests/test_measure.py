@@ -13,7 +13,7 @@ import trimesh
 from drawn_run import CAMERA, FRAMES, IN_RESULT, draw_run
 from front_door import call, refused
 
-from scopemap.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
+from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
 
 RADIUS = 10.0
 

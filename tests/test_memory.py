@@ -14,12 +14,12 @@ from front_door import call, refused
 from tiny_phantom import SIZE, write_tiny
 
 from scopemap import open_sequence
-from scopemap.config import Config, FusionSettings
-from scopemap.errors import InputError, SettingsError
-from scopemap.fusion.frame_store import FrameStore
-from scopemap.fusion.surface_fusion import SurfaceFusion
-from scopemap.fusion.tsdf import VoxelBlocks, pack
-from scopemap.mapping.backend import MOST_OBSERVATIONS
+from scopemap.engine.config import Config, FusionSettings
+from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.fusion.frame_store import FrameStore
+from scopemap.engine.fusion.surface_fusion import SurfaceFusion
+from scopemap.engine.fusion.tsdf import VoxelBlocks, pack
+from scopemap.engine.mapping.backend import MOST_OBSERVATIONS
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.network_cost import network_cost
 
@@ -135,6 +135,6 @@ def test_what_networks_cost_is_said_before_the_run(
     asked = ("run", folder, "--out", folder.parent / "out", "--flow", "raft-small")
     assert call(*asked) == 1
     assert "cost of" not in capfd.readouterr().err  # without its weights nothing will run
-    monkeypatch.setattr("scopemap.estimators.missing_weights", lambda config: [])
+    monkeypatch.setattr("scopemap.runner.estimators.missing_weights", lambda config: [])
     assert call(*asked) == 1
     assert capfd.readouterr().err.startswith("cost of raft-small at 160x128 px")

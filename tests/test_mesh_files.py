@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scopemap.fusion.mesh_files import save_mesh
+from scopemap.engine.fusion.mesh_files import save_mesh
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ import trimesh
 from front_door import call
 from tiny_phantom import write_tiny
 
-from scopemap.config import Config, FusionSettings
-from scopemap.fusion.finish import finished, simplified, smoothed, with_normals_alone, without_small_holes
-from scopemap.fusion.mesh_files import ply_bytes
+from scopemap.engine.config import Config, FusionSettings
+from scopemap.engine.fusion.finish import finished, simplified, smoothed, with_normals_alone, without_small_holes
+from scopemap.engine.fusion.mesh_files import ply_bytes
 
 
 def _plate(size: int = 40) -> trimesh.Trimesh:

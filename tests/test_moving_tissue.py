@@ -13,21 +13,21 @@ from result_files import frame_rows
 from tiny_phantom import write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import FusionSettings
-from scopemap.estimators import create_estimators
-from scopemap.flow.corners import Correspondences2D3D
-from scopemap.flow.dis import DisFlow
-from scopemap.frame import REGIONS, Frame
-from scopemap.fusion.depth_mesh import depth_mesh
-from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
-from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.geometry.se3 import se3_exp
-from scopemap.io.decoding import read_decoded
-from scopemap.odometry import Step
-from scopemap.tracking.at_rest import CameraAtRest
-from scopemap.tracking.corner_pose import nonrigidity
-from scopemap.tracking.track import MOVING_SIGMAS
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import FusionSettings
+from scopemap.engine.flow.corners import Correspondences2D3D
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.frame import REGIONS, Frame
+from scopemap.engine.fusion.depth_mesh import depth_mesh
+from scopemap.engine.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
+from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.engine.odometry import Step
+from scopemap.engine.tracking.at_rest import CameraAtRest
+from scopemap.engine.tracking.corner_pose import nonrigidity
+from scopemap.engine.tracking.track import MOVING_SIGMAS
+from scopemap.input.decoding import read_decoded
+from scopemap.runner.estimators import create_estimators
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 

@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.flow.dis import DisFlow
-from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.mapping.multiview_depth import (
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.geometry.se3 import se3, so3_exp
+from scopemap.engine.mapping.multiview_depth import (
     KeyframeDepths,
     StereoView,
     choose_neighbours,
     normalised_contrast,
     triangulate_depth,
 )
-from scopemap.trajectory.tissue_states import TissueStates
+from scopemap.engine.mapping.tissue_states import TissueStates
 
 CAMERA = PinholeCamera(fx=110.0, fy=110.0, cx=79.5, cy=63.5, width=160, height=128)
 WALL_MM = 60.0

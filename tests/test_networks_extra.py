@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from chosen_settings import chosen
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.rectification import Rectifier
-from scopemap.config import DepthSettings
-from scopemap.depth.backends import create_depth
-from scopemap.depth.perceptual import create_perceptual
-from scopemap.errors import SettingsError
-from scopemap.flow.flows import create_flow
-from scopemap.io import weights
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.rectification import Rectifier
+from scopemap.engine.config import DepthSettings
+from scopemap.engine.depth.perceptual import create_perceptual
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.flow.flows import create_flow
+from scopemap.engine.models import weights
+from scopemap.runner.depth_backends import create_depth
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 

@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 from drawn_bundle import FOCAL_PX, tracked
 
-from scopemap.geometry.align import umeyama
-from scopemap.geometry.se3 import inverse, se3_exp, transform
-from scopemap.geometry.skinning import skin_of
-from scopemap.mapping import FrameCorrection
-from scopemap.mapping.bundle_adjustment import PER_KEYFRAME as PER_KEYFRAME_UNKNOWNS
-from scopemap.mapping.bundle_adjustment import adjust, errors_px
-from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.mapping.deformation_graph import (
+from scopemap.engine.geometry.align import umeyama
+from scopemap.engine.geometry.se3 import inverse, se3_exp, transform
+from scopemap.engine.geometry.skinning import skin_of
+from scopemap.engine.mapping import FrameCorrection
+from scopemap.engine.mapping.bundle_adjustment import PER_KEYFRAME as PER_KEYFRAME_UNKNOWNS
+from scopemap.engine.mapping.bundle_adjustment import adjust, errors_px
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
+from scopemap.engine.mapping.deformation_graph import (
     MotionPrior,
     camera_without_curve,
     hat_functions,
     periodic_rate,
     spread_nodes,
 )
-from scopemap.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
-from scopemap.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
-from scopemap.mapping.pose_interpolation import TissueMotion
+from scopemap.engine.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
+from scopemap.engine.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
+from scopemap.engine.mapping.pose_interpolation import TissueMotion
 
 KEYFRAMES, PER_KEYFRAME, GAPS = 16, 120, (1, 2, 3, 5)
 BREATH = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(KEYFRAMES) / 9)

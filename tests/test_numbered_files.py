@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from drawn_scared import Files, write_loose, write_tar
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 from scopemap_bench.trajectories import numbered
 from scopemap_bench.trajectories.numbered import NumberedFiles, find_numbered
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scopemap.geometry.se3 import inverse, se3_exp
-from scopemap.mapping import other_starts
-from scopemap.mapping.bundle_adjustment import adjust_in_windows
-from scopemap.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.mapping.other_starts import ShapeTest, with_other_starts
+from scopemap.engine.geometry.se3 import inverse, se3_exp
+from scopemap.engine.mapping import other_starts
+from scopemap.engine.mapping.bundle_adjustment import adjust_in_windows
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
+from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 
 FOCAL_PX = 400.0  # 320 px wide: 44 degrees, as a laparoscope's
 SEEN_PX = np.array([160.0, 128.0])

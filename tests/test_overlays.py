@@ -10,12 +10,12 @@ import pytest
 from chosen_settings import chosen
 from drawn_clips import SIZE, Change, clip, text, tissue
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import Config, MaskSettings
-from scopemap.frame import Frame
-from scopemap.io.opening import open_sequence
-from scopemap.masking.masker import Masker
-from scopemap.masking.overlays import OverlayFinder
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import Config, MaskSettings
+from scopemap.engine.frame import Frame
+from scopemap.engine.masking.masker import Masker
+from scopemap.engine.masking.overlays import OverlayFinder
+from scopemap.input.opening import open_sequence
 
 CAMERA = PinholeCamera(300.0, 300.0, 159.5, 119.5, *SIZE)
 EVERYWHERE = np.ones(SIZE[::-1], bool)

@@ -14,14 +14,14 @@ from small_networks import saved, small_depth_anything, small_depth_pro
 from tiny_phantom import FRAMES, only_images, write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import PRESETS
-from scopemap.depth.estimate import PerceptualResult
-from scopemap.depth.mapis import DenseMatcher, Mapis
-from scopemap.flow.flows import create_flow
-from scopemap.frame import Frame
-from scopemap.odometry import Step
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import PRESETS
+from scopemap.engine.depth.estimate import PerceptualResult
+from scopemap.engine.depth.mapis import DenseMatcher, Mapis
+from scopemap.engine.flow.flows import create_flow
+from scopemap.engine.frame import Frame
+from scopemap.engine.odometry import Step
+from scopemap.engine.tracking.tracker import Tracker
 
 PAPER, STRICT = Config.load("paper"), Config.load("paper-strict")
 BEYOND = {key: value for key, value in PRESETS["paper-strict"].items() if PRESETS["paper"].get(key) != value}

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from scopemap.depth.perceptual import LpipsAlex, create_perceptual
-from scopemap.errors import SettingsError, WeightsError
-from scopemap.geometry.similarity import structural_similarity
+from scopemap.engine.depth.perceptual import LpipsAlex, create_perceptual
+from scopemap.engine.errors import SettingsError, WeightsError
+from scopemap.engine.geometry.similarity import structural_similarity
 
 SHAPE = (70, 93, 3)
 

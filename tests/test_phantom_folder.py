@@ -13,7 +13,7 @@ import trimesh
 import typer
 from typer.testing import CliRunner
 
-from scopemap.errors import InputError, SettingsError
+from scopemap.engine.errors import InputError, SettingsError
 from scopemap_bench.cli.phantom import phantom as phantom_command
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events

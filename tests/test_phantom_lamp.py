@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scopemap.errors import SettingsError
+from scopemap.engine.errors import SettingsError
 from scopemap_bench.phantom.march import rays_of
 from scopemap_bench.phantom.render import Phantom, light, prepare
 from scopemap_bench.phantom.shading import beam, shade

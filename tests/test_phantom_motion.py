@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from scopemap.errors import SettingsError
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.decoding import read_decoded
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.input.decoding import read_decoded
 from scopemap_bench.phantom.instrument import instrument
 from scopemap_bench.phantom.motion import Grasp, Push, TissueMotion, contractions, insufflated
 from scopemap_bench.phantom.render import Phantom, prepare, render_frame

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import FisheyeCamera
-from scopemap.errors import InputError, SettingsError
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3, so3_exp
-from scopemap.io.opening import open_sequence
-from scopemap.trajectory.formats.text import read_poses
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera
+from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3, so3_exp
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.opening import open_sequence
+from scopemap.input.trajectory.text import read_poses
 from scopemap_bench.phantom.instrument import Capsules, insert
 from scopemap_bench.phantom.march import Volume, march, rays_of
 from scopemap_bench.phantom.motion import REST, lumen_path, sweep_path, turned

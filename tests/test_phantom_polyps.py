@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap.errors import InputError, SettingsError
+from scopemap.engine.errors import InputError, SettingsError
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec, Polyp, parse_polyps
 from scopemap_bench.phantom.writer import write_phantom

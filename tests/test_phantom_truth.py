@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy import ndimage
 
-from scopemap.geometry.se3 import inverse, transform
+from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap_bench.phantom.march import Volume, march
 from scopemap_bench.phantom.motion import REST, breathing
 from scopemap_bench.phantom.render import Phantom, build_scene, camera_path, prepare, render_frame

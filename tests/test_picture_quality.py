@@ -13,13 +13,13 @@ from chosen_settings import chosen
 from drawn_surfaces import LENIENT, plane_frame
 from plane_scene import CAMERA, EVERYWHERE
 
-from scopemap.config import MaskSettings, TrackingSettings
-from scopemap.config.tracking import TRACKING
-from scopemap.frame import Frame
-from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.masking.masker import Masker
-from scopemap.tracking.sharpness import PictureQuality
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.config import MaskSettings, TrackingSettings
+from scopemap.engine.config.tracking import TRACKING
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.masking.masker import Masker
+from scopemap.engine.tracking.sharpness import PictureQuality
+from scopemap.engine.tracking.tracker import Tracker
 
 TISSUE = (0.5 * plane_scene.see(np.eye(4)).rgb * [1.0, 0.6, 0.5] + [90, 30, 20]).astype(np.uint8)
 

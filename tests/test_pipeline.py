@@ -16,14 +16,14 @@ from spied_depth import SpyDepth, spied
 from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_tiny
 
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
-from scopemap.config import PRESETS
-from scopemap.errors import WeightsError
-from scopemap.estimators import create_estimators
-from scopemap.frame import Frame
-from scopemap.odometry import Step
-from scopemap.preprocessing import Estimators
-from scopemap.tracking.track import Track
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.config import PRESETS
+from scopemap.engine.errors import WeightsError
+from scopemap.engine.frame import Frame
+from scopemap.engine.odometry import Step
+from scopemap.engine.preprocessing import Estimators
+from scopemap.engine.tracking.track import Track
+from scopemap.result.trajectories import read_trajectory
+from scopemap.runner.estimators import create_estimators
 
 WITHOUT_NETWORKS = {"networks__flow": "dis", "networks__perceptual": "structure"}
 WEMA = {"smoothing__method": "wema", "smoothing__dynamic": False}
@@ -82,7 +82,7 @@ def test_depth_is_estimated_at_a_smaller_size_and_given_at_the_frames(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spies, steps = spied(monkeypatch), list[Step]()
-    monkeypatch.setattr("scopemap.depth.anchor._SCOPENET_PX", SIZE[0] // 2)
+    monkeypatch.setattr("scopemap.engine.depth.anchor._SCOPENET_PX", SIZE[0] // 2)
     reconstruct(open_sequence(folder), Config(), observers=(steps.append,))
     assert {frame.valid.shape for frame in spies.pop().seen} == {(SIZE[1] // 2, SIZE[0] // 2)}
     depths = [(step.raw_mm, step.frame.depth_mm, step.frame.depth_sigma_mm) for step in steps]

@@ -9,7 +9,7 @@ from spied_depth import spied
 from tiny_phantom import SIZE, only_images, write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 
 WITHOUT_NETWORKS = {"networks.flow": "dis", "networks.perceptual": "structure"}
 

@@ -12,12 +12,12 @@ from front_door import said
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.config import Config
-from scopemap.estimators import create_estimators
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.io.depth_maps import DepthReader
-from scopemap.odometry import Step
-from scopemap.preprocessing import Estimators
+from scopemap.engine.config import Config
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.odometry import Step
+from scopemap.engine.preprocessing import Estimators
+from scopemap.result.depth_maps import DepthReader
+from scopemap.runner.estimators import create_estimators
 
 LOST, FRAMES = 8, 14
 EXPONENT = 1.3

@@ -9,8 +9,8 @@ import pytest
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.frame import Frame
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.frame import Frame
+from scopemap.engine.tracking.tracker import Tracker
 
 LOST, FRAMES = 4, 9
 # True depth that is said to be predicted, so that MAPIS links the frames.

@@ -18,10 +18,10 @@ from drawn_datasets import WRITERS
 from drawn_scene import Content, content
 from stored_kinds import KINDS, Kind, put
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.errors import ScopemapError
-from scopemap.geometry.se3 import inverse, se3_exp
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.errors import ScopemapError
+from scopemap.engine.geometry.se3 import inverse, se3_exp
+from scopemap.input.opening import open_sequence
 from scopemap_bench.datasets.checking import Finding, check, refusal
 from scopemap_bench.datasets.survey import survey
 

@@ -14,9 +14,9 @@ from sample_trajectories import as_trajectory, evo_pair, last_digit, random_pair
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from scopemap.errors import AlignmentError
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import inverse, se3_exp, so3_exp
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import inverse, se3_exp, so3_exp
 from scopemap_bench.evaluation.protocols import PROTOCOLS, af_figures
 
 seeds = st.integers(0, 2**32 - 1)

@@ -31,7 +31,7 @@ from scopemap.cli.app import app
 KEPT = {"PATH", "SYSTEMROOT", "LANG", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR"}
 MAIN = "import sys; from scopemap.cli.app import main; main()"
 SHORT_DEMO = (
-    "from functools import partial; from scopemap.actions import demo; "
+    "from functools import partial; from scopemap.apps.demo import demo; "
     f"demo.run_clip = partial(demo.run_clip, frames=slice(0, 8)); {MAIN}"
 )
 COMMANDS = (

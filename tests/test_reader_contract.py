@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from drawn_datasets import WRITERS
 
-from scopemap.frame import TruthQuality
-from scopemap.io.opening import open_sequence, readers
-from scopemap.io.reference import reference_trajectory
-from scopemap.io.sequence import Sequence
-from scopemap.masking.mask_files import MaskFiles
+from scopemap.engine.frame import TruthQuality
+from scopemap.input.mask_files import MaskFiles
+from scopemap.input.opening import open_sequence, readers
+from scopemap.input.sequence import Sequence
+from scopemap.result.reference import reference_trajectory
 
 NAMES = sorted(WRITERS)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scopemap.io.run_folder import RunFolder
+from scopemap.result.run_folder import RunFolder
 from scopemap_bench.scripts import real
 
 

@@ -17,18 +17,18 @@ from result_files import frame_rows
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
 from scopemap import Reconstruction, open_sequence, reconstruct
-from scopemap.cameras.camera import source_pixel
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.config import Config
-from scopemap.errors import InputError
-from scopemap.frame import Frame
-from scopemap.fusion.agreement import FrameAgreement, agreement_figures, compare_with_frame
-from scopemap.io.depth_maps import DEPTH_SCALE_MM, DepthReader, DepthWriter
-from scopemap.io.run_folder import RunFolder
-from scopemap.io.sequence import Sequence
-from scopemap.odometry import Step
-from scopemap.report.verdict import verdict
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.cameras.camera import source_pixel
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.agreement import FrameAgreement, agreement_figures, compare_with_frame
+from scopemap.engine.odometry import Step
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.sequence import Sequence
+from scopemap.result.depth_maps import DEPTH_SCALE_MM, DepthReader, DepthWriter
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.trajectories import read_trajectory
+from scopemap.result.verdict import verdict
 
 COLUMNS = "index time_s name status reason map keyframe residual inlier_share correlation overlap iterations"
 COLUMNS += " depth_scale warped_share usable sharpness motion quality cause orientation"

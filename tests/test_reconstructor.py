@@ -13,9 +13,9 @@ from front_door import warned
 from tiny_phantom import write_tiny
 
 from scopemap import Config, OwnDepth, Reconstruction, Reconstructor, open_sequence, reconstruct
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import InputError, SettingsError
-from scopemap.frame import Frame
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.frame import Frame
 from scopemap.runner.provenance import Limits
 
 CAMERA = PinholeCamera(100.0, 100.0, 79.5, 63.5, 160, 128)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera, source_pixel
-from scopemap.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
-from scopemap.cameras.rectification import DepthSensor, Rectifier, working_camera, working_size
-from scopemap.errors import CalibrationError
-from scopemap.geometry.se3 import inverse, se3_exp, transform
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera, source_pixel
+from scopemap.engine.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.engine.cameras.rectification import DepthSensor, Rectifier, working_camera, working_size
+from scopemap.engine.errors import CalibrationError
+from scopemap.engine.geometry.se3 import inverse, se3_exp, transform
 
 PINHOLE = PinholeCamera(300.0, 302.0, 318.0, 245.0, 640, 480)
 LENSES = {

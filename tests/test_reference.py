@@ -10,11 +10,11 @@ import pytest
 from drawn_inputs import write_c3vd, write_sevenscenes
 from drawn_scared import write_scared, write_scared_c
 
-from scopemap.io import images
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import reference_trajectory
-from scopemap.io.video import VideoFile
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.input import images
+from scopemap.input.opening import open_sequence
+from scopemap.input.trajectory.trajectory import Trajectory
+from scopemap.input.video import VideoFile
+from scopemap.result.reference import reference_trajectory
 from scopemap_bench.datasets.scared import ScaredKeyframe
 
 Writer = Callable[[Path], Path]

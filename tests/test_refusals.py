@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
-from scopemap.config import Config
-from scopemap.depth.anchor import max_depth_mm
-from scopemap.depth.mapis import Mapis
-from scopemap.errors import InputError
-from scopemap.estimators import create_estimators
-from scopemap.io.opening import open_sequence
-from scopemap.pipeline import Pipeline
+from scopemap.engine.config import Config
+from scopemap.engine.depth.anchor import max_depth_mm
+from scopemap.engine.depth.mapis import Mapis
+from scopemap.engine.errors import InputError
+from scopemap.engine.pipeline import Pipeline
+from scopemap.input.opening import open_sequence
+from scopemap.runner.estimators import create_estimators
 from scopemap.runner.provenance import estimators_provenance
 from scopemap.runner.reconstruct import reconstruct
 

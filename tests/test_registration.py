@@ -8,8 +8,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.errors import AlignmentError
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3, so3_exp, transform
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3, so3_exp, transform
 from scopemap_bench.evaluation.surface import refine, surface_points
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.rendering import render_mesh, render_points
-from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.rendering import render_mesh, render_points
+from scopemap.engine.geometry.se3 import se3, so3_exp
 
 CAMERA = PinholeCamera(60.0, 62.0, 39.5, 31.5, 80, 64)
 

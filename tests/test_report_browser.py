@@ -18,11 +18,11 @@ import pytest
 from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of, wavering
 from front_door import call
 
-from scopemap.actions.measure import measure
-from scopemap.errors import InputError
-from scopemap.io.run_folder import RunFolder
+from scopemap.apps.measure.measure import measure
+from scopemap.engine.errors import InputError
+from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.report.page import keep_measurements, serve_view, write_comparison, write_report
-from scopemap.trajectory.tissue_states import TissueStates
+from scopemap.result.run_folder import RunFolder
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.geometry.se3 import se3, so3_exp
+from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.report.depth_figures import colour_depth
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,

@@ -12,13 +12,13 @@ import pytest
 import trimesh
 from drawn_run import CAMERA, GOOD_SURFACE, placed_frames, tube
 
-from scopemap.config import Config
-from scopemap.notices import KINDS, Notice, fields_of_kind, notices_of
-from scopemap.reconstruction import Reconstruction
-from scopemap.report import verdict as rules
-from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.report.verdict import verdict
-from scopemap.trajectory.frame_table import LOST, NOT_USED
+from scopemap.engine.config import Config
+from scopemap.engine.notices import KINDS, Notice, fields_of_kind, notices_of
+from scopemap.result import verdict as rules
+from scopemap.result.frame_table import LOST, NOT_USED
+from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
+from scopemap.result.verdict import verdict
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "report.md"
 

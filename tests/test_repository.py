@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 # The one network that the package brings along.
-ALLOWED_BYTES = {"src/scopemap/depth/scopenet/scopenet.onnx": 8_000_000}
+ALLOWED_BYTES = {"src/scopemap/engine/depth/scopenet/scopenet.onnx": 8_000_000}
 
 
 def _project_files() -> list[Path]:

@@ -8,10 +8,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.flow.corners import Correspondences2D3D
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.tracking.corner_pose import pose_from_correspondences
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.flow.corners import Correspondences2D3D
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.engine.tracking.corner_pose import pose_from_correspondences
 
 CAMERA = PinholeCamera(150.0, 151.0, 79.5, 63.5, 160, 128)
 TRUE = se3_exp(np.array([0.02, -0.03, 0.05, 2.0, -1.0, 1.5]))

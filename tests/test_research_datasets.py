@@ -29,12 +29,12 @@ from drawn_image_sets import (
 from drawn_inputs import SIZE, number_in, poses
 from drawn_video_sets import KB4, LENS, SCOPE_SIZE, STEREO_SIZE, STIR_K, kinematic_pose
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
-from scopemap.errors import InputError
-from scopemap.geometry.se3 import inverse, se3, so3_exp
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.se3 import inverse, se3, so3_exp
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.opening import open_sequence
 from scopemap_bench.datasets.c3vd import CAMERA, UNDISTORTED_CAMERA
 from scopemap_bench.datasets.sevenscenes import COLOUR_CAMERA, T_COLOUR_DEPTH
 

@@ -40,15 +40,15 @@ from drawn_image_sets import (
 )
 from drawn_inputs import SIZE, frames_of, number_in, poses, save, write_c3vd
 
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.config import MaskSettings
-from scopemap.config.input import MaskConstants
-from scopemap.errors import InputError
-from scopemap.geometry.se3 import se3_exp
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import reference_trajectory
-from scopemap.masking.mask_files import create_masks
-from scopemap.trajectory.formats.text import read_poses
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.engine.config import MaskSettings
+from scopemap.engine.config.input import MaskConstants
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.input.mask_files import create_masks
+from scopemap.input.opening import open_sequence
+from scopemap.input.trajectory.text import read_poses
+from scopemap.result.reference import reference_trajectory
 from scopemap_bench.datasets.c3vd import CAMERA
 from scopemap_bench.datasets.tum import associated
 

@@ -35,9 +35,9 @@ from drawn_image_sets import (
 )
 from drawn_video_sets import FRAMES, archive_of, images_bin, write_kinematics, write_models
 
-from scopemap.errors import CalibrationError, InputError, ScopemapError
-from scopemap.geometry.se3 import se3_exp
-from scopemap.io.opening import open_sequence
+from scopemap.engine.errors import CalibrationError, InputError, ScopemapError
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.input.opening import open_sequence
 
 Edit = Callable[[Path], object]
 KINEMATICS, TABLE, SHEET = "groundtruth.txt", "Poses/colon_position_rotation.csv", "Poses/poses.xlsx"

@@ -45,12 +45,12 @@ from drawn_video_sets import (
     xml,
 )
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.lenses import FisheyeCamera
-from scopemap.errors import InputError
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import read_reference, reference_trajectory
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera
+from scopemap.engine.errors import InputError
+from scopemap.input.opening import open_sequence
+from scopemap.result.reference import read_reference, reference_trajectory
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.datasets import endomapper_sim
 from scopemap_bench.datasets.endomapper_sim import read_exr_red
 from scopemap_bench.methods.method import create_method

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap.geometry.se3 import se3_exp
-from scopemap.tracking.residuals import Loss, View, normal_equations, residual_images
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.engine.tracking.residuals import Loss, View, normal_equations, residual_images
 
 UNIT_MM = 40.0
 AFFINE = np.array([1.1, 0.05])

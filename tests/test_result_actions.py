@@ -12,7 +12,7 @@ from front_door import call
 from test_lesion import patch
 
 from scopemap import Reconstruction, RunFolder
-from scopemap.errors import InputError, SettingsError
+from scopemap.engine.errors import InputError, SettingsError
 
 REFERENCE = [(30.0, 20.0), (48.0, 20.0)]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from scopemap.errors import InputError
-from scopemap.io.result_folder import result_folder
+from scopemap.engine.errors import InputError
+from scopemap.result.result_folder import result_folder
 
 
 def _make(folder: Path, *, overwrite: bool = False) -> None:
@@ -107,7 +107,7 @@ def test_overwrite_takes_the_place_of_a_link_and_spares_what_it_leads_to(tmp_pat
 
 _HOLD = """
 import sys
-from scopemap.io.result_folder import result_folder
+from scopemap.result.result_folder import result_folder
 with result_folder(sys.argv[1], overwrite=True):
     print("in it", flush=True)
     sys.stdin.readline()

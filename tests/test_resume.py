@@ -15,12 +15,12 @@ from front_door import call, refused, warned
 from tiny_phantom import FRAMES, write_tiny
 
 from scopemap import Config, Reconstruction, open_sequence, reconstruct
-from scopemap.errors import InputError
-from scopemap.fusion.frame_store import StoredFile
-from scopemap.io.checkpoint import CHECKPOINT, SavedState
-from scopemap.io.result_folder import LOCK, UNFINISHED
-from scopemap.odometry import Step
+from scopemap.engine.errors import InputError
+from scopemap.engine.fusion.frame_store import StoredFile
+from scopemap.engine.odometry import Step
 from scopemap.report.frame_pictures import FramePictures
+from scopemap.result.checkpoint import CHECKPOINT, SavedState
+from scopemap.result.result_folder import LOCK, UNFINISHED
 from scopemap.runner.checkpoints import can_resume, check_resumable, discard_unfinished, identity_of
 
 # Seconds, and sums of files that hold some.

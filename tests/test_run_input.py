@@ -13,11 +13,11 @@ from front_door import call, refused
 from tiny_phantom import only_images, write_tiny
 
 from scopemap import Config, open_sequence, reconstruct
-from scopemap.actions.inputs import frames_again
-from scopemap.errors import InputError
-from scopemap.geometry.rendering import render_mesh
-from scopemap.io.run_folder import RunFolder
-from scopemap.io.run_input import find_input, stated_input
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.run_input import find_input, stated_input
+from scopemap.runner.frames_again import frames_again
 
 
 @pytest.fixture

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scopemap.config import MappingSettings
-from scopemap.config.mapping import MappingConstants
-from scopemap.flow.dis import DisFlow
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.mapping import TrackedPose
-from scopemap.mapping.backend import Backend
-from scopemap.mapping.pose_graph import path_without_drift
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.config.mapping import MappingConstants
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import se3, so3_exp
+from scopemap.engine.mapping import TrackedPose
+from scopemap.engine.mapping.backend import Backend
+from scopemap.engine.mapping.pose_graph import path_without_drift
 
 
 def _tracked(log_scale: np.ndarray, map_number: int = 0) -> list[TrackedPose]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm, orthogonal_procrustes
 from scipy.spatial.transform import Rotation
 
-from scopemap.geometry.se3 import (
+from scopemap.engine.geometry.se3 import (
     hat,
     inverse,
     mean_near,

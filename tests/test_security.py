@@ -21,9 +21,9 @@ from PIL import Image
 from tiny_phantom import FRAMES, only_images, write_tiny
 
 from docs.licences_page import PAGE, ROOT, dependencies
-from scopemap.depth.estimate import DepthEstimate
-from scopemap.depth.scopenet.estimator import ScopeNetDepth
-from scopemap.frame import Frame
+from scopemap.engine.depth.estimate import DepthEstimate
+from scopemap.engine.depth.scopenet.estimator import ScopeNetDepth
+from scopemap.engine.frame import Frame
 
 # Of the core; what each allows: use, change and distribution, also in closed programs.
 PERMISSIVE = {

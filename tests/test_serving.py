@@ -21,7 +21,7 @@ import pytest
 from drawn_run import draw_run
 from front_door import refused
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 from scopemap.report.serving import LocalServer, live_page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -9,9 +9,9 @@ import pytest
 from chosen_settings import chosen
 from drawn_inputs import number_in, poses, write_sevenscenes
 
-from scopemap.config import DepthSettings
-from scopemap.depth.backends import create_depth
-from scopemap.io.opening import open_sequence
+from scopemap.engine.config import DepthSettings
+from scopemap.input.opening import open_sequence
+from scopemap.runner.depth_backends import create_depth
 
 
 def test_sevenscenes_bring_depth_and_poses_to_the_colour_camera(tmp_path: Path) -> None:

@@ -13,12 +13,12 @@ from front_door import call, said
 from result_files import frame_rows
 from tiny_phantom import only_images, write_tiny
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.config import Config
-from scopemap.io.frame_choice import FrameChoice
-from scopemap.io.source import SourceFrame
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import Config
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.frame_choice import FrameChoice
+from scopemap.input.source import SourceFrame
+from scopemap.result.trajectories import read_trajectory
 
 FAST = ("--preset", "realtime", "--quiet")
 

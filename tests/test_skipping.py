@@ -11,9 +11,9 @@ from spied_depth import spied
 from tiny_phantom import write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.config import Config
-from scopemap.io.depth_maps import DepthReader
-from scopemap.io.frame_choice import is_at_rest
+from scopemap.engine.config import Config
+from scopemap.input.frame_choice import is_at_rest
+from scopemap.result.depth_maps import DepthReader
 
 FRAMES = 24
 BLACK, WALL = {4, 5, 6}, set(range(7, 20))

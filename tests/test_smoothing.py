@@ -8,9 +8,9 @@ from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.config import SmoothingSettings
-from scopemap.geometry.se3 import inverse, se3, se3_exp, so3_exp
-from scopemap.tracking.smoothing import Wema
+from scopemap.engine.config import SmoothingSettings
+from scopemap.engine.geometry.se3 import inverse, se3, se3_exp, so3_exp
+from scopemap.engine.tracking.smoothing import Wema
 
 ALPHA, BETA, GAMMA = 0.5, 0.3, 0.2
 

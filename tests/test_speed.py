@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from scopemap import Config
 from scopemap.cli.app import app
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 from scopemap_bench import speed
 from scopemap_bench.speed import STAGES, Speed, measure_speed, read_speed, resolved
 

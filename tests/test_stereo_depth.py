@@ -23,15 +23,15 @@ from drawn_pairs import (
     write_stereo_phantom,
 )
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.pair import read_pair
-from scopemap.cameras.rectification import StereoPair, working_camera
-from scopemap.config import Config, InputSettings
-from scopemap.depth.backends import create_depth
-from scopemap.depth.stereo import StereoDepth, disparity_of
-from scopemap.errors import CalibrationError, InputError, SettingsError
-from scopemap.frame import Frame
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.rectification import StereoPair, working_camera
+from scopemap.engine.config import Config, InputSettings
+from scopemap.engine.depth.stereo import StereoDepth, disparity_of
+from scopemap.engine.errors import CalibrationError, InputError, SettingsError
+from scopemap.engine.frame import Frame
+from scopemap.input.camera_files.pair import read_pair
+from scopemap.input.opening import open_sequence
+from scopemap.runner.depth_backends import create_depth
 from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.phantom.spec import PhantomSpec
 

@@ -10,7 +10,7 @@ import pytest
 from drawn_clips import circle, inside, tissue
 from drawn_videos import HEIGHT, WIDTH, above, above_squeezed, beside, beside_squeezed, stereo
 
-from scopemap.io.video_format.stereo_packing import packing
+from scopemap.input.video_format.stereo_packing import packing
 
 NUMBERS = range(0, 40, 5)
 Draw = Callable[[int], np.ndarray]

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 _SUMS = """
-import scopemap.geometry.warp, hashlib
+import scopemap.engine.geometry.warp, hashlib
 import numpy as np
 values = np.random.default_rng(0).normal(size=(2, 700_746))
 print(hashlib.sha256(values[0] @ values[1]).hexdigest(), hashlib.sha256(np.linalg.norm(values[0])).hexdigest())

@@ -12,18 +12,18 @@ import trimesh
 from drawn_run import FRAMES, IN_RESULT, draw_run, drawn_result, tube, wavering
 from trimesh.viewer.notebook import scene_to_html
 
-from scopemap.actions.export.formats import export_run
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import InputError
-from scopemap.frame import Frame
-from scopemap.fusion.agreement import surface_agreement, vertex_sigmas
-from scopemap.fusion.mesh_files import T_GLTF_WORLD, save_mesh_over_time
-from scopemap.fusion.reference_state import SurfaceState, in_surface_state
-from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.io.run_folder import RunFolder, read_mesh
+from scopemap.apps.export.formats import export_run
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.agreement import surface_agreement, vertex_sigmas
+from scopemap.engine.fusion.mesh_files import T_GLTF_WORLD, save_mesh_over_time
+from scopemap.engine.fusion.reference_state import SurfaceState, in_surface_state
+from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.geometry.se3 import se3, so3_exp
+from scopemap.engine.mapping.tissue_states import TISSUE_MOTION, TissueStates
 from scopemap.report.page_data import page_data, shown_meshes
-from scopemap.trajectory.tissue_states import TISSUE_MOTION, TissueStates
+from scopemap.result.run_folder import RunFolder, read_mesh
 
 CAMERA = PinholeCamera(100.0, 100.0, 79.5, 63.5, 160, 128)
 Z_MM = 50.0

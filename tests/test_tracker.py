@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from chosen_settings import chosen
 
-from scopemap.config import TrackingSettings
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.tracking.pyramid import build_pyramid
-from scopemap.tracking.rtdl import align
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.tracking.pyramid import build_pyramid
+from scopemap.engine.tracking.rtdl import align
+from scopemap.engine.tracking.tracker import Tracker
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
 

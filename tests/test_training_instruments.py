@@ -11,7 +11,7 @@ import pytest
 from drawn_buffers import HEIGHT, WIDTH, sphere
 from onnx import numpy_helper
 
-from scopemap.depth.scopenet import estimator as module
+from scopemap.engine.depth.scopenet import estimator as module
 from training.instrument_layers import Layer, LayerStore, render_layer, render_layers
 from training.instrument_samples import make_instrument_sample
 from training.instruments import main

@@ -13,7 +13,7 @@ import pytest
 import torch
 from drawn_buffers import HEIGHT, WIDTH, sphere
 
-from scopemap.depth.scopenet.estimator import ScopeNetDepth, load_network
+from scopemap.engine.depth.scopenet.estimator import ScopeNetDepth, load_network
 from training.buffers import create_store, open_store
 from training.calibrate import calibrated, fit_calibration
 from training.export import export, read_network

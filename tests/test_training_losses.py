@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from scopemap.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.camera import PinholeCamera
 from training.losses import Weights, loss_parts, total
 
 

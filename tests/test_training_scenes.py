@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 from training.buffers import Buffers, camera_rays, create_store, decode, encode, open_store
 from training.marching import INSTRUMENT, march_rays, shade_shadows, surface
 from training.render import render_buffers, render_store

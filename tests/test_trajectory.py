@@ -10,10 +10,10 @@ import pytest
 from evo.tools import file_interface
 from sample_trajectories import write_c3vd, write_run
 
-from scopemap.errors import InputError
-from scopemap.geometry.se3 import se3_exp
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import Trajectory, write_kitti, write_tum
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.input.trajectory.trajectory import Trajectory, write_kitti, write_tum
+from scopemap.result.trajectories import read_trajectory
 
 
 @pytest.fixture

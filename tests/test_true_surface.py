@@ -12,10 +12,10 @@ import pytest
 import trimesh
 from tiny_phantom import write_tiny
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import InputError
-from scopemap.geometry.se3 import se3, so3_exp
-from scopemap.io.opening import open_sequence
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.se3 import se3, so3_exp
+from scopemap.input.opening import open_sequence
 from scopemap_bench.evaluation.surface import compare_surfaces
 from scopemap_bench.evaluation.true_surface import (
     TrueSurface,

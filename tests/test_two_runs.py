@@ -11,9 +11,9 @@ import pytest
 from drawn_run import IN_RESULT, drawn_result
 from front_door import call, refused
 
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import so3_exp
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import so3_exp
+from scopemap.result.frame_table import FrameTable
 
 # From the world of the drawn run to that of another run of the same video.
 OTHER_WORLD = Similarity(1.7, so3_exp(np.array([0.4, -0.7, 0.2])), np.array([5.0, -30.0, 12.0]))
@@ -32,7 +32,7 @@ def write(folder: Path, *, wider: float = 1.0, frames: slice = slice(None), stra
 
 def move(folder: Path, source: Path) -> Path:
     """The run in `source` in another world and scale."""
-    from scopemap.io.run_folder import RunFolder
+    from scopemap.result.run_folder import RunFolder
 
     run, result = RunFolder(source), drawn_result()
     table, mesh = FrameTable(run.frames.rows.copy()), run.mesh.copy()

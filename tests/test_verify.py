@@ -13,10 +13,10 @@ import pytest
 from front_door import call, refused
 from tiny_phantom import write_tiny
 
-from scopemap.actions.verifying import verify_result
-from scopemap.io import checksums
-from scopemap.io.checksums import SUMS, input_checksum
+from scopemap.apps.verify.verifying import verify_result
 from scopemap.report.page import write_report
+from scopemap.result import checksums
+from scopemap.result.checksums import SUMS, input_checksum
 
 Capture = pytest.CaptureFixture[str]
 

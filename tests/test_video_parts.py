@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from scopemap.report.video_parts import Join, video_parts
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.result.frame_table import FrameTable
 
 
 def _table(rows: list[tuple[int, str, int, int, float]]) -> FrameTable:

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from tiny_phantom import SIZE
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.se3 import inverse, se3, so3_exp, transform
 from scopemap_bench.evaluation.true_surface import pixels_near, seen_points, visible_from
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec

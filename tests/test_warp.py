@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.se3 import se3, se3_exp
-from scopemap.geometry.warp import bilateral_filtered, moved_depth, resampled
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.se3 import se3, se3_exp
+from scopemap.engine.geometry.warp import bilateral_filtered, moved_depth, resampled
 
 CAMERA = PinholeCamera(70.0, 75.0, 30.2, 22.9, 64, 48)
 SHAPE = (48, 64)

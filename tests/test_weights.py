@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-from scopemap.cli import models
-from scopemap.errors import SettingsError, WeightsError
-from scopemap.io import weights
-from scopemap.io.device import choose_device
-from scopemap.io.weights import REGISTRY, Checkpoint, find
+from scopemap.apps.models import command as models
+from scopemap.engine.errors import SettingsError, WeightsError
+from scopemap.engine.models import weights
+from scopemap.engine.models.device import choose_device
+from scopemap.engine.models.weights import REGISTRY, Checkpoint, find
 
 CONTENT = b"not really a network"
 TOY = Checkpoint(

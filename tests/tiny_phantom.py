@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from chosen_settings import configured
 
-from scopemap.config import Config
-from scopemap.geometry.se3 import inverse
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.config import Config
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.geometry.se3 import so3_exp
+from scopemap.engine.geometry.se3 import so3_exp
 
 SIZE = (200, 160)
 RADIUS_MM = 40.0

@@ -1,7 +1,7 @@
 """ALIKE-t: local features by a small network (Zhao et al., "ALIKE", IEEE Transactions on Multimedia 2022, arXiv
 2112.02906), written from the paper; its authors' weights (BSD-3-Clause) become the file that the package ships:
 
-    python -m training.alike --weights ../shared/data/weights/alike-t.pth --out src/scopemap/tracking/alike.onnx
+    python -m training.alike --weights ../shared/data/weights/alike-t.pth --out src/scopemap/engine/tracking/alike.onnx
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 
 NOISE_PERIODS = (24.0, 12.0, 6.0, 3.0, 1.5, 14.0, 7.0, 16.0)
 _LOG_STEP = 7.0 / 65534.0

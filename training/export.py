@@ -10,7 +10,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from scopemap.depth.scopenet.planes import INSTRUMENTS, PLANES
+from scopemap.engine.depth.scopenet.planes import INSTRUMENTS, PLANES
 from training.network import (
     SPREAD_RANGE,
     TYPICAL_LOG_MM,

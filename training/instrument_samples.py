@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from scopemap.depth.scopenet.planes import input_planes
+from scopemap.engine.depth.scopenet.planes import input_planes
 from training.buffers import Buffers
 from training.instrument_layers import Layer
 from training.instrument_looks import light_of_instruments

@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from scopemap.config import MaskSettings
-from scopemap.masking.masker import Masker
+from scopemap.engine.config import MaskSettings
+from scopemap.engine.masking.masker import Masker
 from training.buffers import Store, cropped, open_store, thinned
 from training.instrument_layers import LayerStore, part_of, render_layers
 from training.instrument_samples import InstrumentSample, make_instrument_sample

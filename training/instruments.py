@@ -1,6 +1,6 @@
 """One command trains the head that finds instruments, on a trunk that stays as it is.
 
-    python -m training.instruments --out runs/instruments --start src/scopemap/depth/scopenet/scopenet.onnx
+    python -m training.instruments --out runs/instruments --start src/scopemap/engine/depth/scopenet/scopenet.onnx
 
 It renders scenes and layers of instruments, trains the head, puts its threshold where hardly any tissue is taken for an
 instrument, on training scenes, tells what it reaches on held-out ones, and writes the network with both outputs.

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scopemap.depth.scopenet.planes import PLANES, STRIDE
+from scopemap.engine.depth.scopenet.planes import PLANES, STRIDE
 
 WIDTHS = (24, 48, 80, 128, 160)
 _BLOCKS = (1, 2, 2, 3, 2)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 from training.buffers import NOISE_PERIODS, Buffers, camera_rays, create_store, open_store
 from training.marching import INSTRUMENT, march_rays, shade_shadows, surface
 from training.scene import AIRWAY, BAG, COLON, LAPAROSCOPY, SINUS, WALL, Scene, log_uniform

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import MaskSettings
-from scopemap.depth.scopenet.planes import input_planes
-from scopemap.frame import Frame
-from scopemap.masking.masker import Masker
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import MaskSettings
+from scopemap.engine.depth.scopenet.planes import input_planes
+from scopemap.engine.frame import Frame
+from scopemap.engine.masking.masker import Masker
 from training.buffers import Buffers, Store, thinned
 from training.light import INSTRUMENT, draw_light, shade
 from training.sensor import take_picture

@@ -68,7 +68,7 @@ def _choose_kernel_cache() -> None:
     caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     named = os.environ.get("NUMBA_CACHE_DIR")
     usual = [
-        Path(__file__).parent / "geometry" / "__pycache__",
+        Path(__file__).parent / "engine" / "geometry" / "__pycache__",
         Path(caches) / "numba",
         *([Path(named)] if named else []),
     ]
@@ -90,18 +90,18 @@ _choose_kernel_cache()
 if TYPE_CHECKING:
     __version__: str
 
-    from scopemap.config import Config
-    from scopemap.depth.custom import OwnDepth
-    from scopemap.errors import ScopemapError
+    from scopemap.engine.config import Config
+    from scopemap.engine.depth.custom import OwnDepth
+    from scopemap.engine.errors import ScopemapError
+    from scopemap.engine.frame import Frame
     from scopemap.evaluation.poses import evaluate_poses
-    from scopemap.frame import Frame
-    from scopemap.io.opening import open_sequence
-    from scopemap.io.run_folder import RunFolder
-    from scopemap.reconstruction import Reconstruction
+    from scopemap.input.opening import open_sequence
+    from scopemap.input.trajectory.trajectory import Trajectory
+    from scopemap.result.reconstruction import Reconstruction
+    from scopemap.result.run_folder import RunFolder
+    from scopemap.result.trajectories import read_trajectory
     from scopemap.runner.reconstruct import reconstruct
     from scopemap.runner.reconstructor import Reconstructor
-    from scopemap.trajectory.formats.opening import read_trajectory
-    from scopemap.trajectory.trajectory import Trajectory
 
 __all__ = [
     "Config",
@@ -120,17 +120,17 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Config": "config",
-    "Frame": "frame",
-    "OwnDepth": "depth.custom",
-    "Reconstruction": "reconstruction",
+    "Config": "engine.config",
+    "Frame": "engine.frame",
+    "OwnDepth": "engine.depth.custom",
+    "Reconstruction": "result.reconstruction",
     "Reconstructor": "runner.reconstructor",
-    "RunFolder": "io.run_folder",
-    "ScopemapError": "errors",
-    "Trajectory": "trajectory.trajectory",
+    "RunFolder": "result.run_folder",
+    "ScopemapError": "engine.errors",
+    "Trajectory": "input.trajectory.trajectory",
     "evaluate_poses": "evaluation.poses",
-    "open_sequence": "io.opening",
-    "read_trajectory": "trajectory.formats.opening",
+    "open_sequence": "input.opening",
+    "read_trajectory": "result.trajectories",
     "reconstruct": "runner.reconstruct",
 }
 

@@ -15,20 +15,20 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from scopemap.actions.inputs import open_truth
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.config import MaskSettings
-from scopemap.errors import AlignmentError, InputError
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import MaskSettings
+from scopemap.engine.errors import AlignmentError, InputError
+from scopemap.engine.frame import Frame, Truth
+from scopemap.engine.geometry.se3 import inverse, se3, transform
+from scopemap.engine.masking.masker import Masker
 from scopemap.evaluation.poses import match
-from scopemap.frame import Frame, Truth
-from scopemap.geometry.se3 import inverse, se3, transform
-from scopemap.io.depth_maps import DepthReader
-from scopemap.io.reference import read_reference, reference_trajectory
-from scopemap.io.run_folder import RunFolder, read_mesh
-from scopemap.io.sequence import Sequence as Frames
-from scopemap.masking.masker import Masker
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import Unit
+from scopemap.input.sequence import Sequence as Frames
+from scopemap.input.trajectory.trajectory import Unit
+from scopemap.result.depth_maps import DepthReader
+from scopemap.result.reference import read_reference, reference_trajectory
+from scopemap.result.run_folder import RunFolder, read_mesh
+from scopemap.result.trajectories import read_trajectory
+from scopemap.runner.frames_again import open_truth
 from scopemap_bench import pictures
 from scopemap_bench.entry import FILE_NAME as ENTRY
 from scopemap_bench.entry import Entry

@@ -12,11 +12,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from scopemap.config import Config
-from scopemap.errors import SettingsError
-from scopemap.io.opening import open_sequence
-from scopemap.io.sequence import Sequence
-from scopemap.io.source import OWN_CALIBRATION
+from scopemap.engine.config import Config
+from scopemap.engine.errors import SettingsError
+from scopemap.input.opening import open_sequence
+from scopemap.input.sequence import Sequence
+from scopemap.input.source import OWN_CALIBRATION
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 from scopemap_bench.plan import MethodPlan, Plan, ProtocolPlan, SequencePlan, folder_name, spec_of

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from scopemap.errors import check_shape
+from scopemap.engine.errors import check_shape
 from scopemap.report.mesh_figures import ESTIMATE_COLOUR
 
 if TYPE_CHECKING:

@@ -16,11 +16,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from scopemap.config import Config, Preset, explain
-from scopemap.errors import InputError, ScopemapError, SettingsError
-from scopemap.flow.flows import FLOWS
-from scopemap.geometry.align import AlignMode
-from scopemap.io.opening import readers
+from scopemap.engine.config import Config, Preset, explain
+from scopemap.engine.errors import InputError, ScopemapError, SettingsError
+from scopemap.engine.flow.flows import FLOWS
+from scopemap.engine.geometry.align import AlignMode
+from scopemap.input.opening import readers
 from scopemap_bench.evaluation.depth import DepthScaling
 from scopemap_bench.evaluation.protocols import PROTOCOLS
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from scopemap.errors import InputError
-from scopemap.io.json_numbers import without_nan
+from scopemap.engine.errors import InputError
+from scopemap.result.json_numbers import without_nan
 
 FILE_NAME = "result.json"
 Figures = dict[str, dict[str, Any]]

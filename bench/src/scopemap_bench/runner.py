@@ -26,10 +26,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-from scopemap.config import Config
-from scopemap.errors import InputError, ScopemapError, SettingsError
-from scopemap.estimators import missing_weights
-from scopemap.io.sequence import Sequence
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError, ScopemapError, SettingsError
+from scopemap.input.sequence import Sequence
+from scopemap.runner.estimators import missing_weights
 from scopemap_bench.entry import Entry, entries_of
 from scopemap_bench.methods.method import Method, PipelineMethod, create_method
 from scopemap_bench.plan import Plan, found_sequences, spec_of

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from scopemap.geometry.rendering import render_points
+from scopemap.engine.geometry.rendering import render_points
 from scopemap.report.depth_figures import colour_depth, percentiles
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,

@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from scopemap.actions.inputs import is_camera_of, open_truth
-from scopemap.config import MaskSettings
-from scopemap.errors import AlignmentError, InputError
+from scopemap.engine.config import MaskSettings
+from scopemap.engine.errors import AlignmentError, InputError
+from scopemap.engine.flow.estimator import FlowEstimator, pair_flow
+from scopemap.engine.flow.flows import create_flow
+from scopemap.engine.geometry.align import AlignMode, Similarity
+from scopemap.engine.masking.masker import Masker
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
-from scopemap.flow.estimator import FlowEstimator, pair_flow
-from scopemap.flow.flows import create_flow
-from scopemap.geometry.align import AlignMode, Similarity
-from scopemap.io.depth_maps import DepthReader
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import reference_trajectory
-from scopemap.io.run_folder import read_mesh
-from scopemap.io.sequence import Sequence
-from scopemap.masking.masker import Masker
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.input.opening import open_sequence
+from scopemap.input.sequence import Sequence
+from scopemap.input.trajectory.trajectory import Trajectory
+from scopemap.result.depth_maps import DepthReader
+from scopemap.result.reference import reference_trajectory
+from scopemap.result.run_folder import read_mesh
+from scopemap.result.trajectories import read_trajectory
+from scopemap.runner.frames_again import is_camera_of, open_truth
 from scopemap_bench.climb.submission import with_score
 from scopemap_bench.evaluation import depth as depth_errors
 from scopemap_bench.evaluation.consistency import ConsistencyMeter, FrameMatcher

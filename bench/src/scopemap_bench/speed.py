@@ -23,9 +23,9 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
-from scopemap.config import Config
-from scopemap.errors import InputError
-from scopemap.io.opening import open_sequence
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError
+from scopemap.input.opening import open_sequence
 from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 from scopemap_bench.result import RunResult
 from scopemap_bench.table import SPREAD, Figure, Table, escape_markdown, joined, of_frames, summarise
 

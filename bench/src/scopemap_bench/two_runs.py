@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.errors import AlignmentError, InputError, reporting
+from scopemap.engine.errors import AlignmentError, InputError, reporting
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.rendering import Rendering, render_mesh, vertex_colours
 from scopemap.evaluation.poses import rotation_errors_rad, translation_errors_mm
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.rendering import Rendering, render_mesh, vertex_colours
-from scopemap.io.run_folder import RunFolder
+from scopemap.input.trajectory.trajectory import path_length_mm
 from scopemap.report.mesh_figures import draw_trajectories
 from scopemap.report.page import PAGE, write_comparison
 from scopemap.report.sheet import picture_grid
-from scopemap.trajectory.trajectory import path_length_mm
+from scopemap.result.run_folder import RunFolder
 
 _LEAST_COMMON = 3
 _MOST_VIEWS, _DRAWN = 16, 3

@@ -12,24 +12,24 @@ import sys
 
 import typer
 
-from scopemap.cli import models
-from scopemap.cli.batch import batch
-from scopemap.cli.calibrate import calibrate
-from scopemap.cli.compare_exams import compare_exams
-from scopemap.cli.coverage import coverage
-from scopemap.cli.demo import demo
-from scopemap.cli.evaluate import evaluate
-from scopemap.cli.export import export
-from scopemap.cli.inspect import inspect
-from scopemap.cli.live import live
-from scopemap.cli.locate import locate
-from scopemap.cli.measure import measure
-from scopemap.cli.report import report
-from scopemap.cli.run import run
-from scopemap.cli.verify import verify
-from scopemap.cli.view import view
-from scopemap.errors import ScopemapError
-from scopemap.plugins import plugins
+from scopemap.apps.batch.command import batch
+from scopemap.apps.calibrate.command import calibrate
+from scopemap.apps.coverage.command import coverage
+from scopemap.apps.demo.command import demo
+from scopemap.apps.evaluate.command import evaluate
+from scopemap.apps.exams.command import compare_exams
+from scopemap.apps.export.command import export
+from scopemap.apps.inspect.command import inspect
+from scopemap.apps.live.command import live
+from scopemap.apps.locate.command import locate
+from scopemap.apps.measure.command import measure
+from scopemap.apps.models import command as models
+from scopemap.apps.report.command import report
+from scopemap.apps.run.command import run
+from scopemap.apps.verify.command import verify
+from scopemap.apps.view.command import view
+from scopemap.engine.errors import ScopemapError
+from scopemap.input.plugins import plugins
 
 app = typer.Typer(
     help="From a monocular endoscope video to camera poses and a tissue surface.",

@@ -12,10 +12,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation, Slerp
 
-from scopemap.errors import AlignmentError
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.geometry.align import AlignMode, align_trajectories
 from scopemap.evaluation.poses import ErrorSummary, associate, match, translation_errors_mm
-from scopemap.geometry.align import AlignMode, align_trajectories
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.input.trajectory.trajectory import Trajectory
 
 FIT: Final = "fit"
 MOST_OFFSET_S = 0.5

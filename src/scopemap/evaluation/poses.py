@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scopemap.errors import AlignmentError
-from scopemap.geometry.align import AlignMode, Similarity, align_trajectories
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import Trajectory, path_length_mm
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.geometry.align import AlignMode, Similarity, align_trajectories
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.input.trajectory.trajectory import Trajectory, path_length_mm
+from scopemap.result.trajectories import read_trajectory
 
 MIN_MATCHED = 3
 # evo's 0.01 s, and a little over, since decimal time stamps are not exact in binary.

@@ -13,9 +13,9 @@ from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
-from scopemap.errors import reporting
+from scopemap.engine.errors import reporting
 from scopemap.report.page import PAGE, PICTURE
-from scopemap.report.verdict import WORDS
+from scopemap.result.verdict import WORDS
 
 _COLUMNS = ("input", "folder", "status", "reason", "seconds", "frames", "tracked", "verdict")
 _ORDER = ("failed", "started", "done", "waiting")

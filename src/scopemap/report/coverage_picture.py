@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.errors import reporting
+from scopemap.engine.errors import reporting
 from scopemap.report.sheet import SOFT, Plot, Sheet, rgb_of
 
 COLOURS = {"seen": "#2a9d8f", "from afar or obliquely only": "#e9c46a", "probably not seen": "#9b2226"}

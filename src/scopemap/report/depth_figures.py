@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.errors import reporting
-from scopemap.io.decoding import read_decoded
-from scopemap.io.depth_maps import DepthReader, write_picture
-from scopemap.io.device import cpu_threads
+from scopemap.engine.errors import reporting
+from scopemap.engine.models.device import cpu_threads
+from scopemap.input.decoding import read_decoded
 from scopemap.report.sheet import Sheet, picture_grid
+from scopemap.result.depth_maps import DepthReader, write_picture
 
 _CELL_PX = (300, 250)
 _LEGEND_PX, _STEP_PX, _LAST_PX, _MOST_NUMBERS = 36, 54, 74, 5

@@ -8,13 +8,13 @@ from pathlib import Path
 import av
 import numpy as np
 
-from scopemap.errors import InputError, reporting
-from scopemap.io.run_folder import RunFolder
+from scopemap.engine.errors import InputError, reporting
 from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.mesh_figures import ESTIMATE_COLOUR, draw_path, mesh_picture, view_of
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet
 from scopemap.report.shown_mesh import simplified
+from scopemap.result.run_folder import RunFolder
 
 _FRAMES, _FRAMES_PER_S, _PITCH_RAD = 180, 24, -0.35
 _QUALITY_BITS = 4_000_000

@@ -13,10 +13,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.errors import reporting
-from scopemap.frame import Rows
-from scopemap.io.run_folder import RunFolder
-from scopemap.odometry import Step
+from scopemap.engine.errors import reporting
+from scopemap.engine.frame import Rows
+from scopemap.engine.odometry import Step
+from scopemap.result.run_folder import RunFolder
 
 FOLDER = "frames"
 _MOST = 64

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.errors import reporting
-from scopemap.io.run_folder import RunFolder
+from scopemap.engine.errors import reporting
 from scopemap.report.shown_mesh import LARGEST_LEVEL, levels_of, simplified
+from scopemap.result.run_folder import RunFolder
 
 MOST_FACES, FACES_OF_OTHERS = 100_000, 20_000
 DEPTH_WIDTH_PX = 160

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.rendering import Rendering, render_mesh
-from scopemap.geometry.se3 import inverse, se3, so3_exp, transform
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.rendering import Rendering, render_mesh
+from scopemap.engine.geometry.se3 import inverse, se3, so3_exp, transform
 from scopemap.report.sheet import SOFT, Plot, Sheet
 
 ESTIMATE_COLOUR = "#1a9850"

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 
-from scopemap.odometry import Step
-from scopemap.reconstruction import VIEWS, Reconstruction
+from scopemap.engine.odometry import Step
 from scopemap.report.page_data import shown_meshes
 from scopemap.report.run_state import RunState
 from scopemap.report.summary_picture import summary_picture
-from scopemap.report.verdict import verdict
+from scopemap.result.reconstruction import VIEWS, Reconstruction
+from scopemap.result.verdict import verdict
 
 _SHOWN_FACES = 100_000
 _SECONDS_BETWEEN = 0.5

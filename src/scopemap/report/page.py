@@ -14,16 +14,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scopemap.errors import reporting
-from scopemap.io.checksums import SUMS, write_checksums
-from scopemap.io.json_numbers import without_nan
-from scopemap.io.run_folder import RunFolder
+from scopemap.engine.errors import reporting
 from scopemap.report.frame_pictures import FOLDER as PICTURES
 from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.page_data import MEASUREMENTS, checked_measurements, page_data, read_measurements, shown_meshes
 from scopemap.report.serving import LocalServer
 from scopemap.report.shown_mesh import base64_of
 from scopemap.report.summary_picture import summary_picture
+from scopemap.result.checksums import SUMS, write_checksums
+from scopemap.result.json_numbers import without_nan
+from scopemap.result.run_folder import RunFolder
 
 PAGE, PICTURE = "report.html", "summary.png"
 _SCRIPTS = (

@@ -14,18 +14,21 @@ import numpy as np
 import trimesh
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import ScopemapError
-from scopemap.geometry.align import align_trajectories
-from scopemap.io.reference import read_reference
-from scopemap.io.run_folder import RunFolder
-from scopemap.io.run_input import PLACES, places_of_input
-from scopemap.notices import notices_of
-from scopemap.report.losses import losses
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import ScopemapError
+from scopemap.engine.geometry.align import align_trajectories
+from scopemap.engine.notices import notices_of
+from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
-from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.report.verdict import (
+from scopemap.report.video_parts import video_parts
+from scopemap.result.frame_table import NOT_USED
+from scopemap.result.losses import losses
+from scopemap.result.reference import read_reference
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.run_input import PLACES, places_of_input
+from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
+from scopemap.result.verdict import (
     WORDS,
     Result,
     frames_per_s,
@@ -34,9 +37,6 @@ from scopemap.report.verdict import (
     scale_source,
     verdict,
 )
-from scopemap.report.video_parts import video_parts
-from scopemap.trajectory.frame_table import NOT_USED
-from scopemap.trajectory.trajectory import Trajectory
 
 _MOST_MAPS = 8
 MEASUREMENTS, COVERAGE = "measurements.json", "coverage"

@@ -7,7 +7,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from scopemap.odometry import Step
+    from scopemap.engine.odometry import Step
 
 # Time per frame after the last one (adjustment, fusion, writing) over that until then: typical of the default preset,
 # and of one that adjusts nothing.

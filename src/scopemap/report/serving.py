@@ -9,7 +9,7 @@ from importlib.resources import files
 from socketserver import TCPServer
 from typing import Any
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 
 Content = tuple[str, bytes]
 """A content type and bytes."""

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.rendering import vertex_colours
-from scopemap.geometry.se3 import inverse
-from scopemap.trajectory.tissue_states import TissueStates
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.rendering import vertex_colours
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.mapping.tissue_states import TissueStates
 
 _SAME_SURFACE = 0.1
 _CELLS_PER_FACE = 2.5  # faces of a surface that crosses a grid, times a cell's area, over its area

@@ -11,10 +11,9 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.geometry.rendering import render_mesh, vertex_colours
-from scopemap.io.decoding import read_decoded
-from scopemap.io.run_folder import RunFolder
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.rendering import render_mesh, vertex_colours
+from scopemap.input.decoding import read_decoded
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     MeshView,
@@ -27,8 +26,9 @@ from scopemap.report.mesh_figures import (
 )
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import SOFT, Sheet, rgb_of
-from scopemap.report.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.report.verdict import Result, Verdict, scale_is_known, verdict
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
+from scopemap.result.verdict import Result, Verdict, scale_is_known, verdict
 
 _CELL_PX, _GAP_PX, _HEAD_PX, _LABEL_PX = 384, 12, 104, 26
 _COLUMNS = 4

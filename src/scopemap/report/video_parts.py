@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scopemap.io.run_folder import RunFolder
-from scopemap.trajectory.frame_table import NOT_USED
+from scopemap.result.frame_table import NOT_USED
+from scopemap.result.run_folder import RunFolder
 
 _LEAST_GAP_S = 0.5
 

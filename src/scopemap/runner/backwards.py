@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.pipeline import Pipeline
-from scopemap.preprocessing import without_depth
-from scopemap.tracking.track import Track
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.pipeline import Pipeline
+from scopemap.engine.preprocessing import without_depth
+from scopemap.engine.tracking.track import Track
+from scopemap.result.frame_table import FrameTable
 
 BACKWARDS = "tracked backwards"
 """Reason of the track of such a frame."""

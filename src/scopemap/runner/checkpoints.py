@@ -7,15 +7,15 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from scopemap.config import Config
-from scopemap.errors import InputError, reporting
-from scopemap.fusion.frame_store import StoredFile, check_stored
-from scopemap.io.checkpoint import CHECKPOINT, SavedState
-from scopemap.io.checksums import input_checksum
-from scopemap.io.result_folder import STORED, UNFINISHED
-from scopemap.io.sequence import Sequence
-from scopemap.notices import Notice
-from scopemap.pipeline import Pipeline
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError, reporting
+from scopemap.engine.fusion.frame_store import StoredFile, check_stored
+from scopemap.engine.notices import Notice
+from scopemap.engine.pipeline import Pipeline
+from scopemap.input.sequence import Sequence
+from scopemap.result.checkpoint import CHECKPOINT, SavedState
+from scopemap.result.checksums import input_checksum
+from scopemap.result.result_folder import STORED, UNFINISHED
 from scopemap.runner.provenance import package_versions
 
 # A checkpoint is due after so many seconds, and so long after the last one that they take a 50th of the time.

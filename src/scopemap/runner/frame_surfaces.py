@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scopemap.config import Config
-from scopemap.depth.anchor import depth_downscale
-from scopemap.errors import reporting
-from scopemap.frame import Frame
-from scopemap.fusion.depth_mesh import depth_mesh
-from scopemap.fusion.mesh_files import save_mesh
-from scopemap.notices import scale_words
-from scopemap.preprocessing import Estimators
+from scopemap.engine.config import Config
+from scopemap.engine.depth.anchor import depth_downscale
+from scopemap.engine.errors import reporting
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.depth_mesh import depth_mesh
+from scopemap.engine.fusion.mesh_files import save_mesh
+from scopemap.engine.notices import scale_words
+from scopemap.engine.preprocessing import Estimators
 from scopemap.runner.provenance import scale_facts
 
 SURFACES = "surfaces"

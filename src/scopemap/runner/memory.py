@@ -11,11 +11,11 @@ import gc
 from contextlib import suppress
 from dataclasses import dataclass
 
-from scopemap.config import Config
-from scopemap.errors import InputError, SettingsError
-from scopemap.io.sequence import Sequence
-from scopemap.mapping.backend import MOST_OBSERVATIONS
-from scopemap.notices import Notice
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.mapping.backend import MOST_OBSERVATIONS
+from scopemap.engine.notices import Notice
+from scopemap.input.sequence import Sequence
 
 _MB = 1_000_000
 # Python with its libraries, the embedded network, kernels; with kernels that are compiled.

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from scopemap.config import Config
-from scopemap.io.device import choose_device, cpu_threads
-from scopemap.io.sequence import Sequence
+from scopemap.engine.config import Config
+from scopemap.engine.models.device import choose_device, cpu_threads
+from scopemap.input.sequence import Sequence
 
 # Seconds of one core: of one flow, for each million pixels and each square of that; of depth, for a picture of any
 # size; of the perceptual distance and of the other stages, for each million pixels.

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from scopemap.calibration.focal_length.from_motion import with_focal_from_motion
-from scopemap.config import Config
-from scopemap.depth.estimate import DepthEstimator
-from scopemap.estimators import OwnEstimators, create_estimators
-from scopemap.frame import is_constant
-from scopemap.io.sequence import Sequence
-from scopemap.notices import Notice
-from scopemap.preprocessing import Estimators
+from scopemap.engine.config import Config
+from scopemap.engine.depth.estimate import DepthEstimator
+from scopemap.engine.frame import is_constant
+from scopemap.engine.notices import Notice
+from scopemap.engine.preprocessing import Estimators
+from scopemap.input.focal_length.from_motion import with_focal_from_motion
+from scopemap.input.sequence import Sequence
+from scopemap.runner.estimators import OwnEstimators, create_estimators
 from scopemap.runner.run import Progress
 
 Timed = Callable[..., Any]

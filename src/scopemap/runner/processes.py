@@ -18,7 +18,7 @@ from typing import Any
 
 import cv2
 
-from scopemap.errors import ScopemapError
+from scopemap.engine.errors import ScopemapError
 
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Variables of the environment that bound the threads of a process."""

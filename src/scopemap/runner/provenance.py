@@ -11,15 +11,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from scopemap.config import Config
-from scopemap.depth.estimate import DepthEstimator, PerceptualDistance
-from scopemap.errors import InputError
-from scopemap.flow.estimator import FlowEstimator
-from scopemap.io.sequence import Sequence
-from scopemap.notices import Notice, of_input
-from scopemap.preprocessing import Estimators
-from scopemap.tracking.features import FeatureDetector
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.engine.config import Config
+from scopemap.engine.depth.estimate import DepthEstimator, PerceptualDistance
+from scopemap.engine.errors import InputError
+from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.notices import Notice, of_input
+from scopemap.engine.preprocessing import Estimators
+from scopemap.engine.tracking.features import FeatureDetector
+from scopemap.input.sequence import Sequence
+from scopemap.result.frame_table import FrameTable
 
 _VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
 _VERSIONS_OF_NETWORKS = ("torch", "torchvision", "transformers", "lpips")

@@ -7,28 +7,28 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scopemap.config import Config
-from scopemap.estimators import largest_depth_mm
-from scopemap.fusion.frame_store import FrameStore
-from scopemap.io.checksums import write_checksums
-from scopemap.io.depth_maps import DepthWriter
-from scopemap.io.opening import open_sequence
-from scopemap.io.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
-from scopemap.io.run_input import stated_input
-from scopemap.io.sequence import Sequence
-from scopemap.notices import Notice
-from scopemap.pipeline import Pipeline
-from scopemap.reconstruction import Reconstruction
+from scopemap.engine.config import Config
+from scopemap.engine.fusion.frame_store import FrameStore
+from scopemap.engine.notices import Notice
+from scopemap.engine.pipeline import Pipeline
+from scopemap.engine.tracking.track import FrameTracker
+from scopemap.input.opening import open_sequence
+from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import write_previews
 from scopemap.report.notebook import in_notebook, notebook_progress
-from scopemap.report.verdict import state_verdict
+from scopemap.result.checksums import write_checksums
+from scopemap.result.depth_maps import DepthWriter
+from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
+from scopemap.result.run_input import stated_input
+from scopemap.result.verdict import state_verdict
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
+from scopemap.runner.estimators import largest_depth_mm
 from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import refuse_own_input
 from scopemap.runner.run import Clock, FrameWriter, Observer, Progress, Run
-from scopemap.tracking.track import FrameTracker
 
 _NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
 

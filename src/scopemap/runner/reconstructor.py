@@ -9,30 +9,30 @@ from types import TracebackType
 import numpy as np
 import trimesh
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.rectification import Rectifier, working_camera, working_size
-from scopemap.config import Config
-from scopemap.depth.estimate import DepthEstimator
-from scopemap.errors import SettingsError
-from scopemap.estimators import OwnEstimators, largest_depth_mm
-from scopemap.flow.estimator import OwnFlow
-from scopemap.frame import Frame
-from scopemap.fusion.frame_store import FrameStore
-from scopemap.fusion.surface_fusion import TsdfVolume
-from scopemap.io.depth_maps import DepthWriter
-from scopemap.io.opening import open_sequence
-from scopemap.io.run_input import stated_input
-from scopemap.io.sequence import Sequence
-from scopemap.io.source import ASSUMED_RATE_HZ, Source
-from scopemap.odometry import Step
-from scopemap.pipeline import Pipeline
-from scopemap.reconstruction import Reconstruction
-from scopemap.report.verdict import state_verdict
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.rectification import Rectifier, working_camera, working_size
+from scopemap.engine.config import Config
+from scopemap.engine.depth.estimate import DepthEstimator
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.flow.estimator import OwnFlow
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.frame_store import FrameStore
+from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.odometry import Step
+from scopemap.engine.pipeline import Pipeline
+from scopemap.input.opening import open_sequence
+from scopemap.input.sequence import Sequence
+from scopemap.input.source import ASSUMED_RATE_HZ, Source
+from scopemap.result.depth_maps import DepthWriter
+from scopemap.result.frame_table import FrameTable
+from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.run_input import stated_input
+from scopemap.result.verdict import state_verdict
+from scopemap.runner.estimators import OwnEstimators, largest_depth_mm
 from scopemap.runner.memory import memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import Limits, provenance_of, scale_facts
 from scopemap.runner.run import Clock, KeptMaps, Progress, Run, overlapped
-from scopemap.trajectory.frame_table import FrameTable
 
 
 class Reconstructor:

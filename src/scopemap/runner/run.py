@@ -14,28 +14,28 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numba.core.event import TimingListener, register
 
-from scopemap.frame import Frame
-from scopemap.fusion.agreement import surface_agreement, vertex_sigmas
-from scopemap.fusion.finish import finished, with_normals_alone
-from scopemap.fusion.frame_store import SpreadFrames
-from scopemap.fusion.free_space import FreeSpace, views_among
-from scopemap.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
-from scopemap.fusion.reference_state import SurfaceState
-from scopemap.fusion.surface_fusion import FusedSurface, depth_notices
-from scopemap.io.sequence import Sequence
-from scopemap.mapping.multiview_depth import KeyframeDepths
-from scopemap.mapping.submaps import FinalFrames, Submap
-from scopemap.notices import Notice
-from scopemap.odometry import Step
-from scopemap.pipeline import Pipeline
-from scopemap.reconstruction import Reconstruction
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.agreement import surface_agreement, vertex_sigmas
+from scopemap.engine.fusion.finish import finished, with_normals_alone
+from scopemap.engine.fusion.frame_store import SpreadFrames
+from scopemap.engine.fusion.free_space import FreeSpace, views_among
+from scopemap.engine.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
+from scopemap.engine.fusion.reference_state import SurfaceState
+from scopemap.engine.fusion.surface_fusion import FusedSurface, depth_notices
+from scopemap.engine.mapping.multiview_depth import KeyframeDepths
+from scopemap.engine.mapping.submaps import FinalFrames, Submap
+from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.engine.notices import Notice
+from scopemap.engine.odometry import Step
+from scopemap.engine.pipeline import Pipeline
+from scopemap.engine.tracking.track import Track
+from scopemap.input.sequence import Sequence
+from scopemap.result.frame_table import FrameTable, GrowingFrameTable
+from scopemap.result.reconstruction import Reconstruction
 from scopemap.runner.backwards import track_backwards
 from scopemap.runner.memory import MemoryPlan, give_back_freed
 from scopemap.runner.provenance import Limits, motion_notices, notices_of_end, provenance_of
 from scopemap.runner.submap_frames import check_tracked, frames_of_submap
-from scopemap.tracking.track import Track
-from scopemap.trajectory.frame_table import FrameTable, GrowingFrameTable
-from scopemap.trajectory.tissue_states import TissueStates
 
 Observer = Callable[[Step], bool | None]
 """Called with each step; True: no further frame is read, and the result is of the frames until then."""

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.mapping.submaps import Submap
-from scopemap.trajectory.causes import LossCause, causes_of_loss
-from scopemap.trajectory.frame_table import FrameTable
-from scopemap.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY
+from scopemap.engine.errors import InputError
+from scopemap.engine.mapping.submaps import Submap
+from scopemap.engine.tracking.causes import LossCause, causes_of_loss
+from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY
+from scopemap.result.frame_table import FrameTable
 
 
 def check_tracked(frames: FrameTable, path: Path) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scopemap.config import Config
-from scopemap.io.sequence import Sequence
-from scopemap.reconstruction import Reconstruction
+from scopemap.engine.config import Config
+from scopemap.input.sequence import Sequence
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import write_report
+from scopemap.result.reconstruction import Reconstruction
 from scopemap.runner.memory import give_back_freed
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Observer, Progress

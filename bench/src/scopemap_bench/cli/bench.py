@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from scopemap.cli.figures import print_json
-from scopemap.cli.options import AsJson, Quiet
+from scopemap.terminal.figures import print_json
+from scopemap.terminal.options import AsJson, Quiet
 
 if TYPE_CHECKING:
     from scopemap_bench.entry import Entry
@@ -99,7 +99,7 @@ def bench(
 
 def _print_speed(video: Path | None, frames: int | None, preset: _Preset, compare: Path | None, as_json: bool) -> None:
     """Measure and print; ends with code 1 where a stage is slower than in the file to compare with."""
-    from scopemap.config import Config
+    from scopemap.engine.config import Config
     from scopemap_bench.speed import measure_speed, read_speed
 
     before = None if compare is None else read_speed(compare)

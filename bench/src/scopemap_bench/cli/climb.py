@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from scopemap.cli.options import AsJson, Quiet
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
+from scopemap.terminal.options import AsJson, Quiet
 
 
 def climb(

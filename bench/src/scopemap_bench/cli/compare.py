@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from scopemap.cli.figures import print_json
-from scopemap.cli.options import Align, AsJson, Quiet, Unit
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
+from scopemap.terminal.figures import print_json
+from scopemap.terminal.options import Align, AsJson, Quiet, Unit
 
 
 def compare(
@@ -39,8 +39,8 @@ def compare(
 
     Without a truth, the first of two runs is moved onto the second by the Sim(3) of the frames that both have.
     """
-    from scopemap.io.run_folder import RunFolder
     from scopemap.report.page import PAGE, write_comparison
+    from scopemap.result.run_folder import RunFolder
     from scopemap_bench.comparison import compare as compare_runs
     from scopemap_bench.comparison import write_results
     from scopemap_bench.plan import ProtocolPlan

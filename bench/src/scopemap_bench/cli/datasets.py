@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scopemap.cli.figures import print_findings, print_json, print_table, print_values
-from scopemap.cli.options import AsJson, CameraFile, Dataset, Quiet, SetPairs, parse_settings
-from scopemap.cli.progress import count_progress
-from scopemap.errors import InputError, ScopemapError
+from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.terminal.figures import print_findings, print_json, print_table, print_values
+from scopemap.terminal.options import AsJson, CameraFile, Dataset, Quiet, SetPairs, parse_settings
+from scopemap.terminal.progress import count_progress
 
 if TYPE_CHECKING:
-    from scopemap.inspection.clip import Finding
-    from scopemap.io.source import Source
+    from scopemap.apps.inspect.clip import Finding
+    from scopemap.input.source import Source
 
 app = typer.Typer(help="List the supported data sets; check one.", no_args_is_help=True)
 
@@ -27,7 +27,7 @@ app = typer.Typer(help="List the supported data sets; check one.", no_args_is_he
 @app.command("list")
 def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
     """List the data sets that are read, in the order in which they are recognised."""
-    from scopemap.io.opening import readers
+    from scopemap.input.opening import readers
 
     # A reader's docstrings and its layout's table are the only description of a data set.
     rows = []
@@ -49,8 +49,8 @@ def check(
     quiet: Quiet = False,
 ) -> None:
     """Read a data set once and report errors in its frames, camera, poses and depth; exit code 1 with errors."""
-    from scopemap.config import Config
-    from scopemap.io.opening import open_sequence
+    from scopemap.engine.config import Config
+    from scopemap.input.opening import open_sequence
     from scopemap_bench.datasets.checking import check as findings_of
     from scopemap_bench.datasets.checking import refusal
     from scopemap_bench.datasets.survey import survey

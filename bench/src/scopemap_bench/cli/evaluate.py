@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from scopemap.cli.evaluate import (
+from scopemap.apps.evaluate.command import (
     AgainstVideo,
     AlignBy,
     AlignFirst,
@@ -24,14 +24,14 @@ from scopemap.cli.evaluate import (
     output_form,
     warn_of,
 )
-from scopemap.cli.figures import show
-from scopemap.cli.options import AsJson, InputNow
-from scopemap.errors import CalibrationError, InputError, SettingsError
+from scopemap.engine.errors import CalibrationError, InputError, SettingsError
+from scopemap.terminal.figures import show
+from scopemap.terminal.options import AsJson, InputNow
 
 if TYPE_CHECKING:
     from scopemap.evaluation.poses import MatchedTrajectories
-    from scopemap.io.sequence import Sequence
-    from scopemap.trajectory.trajectory import Trajectory
+    from scopemap.input.sequence import Sequence
+    from scopemap.input.trajectory.trajectory import Trajectory
 
 DepthScaling = Literal["none", "median", "scale-and-shift", "sequence-median", "sequence-scale-and-shift"]
 
@@ -84,8 +84,8 @@ def evaluate(
     offset = offset_of(time_offset)
     from scopemap.evaluation.clock import by_clock
     from scopemap.evaluation.poses import match, pose_report
-    from scopemap.io.reference import read_reference
-    from scopemap.trajectory.formats.opening import read_trajectory
+    from scopemap.result.reference import read_reference
+    from scopemap.result.trajectories import read_trajectory
     from scopemap_bench.climb.submission import with_score
     from scopemap_bench.evaluation.paper import paper_figures
     from scopemap_bench.scoring import depth_groups
@@ -125,8 +125,8 @@ def _surface(trajectory: Path, truth: Path, matched: MatchedTrajectories, *, icp
         if icp:
             raise InputError("--icp needs a run's mesh.ply and a folder with a true surface")
         return {}
-    from scopemap.actions.inputs import open_truth
-    from scopemap.io.opening import open_sequence
+    from scopemap.input.opening import open_sequence
+    from scopemap.runner.frames_again import open_truth
     from scopemap_bench.scoring import surface_figures_of
 
     try:

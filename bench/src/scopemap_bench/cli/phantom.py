@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from scopemap.cli.figures import print_json
-from scopemap.cli.options import AsJson, Quiet, parse_settings, parse_size
-from scopemap.cli.progress import count_progress
+from scopemap.terminal.figures import print_json
+from scopemap.terminal.options import AsJson, Quiet, parse_settings, parse_size
+from scopemap.terminal.progress import count_progress
 
 
 def phantom(

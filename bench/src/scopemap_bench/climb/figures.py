@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from scopemap.engine.geometry.align import align_trajectories
 from scopemap.evaluation.poses import ErrorSummary, associate, relative_errors, translation_errors_mm
-from scopemap.geometry.align import align_trajectories
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.input.trajectory.trajectory import Trajectory
 
 LEAST_FRAMES = 250
 """Frames of the reference that a submap needs to count, 5 s of video; 100 before the challenge's commit 79d7435."""

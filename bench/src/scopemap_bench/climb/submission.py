@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.geometry.rendering import vertex_colours
-from scopemap.io.run_folder import RunFolder, read_mesh
-from scopemap.trajectory.formats.folders import read_run, submap_folders
-from scopemap.trajectory.formats.text import text_lines
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.rendering import vertex_colours
+from scopemap.input.trajectory.text import text_lines
+from scopemap.input.trajectory.trajectory import Trajectory
+from scopemap.result.run_folder import RunFolder, read_mesh
+from scopemap.result.trajectory_folders import read_run, submap_folders
 from scopemap_bench.climb.figures import climb_score
 from scopemap_bench.trajectories.climb import read_submap, write_submap
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.lenses import OmnidirectionalCamera
-from scopemap.errors import InputError
-from scopemap.io.decoding import read_decoded
-from scopemap.trajectory.formats.text import read_poses
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.lenses import OmnidirectionalCamera
+from scopemap.engine.errors import InputError
+from scopemap.input.decoding import read_decoded
+from scopemap.input.trajectory.text import read_poses
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 CAMERA = OmnidirectionalCamera(

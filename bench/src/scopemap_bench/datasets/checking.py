@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.errors import CalibrationError, ScopemapError
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.inspection.clip import Finding, Severity
-from scopemap.io.decoding import frame_number
+from scopemap.apps.inspect.clip import Finding, Severity
+from scopemap.engine.errors import CalibrationError, ScopemapError
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.input.decoding import frame_number
 from scopemap_bench.datasets.survey import (
     OTHERS,
     RIGID_TOLERANCE,

@@ -17,12 +17,12 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.parsing import Fields, calibration_bytes, read_tree
-from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.trajectory.formats.poses import rigid
-from scopemap.trajectory.formats.text import read_numbers
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import CalibrationError, InputError, reporting
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.input.camera_files.parsing import Fields, calibration_bytes, read_tree
+from scopemap.input.trajectory.poses import rigid
+from scopemap.input.trajectory.text import read_numbers
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 _MM_PER_M = 1000.0

@@ -11,10 +11,10 @@ import json
 import re
 from pathlib import Path
 
-from scopemap.cameras.formats.colmap_model import read_largest_model
-from scopemap.cameras.formats.reading import stated_calibration
-from scopemap.errors import InputError, reporting
-from scopemap.trajectory.formats.colmap_poses import camera_poses
+from scopemap.engine.errors import InputError, reporting
+from scopemap.input.camera_files.colmap_model import read_largest_model
+from scopemap.input.camera_files.reading import stated_calibration
+from scopemap.input.trajectory.colmap_poses import camera_poses
 from scopemap_bench.datasets.posed_video import PosedVideo, videos_in
 
 _PROCEDURE = re.compile(r"Seq_\d+")

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import InputError, reporting
-from scopemap.io.decoding import check_pixels
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import InputError, reporting
+from scopemap.input.decoding import check_pixels
 from scopemap_bench.datasets.layouts import Place, UnityFolder
 
 CAMERA = PinholeCamera(472.64955, 472.64955, 479.5, 359.5, 960, 720)

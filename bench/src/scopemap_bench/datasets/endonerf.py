@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.io.images import numbered_images
-from scopemap.notices import Notice
-from scopemap.trajectory.formats.poses import rigid
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import CalibrationError, InputError, reporting
+from scopemap.engine.notices import Notice
+from scopemap.input.images import numbered_images
+from scopemap.input.trajectory.poses import rigid
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 _POSES = ("poses_bounds.npy", "pose_bounds.npy")

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import InputError, check_bytes, reporting
-from scopemap.io.decoding import read_decoded
-from scopemap.trajectory.formats.poses import poses_by_row
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import InputError, check_bytes, reporting
+from scopemap.input.decoding import read_decoded
+from scopemap.input.trajectory.poses import poses_by_row
 from scopemap_bench.datasets.layouts import Place, UnityFolder
 
 UNITY_CAMERA = PinholeCamera(156.0418, 155.7529, 178.5604, 181.8043, 320, 320)

@@ -12,13 +12,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from scopemap.cameras.formats.reading import stated_calibration
-from scopemap.errors import InputError
-from scopemap.frame import TruthQuality
-from scopemap.io.decoding import by_number
-from scopemap.io.images import ImageFolder, image_files, numbered_images
-from scopemap.trajectory.formats.poses import poses_by_row
-from scopemap.trajectory.formats.text import fields_of, text_lines
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import TruthQuality
+from scopemap.input.camera_files.reading import stated_calibration
+from scopemap.input.decoding import by_number
+from scopemap.input.images import ImageFolder, image_files, numbered_images
+from scopemap.input.trajectory.poses import poses_by_row
+from scopemap.input.trajectory.text import fields_of, text_lines
 
 _HEADER = ["tx", "ty", "tz", "rx", "ry", "rz", "rw", "time(s)"]
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])

@@ -16,14 +16,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.parsing import calibration_bytes
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.io.decoding import by_number, read_decoded
-from scopemap.io.images import image_files
-from scopemap.trajectory.formats.poses import are_frame_numbers
-from scopemap.trajectory.formats.text import tum_poses
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import CalibrationError, InputError, reporting
+from scopemap.input.camera_files.parsing import calibration_bytes
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.decoding import by_number, read_decoded
+from scopemap.input.images import image_files
+from scopemap.input.trajectory.poses import are_frame_numbers
+from scopemap.input.trajectory.text import tum_poses
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 from scopemap_bench.datasets.tum import read_stamped
 

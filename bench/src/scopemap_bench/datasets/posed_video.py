@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.frame import TruthQuality
-from scopemap.io.images import use_first_calibration
-from scopemap.io.source import OWN_CALIBRATION, Source, SourceFrame
-from scopemap.io.video import VideoFile
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import TruthQuality
+from scopemap.input.images import use_first_calibration
+from scopemap.input.source import OWN_CALIBRATION, Source, SourceFrame
+from scopemap.input.video import VideoFile
 
 # Even a frame that repeats the one before it takes more, with its entry in the file's index.
 _SMALLEST_FRAME_BYTES = 16

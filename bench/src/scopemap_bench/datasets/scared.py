@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.frame import TruthQuality
-from scopemap.io.decoding import decoded, frame_number
-from scopemap.io.images import ImageFolder, decoded_image, image_files, use_first_calibration
-from scopemap.io.source import OWN_CALIBRATION, Source, SourceFrame
-from scopemap.io.video import VideoFile
+from scopemap.engine.errors import CalibrationError, InputError, reporting
+from scopemap.engine.frame import TruthQuality
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.decoding import decoded, frame_number
+from scopemap.input.images import ImageFolder, decoded_image, image_files, use_first_calibration
+from scopemap.input.source import OWN_CALIBRATION, Source, SourceFrame
+from scopemap.input.video import VideoFile
 from scopemap_bench.trajectories.numbered import NumberedFiles, find_numbered
 from scopemap_bench.trajectories.scared import find_frame_data, read_frame_data, times_of
 

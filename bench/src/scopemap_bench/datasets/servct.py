@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.calibration import check_plausible
-from scopemap.cameras.rectification import Rectifier
-from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.io.images import read_image
-from scopemap.io.source import SourceFrame
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.rectification import Rectifier
+from scopemap.engine.errors import CalibrationError, InputError, reporting
+from scopemap.input.camera_files.calibration import check_plausible
+from scopemap.input.images import read_image
+from scopemap.input.source import SourceFrame
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 _CALIBRATION = "Rectified_calibration"

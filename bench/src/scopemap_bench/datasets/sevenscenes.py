@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.cameras.rectification import DepthSensor
-from scopemap.errors import CalibrationError
-from scopemap.geometry.se3 import inverse, se3
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.rectification import DepthSensor
+from scopemap.engine.errors import CalibrationError
+from scopemap.engine.geometry.se3 import inverse, se3
+from scopemap.input.camera_files.reading import read_calibration
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 from scopemap_bench.trajectories.text import read_seven_scenes_pose
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.trajectory.formats.poses import poses_by_row
-from scopemap.trajectory.formats.text import read_numbers
+from scopemap.engine.errors import InputError
+from scopemap.input.trajectory.poses import poses_by_row
+from scopemap.input.trajectory.text import read_numbers
 from scopemap_bench.datasets.layouts import LayoutFolder, Place, mirrored
 
 DEPTH_RANGE_MM = 200.0

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scopemap.cameras.formats.reading import stated_calibration
-from scopemap.errors import InputError
-from scopemap.trajectory.formats.poses import are_frame_numbers, poses_by_row
-from scopemap.trajectory.formats.text import read_numbers
+from scopemap.engine.errors import InputError
+from scopemap.input.camera_files.reading import stated_calibration
+from scopemap.input.trajectory.poses import are_frame_numbers, poses_by_row
+from scopemap.input.trajectory.text import read_numbers
 from scopemap_bench.datasets.posed_video import PosedVideo, videos_in
 
 _CALIBRATION = "StereoCalibration.ini"

@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.parsing import calibration_bytes
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.errors import CalibrationError, InputError, reporting
-from scopemap.io.decoding import read_decoded
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.engine.errors import CalibrationError, InputError, reporting
+from scopemap.input.camera_files.parsing import calibration_bytes
+from scopemap.input.decoding import read_decoded
 from scopemap_bench.datasets.posed_video import PosedVideo, videos_in
 
 _START, _END = "segmentation/icgstartseg.png", "segmentation/icgendseg.png"

@@ -14,12 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import ScopemapError
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.frame_choice import is_repeat
-from scopemap.io.sequence import Sequence
-from scopemap.trajectory.trajectory import path_length_mm
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import ScopemapError
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.input.frame_choice import is_repeat
+from scopemap.input.sequence import Sequence
+from scopemap.input.trajectory.trajectory import path_length_mm
 
 LAGS, LEAST_OVERLAP = (10, 30, 90), 0.2
 _KEPT_EVERY, _MOST_POINTS = 5, 20_000

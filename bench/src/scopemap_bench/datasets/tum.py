@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.lenses import OpenCvCamera
-from scopemap.errors import InputError, reporting
-from scopemap.io.images import ImageFolder
-from scopemap.trajectory.formats.poses import are_frame_numbers
-from scopemap.trajectory.formats.text import NumberTable, read_numbers, text_lines, tum_poses
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import OpenCvCamera
+from scopemap.engine.errors import InputError, reporting
+from scopemap.input.images import ImageFolder
+from scopemap.input.trajectory.poses import are_frame_numbers
+from scopemap.input.trajectory.text import NumberTable, read_numbers, text_lines, tum_poses
 
 CAMERAS: dict[str, CameraModel] = {
     "1": OpenCvCamera(PinholeCamera(517.3, 516.5, 318.6, 255.3, 640, 480), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),

@@ -19,11 +19,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import SettingsError, check_shape
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import SettingsError, check_shape
+from scopemap.engine.geometry.se3 import inverse, se3, transform
+from scopemap.engine.geometry.warp import moved_depth, pull
 from scopemap.evaluation.poses import ErrorSummary
-from scopemap.geometry.se3 import inverse, se3, transform
-from scopemap.geometry.warp import moved_depth, pull
 from scopemap_bench.evaluation.depth import depth_scale, scale_jitter
 
 FEATURES, RATIO = 1000, 0.8

@@ -16,13 +16,13 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from scopemap.actions.coverage.coverage import Coverage, regions, smoothed
-from scopemap.actions.coverage.layout import Lumen, binned, column_of
-from scopemap.errors import InputError
+from scopemap.apps.coverage.coverage import Coverage, regions, smoothed
+from scopemap.apps.coverage.layout import Lumen, binned, column_of
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.evaluation.poses import match
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.evaluation.true_surface import read_true_surface
 from scopemap_bench.phantom.render import prepare
 from scopemap_bench.phantom.spec import Event, PhantomSpec

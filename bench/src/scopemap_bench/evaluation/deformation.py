@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.actions.inputs import open_truth
-from scopemap.errors import InputError
-from scopemap.geometry.align import Similarity, umeyama
-from scopemap.geometry.se3 import transform
-from scopemap.io.depth_maps import DepthReader
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.tissue_states import TissueStates
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.align import Similarity, umeyama
+from scopemap.engine.geometry.se3 import transform
+from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.result.depth_maps import DepthReader
+from scopemap.result.trajectories import read_trajectory
+from scopemap.runner.frames_again import open_truth
 from scopemap_bench.datasets.d4d import D4dClip, End
 from scopemap_bench.phantom.writer import DISPLACEMENT
 

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from scopemap.errors import SettingsError, check_shape
+from scopemap.engine.errors import SettingsError, check_shape
 
 ImageScaling = Literal["none", "median", "scale-and-shift"]
 DepthScaling = Literal["none", "median", "scale-and-shift", "sequence-median", "sequence-scale-and-shift"]

@@ -13,10 +13,10 @@ from collections import deque
 
 import numpy as np
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.flow.corners import match_corners, usable_pixels
-from scopemap.flow.dis import DisFlow
-from scopemap.geometry.se3 import inverse
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.flow.corners import match_corners, usable_pixels
+from scopemap.engine.flow.dis import DisFlow
+from scopemap.engine.geometry.se3 import inverse
 
 LIMITS_PX = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Median distances between flow and the segments above which frames contradict; the criterion is that of `LIMIT_PX`."""

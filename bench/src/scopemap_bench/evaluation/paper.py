@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from scopemap.engine.geometry.align import Similarity, align_trajectories
 from scopemap.evaluation.poses import (
     ErrorSummary,
     MatchedTrajectories,
@@ -22,7 +23,6 @@ from scopemap.evaluation.poses import (
     rpe_over_path,
     translation_errors_mm,
 )
-from scopemap.geometry.align import Similarity, align_trajectories
 
 _PATH_MM = 10.0
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.cameras.formats.reading import stated_calibration
-from scopemap.io.run_folder import RunFolder
+from scopemap.input.camera_files.reading import stated_calibration
+from scopemap.result.run_folder import RunFolder
 
 _PAIR_PX = 2  # a pixel's depth is the median of those so near
 

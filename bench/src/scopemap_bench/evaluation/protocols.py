@@ -10,6 +10,8 @@ from importlib import resources
 import numpy as np
 from scipy.special import stdtrit
 
+from scopemap.engine.geometry.align import AlignMode, align_trajectories
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.evaluation.poses import (
     ErrorSummary,
     frame_pairs,
@@ -19,9 +21,7 @@ from scopemap.evaluation.poses import (
     rotation_errors_rad,
     translation_errors_mm,
 )
-from scopemap.geometry.align import AlignMode, align_trajectories
-from scopemap.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.trajectory.trajectory import Trajectory
+from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures
 
 _EVO_MODES: tuple[AlignMode, ...] = ("none", "se3", "sim3")

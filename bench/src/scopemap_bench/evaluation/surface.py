@@ -11,9 +11,9 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from scopemap.errors import AlignmentError, check_shape
-from scopemap.geometry.align import Similarity
-from scopemap.geometry.se3 import so3_exp
+from scopemap.engine.errors import AlignmentError, check_shape
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import so3_exp
 
 Surface = np.ndarray | trimesh.Trimesh
 """A mesh, or points (N, 3), mm."""

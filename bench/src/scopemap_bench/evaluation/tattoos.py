@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from scopemap.actions.inputs import open_truth
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.depth_maps import DepthReader
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.result.depth_maps import DepthReader
+from scopemap.result.trajectories import read_trajectory
+from scopemap.runner.frames_again import open_truth
 from scopemap_bench.evaluation.deformation import estimated_displacement
 
 THRESHOLDS_PX = (4, 8, 16, 32, 64)

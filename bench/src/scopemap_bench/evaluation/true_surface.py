@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.cameras.camera import CameraModel
-from scopemap.errors import InputError, reporting
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.decoding import read_decoded
+from scopemap.engine.cameras.camera import CameraModel
+from scopemap.engine.errors import InputError, reporting
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.input.decoding import read_decoded
 from scopemap_bench.evaluation.surface import (
     Surface,
     compare_surfaces,

@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scopemap.config.tracking import TrackingConstants, TrackingSettings
-from scopemap.errors import SettingsError
-from scopemap.frame import Frame
-from scopemap.tracking.track import FrameTracker, Track
-from scopemap.tracking.tracker import Tracker
+from scopemap.engine.config.tracking import TrackingConstants, TrackingSettings
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.frame import Frame
+from scopemap.engine.tracking.track import FrameTracker, Track
+from scopemap.engine.tracking.tracker import Tracker
 
 UNIT_MM = 100.0
 """Length of one Open3D unit, mm."""

@@ -17,12 +17,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scopemap.config import Config
-from scopemap.errors import InputError
-from scopemap.io.sequence import Sequence
-from scopemap.masking.mask_files import create_masks
-from scopemap.masking.masker import Masker
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError
+from scopemap.engine.masking.masker import Masker
+from scopemap.input.mask_files import create_masks
+from scopemap.input.sequence import Sequence
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.methods.imported import write_trajectory
 from scopemap_bench.plan import MethodPlan
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.errors import InputError
+from scopemap.engine.errors import InputError
 from scopemap.evaluation.poses import associate
-from scopemap.io.sequence import Sequence
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import TRACKED, Trajectory, write_tum
+from scopemap.input.sequence import Sequence
+from scopemap.input.trajectory.trajectory import TRACKED, Trajectory, write_tum
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.plan import MethodPlan
 
 

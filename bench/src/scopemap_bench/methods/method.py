@@ -9,13 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scopemap.config import Config
-from scopemap.errors import SettingsError
-from scopemap.estimators import missing_weights
-from scopemap.io.sequence import Sequence
-from scopemap.odometry import Step
+from scopemap.engine.config import Config
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.odometry import Step
+from scopemap.engine.tracking.track import FrameTracker
+from scopemap.input.sequence import Sequence
+from scopemap.runner.estimators import missing_weights
 from scopemap.runner.reconstruct import reconstruct
-from scopemap.tracking.track import FrameTracker
 from scopemap_bench.methods.baselines import Open3dTracker, StandingStill, create_endo_depth_and_motion
 from scopemap_bench.methods.colmap import Colmap
 from scopemap_bench.methods.imported import ImportedTrajectory

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scopemap.cameras.camera import CameraModel
+from scopemap.engine.cameras.camera import CameraModel
 from scopemap_bench.phantom.march import SurfaceBuffers, rays_of
 
 _METAL = np.array([0.50, 0.51, 0.53], np.float32)

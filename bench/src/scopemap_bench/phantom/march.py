@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit, prange
 from scipy import ndimage
 
-from scopemap.cameras.camera import CameraModel
+from scopemap.engine.cameras.camera import CameraModel
 from scopemap_bench.phantom.motion import Displacement
 from scopemap_bench.phantom.slit import gap_at, shift_at
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scopemap.geometry.se3 import mean_near, se3, so3_exp
+from scopemap.engine.geometry.se3 import mean_near, se3, so3_exp
 from scopemap_bench.phantom.slit import UNCUT, cut_until, opened, slit
 from scopemap_bench.phantom.slit import in_grid as slits_in_grid
 from scopemap_bench.phantom.slit import stretch as stretch_of

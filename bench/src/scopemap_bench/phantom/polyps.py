@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scopemap.cameras.camera import CameraModel
-from scopemap.errors import InputError
+from scopemap.engine.cameras.camera import CameraModel
+from scopemap.engine.errors import InputError
 from scopemap_bench.phantom.march import Volume, march
 from scopemap_bench.phantom.motion import REST
 from scopemap_bench.phantom.spec import Polyp

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.trajectory.formats.text import read_poses
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.input.trajectory.text import read_poses
 from scopemap_bench.phantom.instrument import Capsules, insert, instrument
 from scopemap_bench.phantom.march import SurfaceBuffers, Volume, march
 from scopemap_bench.phantom.motion import (

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from av.video.codeccontext import VideoCodecContext
 
-from scopemap.cameras.camera import CameraModel
-from scopemap.errors import SettingsError
-from scopemap.geometry.se3 import inverse, mean_near, transform
+from scopemap.engine.cameras.camera import CameraModel
+from scopemap.engine.errors import SettingsError
+from scopemap.engine.geometry.se3 import inverse, mean_near, transform
 from scopemap_bench.phantom.march import SurfaceBuffers, noise_at, rays_of
 from scopemap_bench.phantom.scenes import Tint
 from scopemap_bench.phantom.spec import EventName

@@ -11,9 +11,9 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.errors import SettingsError
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.errors import SettingsError
+from scopemap.input.camera_files.reading import read_calibration
 
 SceneName = Literal["colon", "laparoscopy", "abdominal_wall", "tube"]
 RouteName = Literal["wander", "sideways", "withdrawal"]

@@ -22,11 +22,11 @@ import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.errors import InputError
-from scopemap.fusion.mesh import marching_cubes
-from scopemap.geometry.lesion_shape import extents
-from scopemap.io.decoding import write_encoded
+from scopemap.engine.errors import InputError
+from scopemap.engine.fusion.mesh import marching_cubes
+from scopemap.engine.geometry.lesion_shape import extents
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.decoding import write_encoded
 from scopemap_bench.phantom.march import Volume
 from scopemap_bench.phantom.render import Phantom, prepare, render_frame
 from scopemap_bench.phantom.shading import VideoCoding

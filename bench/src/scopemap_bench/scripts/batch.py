@@ -183,12 +183,12 @@ def by_slurm(videos: Path, out: Path) -> Iterator[Disturbed]:
 
 def local_jobs(videos: str, out: Path) -> None:
     """Do what `scopemap batch --engine slurm` does, by jobs on this machine."""
-    from scopemap.cli.batch import videos_of
-    from scopemap.io.inputs import named_inputs
-    from scopemap.runner.batch import run_batch
-    from scopemap.runner.engines import WorkerNeeds
+    from scopemap.apps.batch.batch import run_batch
+    from scopemap.apps.batch.command import videos_of
+    from scopemap.apps.batch.engines import WorkerNeeds
+    from scopemap.apps.batch.slurm_engine import SlurmEngine
+    from scopemap.input.inputs import named_inputs
     from scopemap.runner.processes import ProcessLimits
-    from scopemap.runner.slurm_engine import SlurmEngine
 
     chosen = videos_of(named_inputs([videos]), {"preset": "realtime", "camera": CAMERA}, {})
     engine = SlurmEngine(out, WorkerNeeds(cores=1), cluster="local")

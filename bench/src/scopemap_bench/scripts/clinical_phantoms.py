@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.io.depth_maps import DepthReader
-from scopemap.io.opening import open_sequence
+from scopemap.input.opening import open_sequence
+from scopemap.result.depth_maps import DepthReader
 from scopemap_bench.evaluation.depth import DepthFit, evaluate_depth
 from scopemap_bench.scoring import true_pairs
 from scopemap_bench.scripts import measuring

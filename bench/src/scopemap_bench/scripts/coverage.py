@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from scopemap.actions.coverage.coverage import HIDDEN_AREA, Coverage, coverage
+from scopemap.apps.coverage.coverage import HIDDEN_AREA, Coverage, coverage
 from scopemap_bench.evaluation.coverage import (
     CoverageErrors,
     coverage_errors,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from scopemap.io.opening import open_source
+from scopemap.input.opening import open_source
 from scopemap_bench.datasets.stir import StirClip
 from scopemap_bench.evaluation.deformation import structured_light_errors
 from scopemap_bench.evaluation.tattoos import THRESHOLDS_PX, accuracy, followed

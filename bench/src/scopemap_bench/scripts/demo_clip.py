@@ -44,7 +44,7 @@ def write_clip(out: Path, spec: PhantomSpec = SPEC) -> None:
 def main() -> None:
     """Write the clip."""
     parser = options_of(__doc__)
-    parser.add_argument("--out", type=Path, default=Path(scopemap.__file__).parent / "demo_clip")
+    parser.add_argument("--out", type=Path, default=Path(scopemap.__file__).parent / "apps" / "demo" / "clip")
     write_clip(parser.parse_args().out)
 
 

@@ -22,16 +22,16 @@ import numpy as np
 import trimesh
 from scipy.stats import spearmanr
 
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.cameras.rectification import Rectifier, working_camera
-from scopemap.config import DepthSettings, MaskSettings
-from scopemap.depth.scopenet.estimator import ScopeNetDepth
-from scopemap.depth.shading import ShadingDepth
-from scopemap.frame import Frame
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.opening import open_sequence
-from scopemap.masking.mask_files import MaskFiles
-from scopemap.masking.masker import Masker
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.cameras.rectification import Rectifier, working_camera
+from scopemap.engine.config import DepthSettings, MaskSettings
+from scopemap.engine.depth.scopenet.estimator import ScopeNetDepth
+from scopemap.engine.depth.shading import ShadingDepth
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.engine.masking.masker import Masker
+from scopemap.input.mask_files import MaskFiles
+from scopemap.input.opening import open_sequence
 from scopemap_bench.datasets.c3vd import C3vdFolder
 from scopemap_bench.evaluation.depth import evaluate_depth, evaluate_depth_sequence, scale_jitter
 from scopemap_bench.scripts.measuring import options_of, print_head, print_row

@@ -24,10 +24,10 @@ import av
 import cv2
 import numpy as np
 
-from scopemap.geometry.align import align_trajectories
-from scopemap.io.run_folder import RunFolder
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.frame_table import FrameTable
+from scopemap.engine.geometry.align import align_trajectories
+from scopemap.result.frame_table import FrameTable
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.phantom.shading import develop, disturb
 from scopemap_bench.scripts import measuring
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.evaluation.poses import match
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.locating import errors
 

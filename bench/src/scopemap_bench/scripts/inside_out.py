@@ -15,9 +15,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.io.opening import open_sequence
-from scopemap.io.run_folder import RunFolder
-from scopemap.notices import notices_of
+from scopemap.engine.notices import notices_of
+from scopemap.input.opening import open_sequence
+from scopemap.result.run_folder import RunFolder
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.clinical_phantoms import FRAMES, PHANTOMS, SEED
 from scopemap_bench.scripts.real import depth_figures

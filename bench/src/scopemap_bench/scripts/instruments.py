@@ -18,9 +18,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.actions.against_video import RunFrames
-from scopemap.actions.inputs import open_input
-from scopemap.masking.mask_files import MaskFiles
+from scopemap.apps.evaluate.against_video import RunFrames
+from scopemap.input.mask_files import MaskFiles
+from scopemap.runner.frames_again import open_input
 from scopemap_bench.scripts import measuring
 
 EVENTS = "instrument:10-40,instrument:50-75"

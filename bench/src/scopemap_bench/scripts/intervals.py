@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from scopemap.actions.inputs import open_truth
-from scopemap.actions.measure import measure
-from scopemap.cameras.camera import PinholeCamera
-from scopemap.errors import InputError
-from scopemap.geometry.surface_measures import area_inside
+from scopemap.apps.measure.measure import measure
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.surface_measures import area_inside
+from scopemap.runner.frames_again import open_truth
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.overview import clips, drawn
 

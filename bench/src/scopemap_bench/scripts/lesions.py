@@ -17,11 +17,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from scopemap.actions.inputs import open_truth
-from scopemap.actions.lesion import measure_lesion
-from scopemap.actions.measure import Known, Measure
-from scopemap.errors import InputError
-from scopemap.frame import Frame
+from scopemap.apps.measure.lesion import measure_lesion
+from scopemap.apps.measure.measure import Known, Measure
+from scopemap.engine.errors import InputError
+from scopemap.engine.frame import Frame
+from scopemap.runner.frames_again import open_truth
 from scopemap_bench.scripts import measuring
 
 SEEDS, FRAMES, AT = (*range(401, 410), 411, 413, 415), 48, (8, 20, 32, 44)

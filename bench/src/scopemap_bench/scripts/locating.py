@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3
 from scopemap.evaluation.poses import match
-from scopemap.geometry.se3 import inverse, rotation_angle_rad, se3
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.scripts import measuring
 
 PHANTOM_FRAMES = 150

@@ -21,11 +21,11 @@ from pathlib import Path
 import av
 import numpy as np
 
-from scopemap.config import Config
-from scopemap.io.live_source import LiveSource
-from scopemap.io.opening import open_sequence, sequence_of
-from scopemap.odometry import Step
-from scopemap.runner.live import LiveSession, finished
+from scopemap.apps.live.live import LiveSession, finished
+from scopemap.engine.config import Config
+from scopemap.engine.odometry import Step
+from scopemap.input.live_source import LiveSource
+from scopemap.input.opening import open_sequence, sequence_of
 from scopemap.runner.reconstructor import Reconstructor
 from scopemap_bench.scripts import measuring
 

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.io.opening import open_sequence
-from scopemap.io.run_folder import RunFolder
-from scopemap.report.verdict import verdict
-from scopemap.trajectory.trajectory import ASSUMED_FRAMES_PER_S
+from scopemap.input.opening import open_sequence
+from scopemap.input.trajectory.trajectory import ASSUMED_FRAMES_PER_S
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.verdict import verdict
 from scopemap_bench.evaluation.depth import DepthFit, compared_depths, depth_scale, evaluate_depth
 from scopemap_bench.evaluation.partial_truth import drift, pairs_in_order
 from scopemap_bench.scripts import measuring

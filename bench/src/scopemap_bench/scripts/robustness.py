@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import scopemap.runner.checkpoints as checkpoints
-from scopemap.config import Config
-from scopemap.errors import ScopemapError
-from scopemap.io.opening import open_sequence
+from scopemap.engine.config import Config
+from scopemap.engine.errors import ScopemapError
+from scopemap.input.opening import open_sequence
 from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.scripts import batch, measuring
 

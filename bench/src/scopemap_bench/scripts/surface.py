@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.actions.inputs import open_truth
-from scopemap.fusion.agreement import compare_with_frame
-from scopemap.geometry.rendering import render_mesh
-from scopemap.geometry.se3 import inverse, transform
-from scopemap.io.depth_maps import DepthReader
-from scopemap.trajectory.formats.opening import read_trajectory
+from scopemap.engine.fusion.agreement import compare_with_frame
+from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.result.depth_maps import DepthReader
+from scopemap.result.trajectories import read_trajectory
+from scopemap.runner.frames_again import open_truth
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.overview import PHANTOMS, Clip, clips, drawn
 

@@ -4,7 +4,7 @@
 
 Phantoms of 120 frames are given as plain pictures, every fourth. First table: lenses of the models that are tried.
 Second table: lenses of endoscopes as published; the median over `SEEDS` of how far fx at the picture's centre is off.
-A lens that is the source of its kind's prior (`scopemap.cameras.scopes`) is marked; its kind cannot be wrong on it.
+A lens that is the source of its kind's prior (`scopemap.input.scopes`) is marked; its kind cannot be wrong on it.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from scopemap.calibration.focal_length.from_motion import with_focal_from_motion
-from scopemap.cameras.camera import CameraModel, PinholeCamera
-from scopemap.cameras.formats.writing import write_calibration
-from scopemap.cameras.lenses import FisheyeCamera, OpenCvCamera
-from scopemap.cameras.rectification import working_size
-from scopemap.cameras.scopes import KINDS
-from scopemap.config import Config
-from scopemap.io.opening import open_sequence
-from scopemap.io.sequence import Sequence
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.lenses import FisheyeCamera, OpenCvCamera
+from scopemap.engine.cameras.rectification import working_size
+from scopemap.engine.config import Config
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.focal_length.from_motion import with_focal_from_motion
+from scopemap.input.opening import open_sequence
+from scopemap.input.scopes import KINDS
+from scopemap.input.sequence import Sequence
 from scopemap_bench.datasets import c3vd
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec, SceneName

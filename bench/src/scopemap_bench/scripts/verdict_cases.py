@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.cameras.formats.writing import write_calibration
+from scopemap.input.camera_files.writing import write_calibration
 from scopemap_bench.datasets.c3vd import CAMERA
 from scopemap_bench.scripts import overview
 

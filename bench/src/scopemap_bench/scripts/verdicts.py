@@ -23,16 +23,16 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from scopemap.cameras.formats.reading import read_calibration
-from scopemap.errors import AlignmentError
+from scopemap.engine.errors import AlignmentError
 from scopemap.evaluation.clock import read_later
 from scopemap.evaluation.poses import match
-from scopemap.io.opening import open_sequence
-from scopemap.io.reference import read_reference
-from scopemap.io.run_folder import RunFolder
-from scopemap.report.verdict import verdict
-from scopemap.trajectory.formats.opening import read_trajectory
-from scopemap.trajectory.trajectory import path_length_mm
+from scopemap.input.camera_files.reading import read_calibration
+from scopemap.input.opening import open_sequence
+from scopemap.input.trajectory.trajectory import path_length_mm
+from scopemap.result.reference import read_reference
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.trajectories import read_trajectory
+from scopemap.result.verdict import verdict
 from scopemap_bench.evaluation.partial_truth import drift, pairs_in_order
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.verdict_cases import Case, phantom_cases, real_cases

@@ -3,8 +3,8 @@
 import zipfile
 from functools import partial
 
-from scopemap.trajectory.formats.opening import TrajectoryFormat
-from scopemap.trajectory.formats.text import read_kitti
+from scopemap.input.trajectory.text import read_kitti
+from scopemap.result.trajectories import TrajectoryFormat
 from scopemap_bench.trajectories import climb, scared, splatam, text
 
 FORMATS = (

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scopemap.errors import InputError, reporting
-from scopemap.trajectory.formats.colmap_poses import read_colmap
-from scopemap.trajectory.formats.poses import from_quaternions, stamped
-from scopemap.trajectory.formats.text import text_lines
-from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
+from scopemap.engine.errors import InputError, reporting
+from scopemap.input.trajectory.colmap_poses import read_colmap
+from scopemap.input.trajectory.poses import from_quaternions, stamped
+from scopemap.input.trajectory.text import text_lines
+from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
 CLIMB_FILES = ("camera_trajectory/cam_traj_map_*.txt", "results_txt/images.txt")
 SCALES_FILE = "scales.csv"

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
-from scopemap.errors import check_bytes, reporting
+from scopemap.engine.errors import check_bytes, reporting
 
 LARGEST_FILE_BYTES = 256 << 20
 _MOST_MEMBERS, _LARGEST_HEADER_BYTES = 200_000, 1 << 20

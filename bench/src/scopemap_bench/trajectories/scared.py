@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.geometry.se3 import inverse
-from scopemap.trajectory.formats.poses import rigid, stamped
-from scopemap.trajectory.trajectory import Trajectory, Unit
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.input.trajectory.poses import rigid, stamped
+from scopemap.input.trajectory.trajectory import Trajectory, Unit
 from scopemap_bench.trajectories.numbered import ARCHIVES, ArchiveFiles, NumberedFiles, find_numbered
 
 _PREFIX, _SUFFIXES = "frame_data", (".json",)

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.errors import InputError, check_bytes, reporting
-from scopemap.geometry.se3 import inverse
-from scopemap.trajectory.formats.poses import file_of, from_quaternions, rigid, stamped
-from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
+from scopemap.engine.errors import InputError, check_bytes, reporting
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.input.trajectory.poses import file_of, from_quaternions, rigid, stamped
+from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
 PARAMS_FILE = "params.npz"
 _ARRAYS = ("cam_unnorm_rots", "cam_trans")

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.errors import InputError
-from scopemap.geometry.se3 import inverse
-from scopemap.trajectory.formats.poses import are_frame_numbers, file_of, rigid, stamped
-from scopemap.trajectory.formats.text import fields_of, read_numbers, read_rows, text_lines, tum_poses
-from scopemap.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.input.trajectory.poses import are_frame_numbers, file_of, rigid, stamped
+from scopemap.input.trajectory.text import fields_of, read_numbers, read_rows, text_lines, tum_poses
+from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
 LOG_FILE = "trajectory.log"
 ONESLAM_FILES = ("poses_pred.txt", "poses_gt.txt")

@@ -1,1 +1,0 @@
-"""Methods side by side on the same sequences: plans, resumable runs, scores, tables, figures."""

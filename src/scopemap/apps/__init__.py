@@ -1,0 +1,1 @@
+"""Applications: each folder is one, with its command."""

@@ -1,0 +1,1 @@
+"""A camera from pictures of a board."""

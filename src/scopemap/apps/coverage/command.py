@@ -1,0 +1,65 @@
+"""`scopemap coverage`: which share of the tissue was never seen, and where."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scopemap.terminal import options
+from scopemap.terminal.figures import print_json
+
+
+def coverage(
+    run: Annotated[Path, typer.Argument(metavar="RESULT", help="Folder of a run, or of a submap, result/maps/1.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where map and figures go; default: RESULT/coverage.")
+    ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write the blind spots for 3D Slicer, .mrk.json, or as a DICOM report, .dcm."
+        ),
+    ] = None,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Estimate which share of the tissue no frame saw, with an interval of 90 %, and list where.
+
+    Writes coverage.json, map.csv, map.png and coverage.ply. Calibrated on synthetic colons and cavities; not for
+    decisions about a patient.
+    """
+    from scopemap.report.page import PAGE, write_report
+    from scopemap.report.page_data import COVERAGE
+
+    folder = out or run / COVERAGE
+    files = {name: folder / name for name in ("coverage.json", "map.csv", "map.png", "coverage.ply")}
+    for file in files.values():
+        options.check_output(file, (file.suffix,), overwrite)
+    from scopemap.apps.coverage.coverage import coverage as covered
+    from scopemap.apps.measure.findings import FINDING_ENDINGS, write_findings
+    from scopemap.engine.errors import reporting
+    from scopemap.result.json_numbers import without_nan
+
+    if export is not None:
+        options.check_output(export, FINDING_ENDINGS, overwrite)
+    found = covered(run)
+    with reporting(f"cannot write to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(without_nan(found.facts), indent=2) + "\n"
+        files["coverage.json"].write_text(text, encoding="utf-8")
+    found.map.write(files["map.csv"])
+    found.draw(files["map.png"])
+    found.write_surface(files["coverage.ply"])
+    if export is not None:
+        write_findings(run, found.findings, found.scale, export)
+    if out is None and (run / PAGE).is_file():
+        write_report(run)
+    if as_json:
+        print_json(found.facts | {"out": str(folder)})
+    elif not quiet:
+        typer.echo(str(found))
+        typer.echo(f"{folder}: {', '.join(files)}")

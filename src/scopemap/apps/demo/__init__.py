@@ -1,0 +1,1 @@
+"""A phantom, a run, an evaluation: the first minute."""

@@ -1,0 +1,1 @@
+"""A result against a truth, or against its own video."""

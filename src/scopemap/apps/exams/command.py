@@ -1,0 +1,48 @@
+"""`scopemap compare-exams`: two examinations in one frame of reference, and what changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scopemap.terminal import options
+from scopemap.terminal.figures import print_json
+
+
+def compare_exams(
+    first: Annotated[Path, typer.Argument(metavar="FIRST", help="Folder of the first examination's run.")],
+    second: Annotated[Path, typer.Argument(metavar="SECOND", help="Folder of the second one's.")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the page, its pictures and tables go.")],
+    source: options.InputNow = None,
+    second_input: Annotated[
+        Path | None, typer.Option("--second-input", metavar="INPUT", help="Where the second one's input is now.")
+    ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a film along the first one's path, coloured by what changed."),
+    ] = None,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Bring two examinations of the same place together: matched views, what changed, what only one of them saw."""
+    options.check_output(out / "compare.html", (".html",), overwrite)
+    from scopemap.apps.exams.change_painting import change_painting
+    from scopemap.apps.exams.compare_exams import compare_exams as compare
+    from scopemap.apps.exams.exams_page import PAGE, facts_of, summary, write_comparison
+    from scopemap.apps.view.fly_through import write_fly_through
+    from scopemap.result.run_folder import RunFolder
+
+    found = compare(first, second, source, second_input)
+    write_comparison(found, first, second, out)
+    if video is not None:
+        write_fly_through(first, video, source, change_painting(first, found))
+    run = RunFolder(first)
+    if as_json:
+        print_json(facts_of(found, "mm" if run.scale_known else "unit"))
+    elif not quiet:
+        for line in summary(found, run.scale):
+            typer.echo(line)
+        typer.echo(f"look at {out / PAGE}")

@@ -1,0 +1,97 @@
+"""The formats of `scopemap export`: what each is written to, and in which units and axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from scopemap.apps.export.dicom_stl import write_dicom_stl
+from scopemap.apps.export.image_layouts import write_colmap, write_endogslam, write_endonerf, write_nerfstudio
+from scopemap.apps.export.mcap_bag import write_mcap
+from scopemap.apps.export.points import write_gaussians, write_points
+from scopemap.apps.export.surfaces import Axes, write_glb, write_slicer, write_surface, write_surfaces
+from scopemap.apps.export.trajectories import write_euroc_file, write_kitti_folder
+from scopemap.engine.errors import InputError, SettingsError
+from scopemap.input.trajectory.trajectory import Unit, write_tum
+from scopemap.runner.exported_run import ExportedRun, read_exported
+
+Write = Callable[[ExportedRun, Path, Unit, Axes], None]
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format: how it is written, its possible units and axes, the default first, and the ending of its file.
+
+    Without an ending it is a folder.
+    """
+
+    write: Write
+    units: tuple[Unit, ...]
+    axes: tuple[Axes, ...] = ("opencv",)
+    ending: str = ""
+
+
+_ANY_AXES: tuple[Axes, ...] = ("lps", "ras", "opencv", "gltf")
+FORMATS: dict[str, ExportFormat] = {
+    "nerfstudio": ExportFormat(lambda run, out, unit, axes: write_nerfstudio(run, out), ("m",)),
+    "colmap": ExportFormat(lambda run, out, unit, axes: write_colmap(run, out, unit), ("mm", "m")),
+    "endogslam": ExportFormat(lambda run, out, unit, axes: write_endogslam(run, out), ("mm",)),
+    "endonerf": ExportFormat(lambda run, out, unit, axes: write_endonerf(run, out), ("mm",)),
+    "tum": ExportFormat(
+        lambda run, out, unit, axes: write_tum(out, run.trajectory, unit=unit, comment=run.scale),
+        ("m", "mm"),
+        ending=".txt",
+    ),
+    "kitti": ExportFormat(lambda run, out, unit, axes: write_kitti_folder(run, out, unit), ("m", "mm")),
+    "euroc": ExportFormat(lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv"),
+    "ply": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".ply"),
+    "surfaces": ExportFormat(write_surfaces, ("mm", "m"), _ANY_AXES),
+    "obj": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".obj"),
+    "stl": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".stl"),
+    "glb": ExportFormat(lambda run, out, unit, axes: write_glb(run, out), ("m",), ("gltf",), ".glb"),
+    "slicer": ExportFormat(lambda run, out, unit, axes: write_slicer(run, out), ("mm",), ("lps",)),
+    "pointcloud": ExportFormat(lambda run, out, unit, axes: write_points(run, out, unit), ("mm", "m"), ending=".ply"),
+    "gaussians": ExportFormat(lambda run, out, unit, axes: write_gaussians(run, out, unit), ("mm", "m"), ending=".ply"),
+    "mcap": ExportFormat(lambda run, out, unit, axes: write_mcap(run, out), ("m",), ending=".mcap"),
+    "dicom": ExportFormat(write_dicom_stl, ("mm", "m"), ("lps",), ".dcm"),
+}
+
+
+def export_run(
+    folder: Path,
+    name: str,
+    out: Path,
+    unit: Unit | None = None,
+    axes: Axes | None = None,
+    *,
+    source: Path | None = None,
+) -> str:
+    """Write the run in `folder` as the format with this name, and return what is known of its scale, in words.
+
+    unit, axes : None for the format's own. source : where the run's input is now; else it is looked for. Frames that
+    are lost or in another submap are left out. Raises `SettingsError` for units and axes that the format does not have,
+    `InputError` where `out` is there already, cannot be written, or the run lacks what the format needs.
+    """
+    form = FORMATS[name]
+    for option, given, possible in (("units", unit, form.units), ("axes", axes, form.axes)):
+        if given is not None and given not in possible:
+            raise SettingsError(f"--{option} {given}: {name} has {' or '.join(possible)}")
+    if form.ending and out.suffix.lower() != form.ending:
+        raise InputError(f"cannot write {out}: its name must end in {form.ending}")
+    if out.is_file() or (out.is_dir() and (form.ending or any(out.iterdir()))):
+        raise InputError(f"{out} exists; give another name with --out")
+    run = read_exported(folder, source)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        # An export that fails or is stopped leaves nothing.
+        with TemporaryDirectory(dir=out.parent, prefix=".unfinished-") as place:
+            unfinished = Path(place) / out.name
+            form.write(run, unfinished, unit or form.units[0], axes or form.axes[0])
+            if out.is_dir():
+                out.rmdir()
+            unfinished.rename(out)
+    except OSError as error:
+        raise InputError(f"cannot write {out}: {error.strerror or error}") from None
+    return run.scale

@@ -1,0 +1,104 @@
+"""The surface as PLY, OBJ, STL and GLB, and surface and path for 3D Slicer.
+
+3D Slicer reads the axes of a mesh from `SPACE=LPS` or `SPACE=RAS` in a PLY's or OBJ's comment or an STL's header, and
+takes LPS without it (Libs/MRML/Core/vtkMRMLModelStorageNode.cxx); a path is a markups file, markups-schema-v1.0.3.json.
+
+One camera does not know how the patient lies. LPS here is the world's own x, y, z: right as for a patient on the back,
+seen from the feet by an upright camera that looks towards the head (x to the left, y to the back, z to the head).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+
+from scopemap.apps.export.slicer_markups import markup, write_markups
+from scopemap.engine.errors import InputError
+from scopemap.engine.fusion.mesh_files import ply_bytes, save_mesh
+from scopemap.engine.geometry.rendering import vertex_colours
+from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit
+from scopemap.runner.exported_run import ExportedRun
+
+Axes = Literal["lps", "ras", "opencv", "gltf"]
+# World to the axes of a file; all are rotations, so triangles keep their front.
+_R_FILE_WORLD = {
+    "lps": np.diag([1.0, 1.0, 1.0]),
+    "ras": np.diag([-1.0, -1.0, 1.0]),
+    "opencv": np.diag([1.0, 1.0, 1.0]),
+    "gltf": np.diag([1.0, -1.0, -1.0]),
+}
+_AXES_IN_WORDS = {
+    "lps": "SPACE=LPS",
+    "ras": "SPACE=RAS",
+    "opencv": "axes: OpenCV (x right, y down, z forward)",
+    "gltf": "axes: glTF (x right, y up, z backward)",
+}
+_STL_HEADER_BYTES = 80
+
+
+def write_surface(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> None:
+    """Write the mesh as `file`, whose name ends in .ply, .obj or .stl; the last has no colours and no space for much.
+
+    Raises `InputError` where the run has no surface.
+    """
+    ending = file.suffix.lower()
+    if ending == ".stl":
+        file.write_bytes(stl_bytes(run, unit, axes))
+        return
+    mesh, about = _surface_of(run, unit, axes), _about(run, unit, axes)
+    if ending == ".ply":
+        file.write_bytes(ply_bytes(mesh, about))
+    else:
+        text = trimesh.exchange.obj.export_obj(mesh, header=None)
+        file.write_text("".join(f"# {line}\n" for line in about) + text, encoding="utf-8")
+
+
+def write_surfaces(run: ExportedRun, folder: Path, unit: Unit, axes: Axes) -> None:
+    """Write the surface in the state of each tracked frame, as `000000.ply`, ..., named by the frame's number.
+
+    Raises `InputError` where the run has no surface, or its tissue is taken to be at rest.
+    """
+    if run.states is None:
+        raise InputError(f"{run.path}: its tissue is taken to be at rest; export its one surface as ply")
+    folder.mkdir(parents=True, exist_ok=True)
+    shown, about, R = _surface_of(run, unit, axes), _about(run, unit, axes), _R_FILE_WORLD[axes]
+    for index in run.trajectory.indices.tolist():
+        shown.vertices = run.states.moved(run.mesh, index).vertices @ R.T / MM_PER_UNIT[unit]
+        (folder / f"{index:06d}.ply").write_bytes(ply_bytes(shown, about))
+
+
+def stl_bytes(run: ExportedRun, unit: Unit, axes: Axes) -> bytes:
+    """Return the mesh as binary STL. Raises `InputError` where the run has no surface."""
+    content = trimesh.exchange.stl.export_stl(_surface_of(run, unit, axes))
+    # Not all of the scale's words fit; a binary STL must not begin with "solid".
+    header = "; ".join(_about(run, unit, axes)).encode("ascii", "replace")[:_STL_HEADER_BYTES]
+    return header.ljust(_STL_HEADER_BYTES) + content[_STL_HEADER_BYTES:]
+
+
+def write_glb(run: ExportedRun, file: Path) -> None:
+    """Write the mesh as GLB: metres and y up, which glTF prescribes."""
+    save_mesh(_surface_of(run, "mm", "opencv"), glb_file=file, comment=run.scale)
+
+
+def write_slicer(run: ExportedRun, folder: Path) -> None:
+    """Write `surface.ply` and the camera's path as the open curve `path.mrk.json`, both LPS and mm."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_surface(run, folder / "surface.ply", "mm", "lps")
+    positions = run.trajectory.positions_mm @ _R_FILE_WORLD["lps"].T
+    points = {f"frame {index}": at for index, at in zip(run.trajectory.indices, positions, strict=True)}
+    write_markups([markup("Curve", "camera path", points, run.scale)], folder / "path.mrk.json")
+
+
+def _about(run: ExportedRun, unit: Unit, axes: Axes) -> list[str]:
+    return [_AXES_IN_WORDS[axes], f"unit: {unit}", run.scale]
+
+
+def _surface_of(run: ExportedRun, unit: Unit, axes: Axes) -> trimesh.Trimesh:
+    if not len(run.mesh.faces):
+        raise InputError(f"{run.path}: the run has no surface to export")
+    vertices = run.mesh.vertices @ _R_FILE_WORLD[axes].T / MM_PER_UNIT[unit]
+    colours, attributes = vertex_colours(run.mesh), run.vertex_attributes(unit)
+    return trimesh.Trimesh(vertices, run.mesh.faces, vertex_colors=colours, vertex_attributes=attributes, process=False)

@@ -1,0 +1,216 @@
+"""Findings about a video's frames: time stamps, repeated, blank, blurred, badly exposed frames, odd colours, motion.
+
+Each check takes a `Clip` and yields findings, with the option that answers each as its advice. The limits of motion and
+texture separate clips that runs track whole (correlation above 0.84, motion below 2 % of width, sharpness above 0.015)
+from a colonoscopy and a bare tube of which they lost most frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from scopemap.apps.inspect.clip import Clip, Segment, VideoFinding, covered, segments_of
+from scopemap.input.video_format.interlacing import is_interlaced
+from scopemap.input.video_format.stereo_packing import Packing
+
+_BLACK_LEVEL = 16.0
+# Shares of the video's usual sharpness: of a blurred frame, of a soft one. No texture: sharpness of the usual frame.
+_BLURRED_SHARE, _SOFT_SHARE, _NO_TEXTURE = 0.35, 0.6, 0.008
+# Mean red over the stronger of green and blue, of tissue in white light.
+_LEAST_REDNESS, _MOSTLY = 1.1, 0.9
+_UNEVEN, _UNEVEN_SHARE, _HOLE = 0.2, 0.05, 1.5
+_LENGTH_SHARE, _LENGTH_S = 0.05, 1.0
+_FAST_HZ, _SLOW_MOTION = 45.0, 0.004
+_FAST = 0.05  # motion per frame, share of the width
+_UNLIKE, _CUT, _LIKE = 0.6, 0.2, 0.7  # correlation with the frame before
+_SOME, _MANY = 0.05, 0.25  # shares of the frames
+_EXPOSURES = (
+    ("clipped", 0.1, "over-exposed"),
+    ("dark", 0.5, "under-exposed"),
+    ("highlights", 0.1, "specular highlights"),
+)
+
+
+def check_timing(clip: Clip, claimed_s: float | None) -> Iterator[VideoFinding]:
+    """Yield what is wrong with the time stamps; `claimed_s` is the length in the file's header, s, or None."""
+    steps_s = clip.steps_s
+    if steps_s.size < 2:
+        return
+    back = tuple((int(i) + 1, int(i) + 1) for i in np.flatnonzero(steps_s <= 0))
+    if back:
+        message = f"{len(back)} time stamps are not later than the one before (frames {{positions}})"
+        yield clip.finding(
+            "warning", "time-order", message, back, "poses keep their order; take no speeds from the time stamps"
+        )
+        return
+    usual_s = float(np.median(steps_s))
+    before = np.flatnonzero(steps_s > _HOLE * usual_s)
+    if 0 < before.size <= _UNEVEN_SHARE * len(clip):
+        lost = int(np.round((steps_s[before] / usual_s - 1) * np.diff(clip["position"])[before]).sum())
+        what = "time stamps leave" if clip.stamped else "numbers in the names leave"
+        message = f"{what} {before.size} hole(s), about {lost} picture(s) were dropped (between frames {{positions}})"
+        yield clip.finding("warning", "frames-dropped", message, tuple((int(i), int(i) + 1) for i in before))
+    if not clip.stamped:
+        return
+    if claimed_s is not None and (clip.selection.start or 0, clip.selection.stop, clip.step) == (0, None, 1):
+        read_s = float(np.ptp(clip["time_s"])) + usual_s
+        if abs(read_s - claimed_s) > max(_LENGTH_S, _LENGTH_SHARE * claimed_s):
+            message = f"the file's header claims {claimed_s:.1f} s, its pictures last {read_s:.1f} s"
+            advice = "what can be read is used; copy the file again if it is cut off"
+            yield VideoFinding("warning", "length-claimed", message, advice)
+    # A hole is no variable rate.
+    rest = np.abs(steps_s[steps_s < _HOLE * usual_s] / usual_s - 1)
+    if (rest > _UNEVEN).mean() > _UNEVEN_SHARE:
+        low, high = 1 / np.percentile(steps_s, [95, 5])
+        message = f"variable rate: {low:.3g} to {high:.3g} pictures per second, usually {1 / usual_s:.3g}"
+        yield VideoFinding("info", "rate-variable", message, "runs use the time stamps; --fps thins out by them, too")
+    if clip.rate_hz >= _FAST_HZ and np.median(clip["motion"]) < _SLOW_MOTION * clip.step:
+        message = f"{clip.rate_hz:.3g} pictures per second, between which hardly anything moves"
+        yield VideoFinding("info", "rate-high", message, f"--fps {clip.rate_hz / 2:.3g} halves the work")
+
+
+def check_packing(packed: Packing | None, pictures: list[np.ndarray]) -> Iterator[VideoFinding]:
+    """Yield whether a picture holds two views (stereo), or two fields of different times (interlaced).
+
+    `pictures` are some of the video, (H, W, 3) uint8; interlacing shows only where something moves.
+    """
+    if packed is not None:
+        where = "beside" if packed.layout == "left-right" else "above"
+        squeezed = ", each squeezed to half its size" if packed.squeezed else ""
+        correlation = f"(correlation {packed.correlation:.2f})"
+        message = f"two views {where} each other{squeezed} {correlation}; the rest is about the first"
+        yield VideoFinding("warning", "stereo", message, f"--stereo {packed.layout}")
+    if pictures and is_interlaced(pictures):
+        message = "interlaced: odd and even rows show two moments, edges of what moves look like combs"
+        yield VideoFinding("warning", "interlaced", message, "--deinterlace")
+
+
+def check_repeats(clip: Clip) -> Iterator[VideoFinding]:
+    """Yield duplicates, as conversions between rates make them, and frozen segments."""
+    frozen = clip.segments(clip.repeats, seconds=0.3, least=4)
+    single = segments_of(clip.repeats & ~covered(frozen, len(clip)))
+    advice = "runs leave them out (--set input.skip_duplicates=false keeps them)"
+    if frozen:
+        yield clip.finding("warning", "frozen", "the picture is frozen for {frames}", frozen, advice)
+    if single:
+        message = f"the same picture as before: {{frames}}{_rhythm(single) if clip.step == 1 else ''}"
+        yield clip.finding("info", "duplicates", message, single, advice)
+
+
+def _rhythm(single: tuple[Segment, ...]) -> str:
+    """Return the interval in words where duplicates come at an even pace, as from 25 to 30 frames per second."""
+    steps = np.diff([first for first, _ in single])
+    if steps.size < 3 or np.percentile(steps, 90) - np.percentile(steps, 10) > 1:
+        return ""
+    return f", about every {np.median(steps):.0f}th: the video was converted to a higher rate"
+
+
+def check_frames(clip: Clip) -> Iterator[VideoFinding]:
+    """Yield which frames are blank, blurred, of another colour than tissue, or badly exposed."""
+    blank, black, sharpness = clip["blank"], clip["brightness"] <= _BLACK_LEVEL, clip["sharpness"]
+    for flags, code, words in ((blank & black, "black", "black"), (blank & ~black, "one-colour", "of one colour")):
+        if segments := segments_of(flags):
+            yield clip.finding("warning", code, f"{words}: {{frames}}", segments, "{selection}")
+    usual = np.median(sharpness[~blank]) if not blank.all() else 0.0
+    if segments := clip.segments(~blank & (sharpness < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2):
+        share = np.median(sharpness[covered(segments, len(clip))]) / usual
+        message = (
+            f"blurred, or without texture: {{frames}} show {share:.0%} of the usual sharpness (a smear on "
+            "the lens, defocus, or tissue very near)"
+        )
+        yield clip.finding("warning", "blurred", message, segments, "{selection}")
+    flags = ~blank & (clip["redness"] < _LEAST_REDNESS)
+    if segments := clip.segments(flags, seconds=0.3, least=4, gap=3):
+        advice = "look at them; narrow-band light is fine to run on"
+        message = "not the colour of tissue in white light (outside the patient, or narrow-band light): {frames}"
+        if np.mean(flags) > _MOSTLY:
+            message = (
+                "hardly any picture has the colour of tissue in white light: is it narrow-band light, or no tissue?"
+            )
+        elif not covered(segments, len(clip)).all():
+            advice += ", else {selection}"
+        yield clip.finding("warning", "not-tissue", message, segments, advice)
+    for name, most, words in _EXPOSURES:
+        if segments := clip.segments(~blank & (clip[name] > most), seconds=0.15, least=3, gap=2):
+            worst = float(np.max(clip[name][~blank]))
+            message = f"more than {most:.0%} of the field is {words} in {{frames}}, {worst:.0%} at worst"
+            yield clip.finding("info", name, message, segments)
+
+
+def exposure_figures(clip: Clip) -> dict[str, float]:
+    """Return median shares over the frames that are not blank: over-exposed, under-exposed, highlights, usable."""
+    shown = ~clip["blank"]
+    names = {"clipped": "over_exposed", "dark": "under_exposed", "highlights": "highlights", "usable": "usable"}
+    return {f"{name}_share": float(np.median(clip[key][shown])) if shown.any() else 0.0 for key, name in names.items()}
+
+
+def _dangers(clip: Clip) -> tuple[dict[str, np.ndarray], bool]:
+    """Return flags of the frames that were read, (N,) bool each, and whether the video is without texture.
+
+    fast : the picture moves by more than 5 % of its width. unlike : hardly like the frame before, moved by its flow.
+    cut : so unlike, between frames that are like their neighbours; not in `unlike`. soft : less than 0.6 of the usual
+    sharpness, but more than a blurred frame. Blank and repeated frames, which runs leave out, are in none of them.
+    """
+    shown = ~clip["blank"] & ~clip.repeats
+    correlation, sharpness = clip["correlation"], clip["sharpness"]
+    usual = float(np.median(sharpness[shown])) if shown.any() else 0.0
+    # A picture after a blank or an unreadable one resembles nothing.
+    gap = np.diff(clip["position"]) > clip.step
+    follows = shown & ~np.concatenate([[True], clip["blank"][:-1] | gap])
+    around = np.minimum(np.concatenate([[1.0], correlation[:-1]]), np.concatenate([correlation[1:], [1.0]]))
+    cut = follows & (correlation < _CUT) & (around > _LIKE)
+    flags = {
+        "cut": cut,
+        "fast": follows & (clip["motion"] > _FAST),
+        "unlike": follows & (correlation < _UNLIKE) & ~cut,
+        "soft": shown & (sharpness < _SOFT_SHARE * usual) & (sharpness >= _BLURRED_SHARE * usual),
+    }
+    return flags, usual < _NO_TEXTURE
+
+
+def check_dangers(clip: Clip) -> Iterator[VideoFinding]:
+    """Yield what may make a run lose frames: of what was read, so of every n-th frame where these were selected."""
+    flags, textureless = _dangers(clip)
+    if textureless:
+        message = "hardly any texture: little tells how the camera moves along or around such walls"
+        yield VideoFinding("warning", "texture-low", message)
+    if flags["cut"].any():
+        message = "the picture changes at once, as at a cut: {frames}"
+        yield clip.finding("warning", "cut", message, segments_of(flags["cut"]), "{selection}")
+    moving = clip["motion"]
+    motion = (
+        f"fast motion: the picture moves by {np.median(moving):.1%} of its width from frame to frame, by "
+        f"{np.percentile(moving, 95):.1%} in the fastest; by more than {_FAST:.0%} in {{frames}}"
+    )
+    unlike = (
+        "hardly like the frame before, its motion undone: {frames} (fast turns, motion blur, a wall close to the lens, "
+        "water, smoke)"
+    )
+    slower = "use every frame, not one of several" if clip.step > 1 else "a recording of a higher rate moves less"
+    for name, code, message, advice in (
+        ("fast", "motion-fast", motion, slower),
+        ("unlike", "unlike", unlike, ""),
+        ("soft", "soft", "soft, by motion blur or a wall close to the lens: {frames}", ""),
+    ):
+        if flags[name].mean() > _SOME:
+            yield clip.finding("warning", code, message, segments_of(flags[name], gap=2), advice)
+
+
+def forecast(clip: Clip) -> str:
+    """Return in words what a run can be expected to make of the video."""
+    flags, textureless = _dangers(clip)
+    lost, cuts = int((flags["fast"] | flags["unlike"] | flags["cut"]).sum()), int(flags["cut"].sum())
+    which = f"of one frame in {clip.step}: " if clip.step > 1 else ""
+    if textureless:
+        return f"{which}poor: walls without texture; expect most frames lost or in separate maps"
+    if lost > _MANY * len(clip):
+        return (
+            f"{which}poor: about {lost} of {len(clip)} frames are hard to track; expect lost frames, and several "
+            "separate maps instead of one surface"
+        )
+    if lost > _SOME * len(clip) or cuts:
+        jumps = f", {cuts} cut{'s' * (cuts != 1)}" if cuts else ""
+        return f"{which}fair: {lost} frames are hard to track{jumps}; the surface may break into separate maps there"
+    return f"{which}good: nothing in its motion, sharpness and texture endangers a reconstruction"

@@ -1,0 +1,65 @@
+"""Facts in a video file's header: codec, size, rate, shape of pixels, bits, range, rotation, fields, length."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import av
+
+from scopemap.apps.inspect.clip import VideoFinding
+
+_FULL_RANGE = 2
+# FFmpeg's numbers for the order of fields: 0 unknown, 1 progressive, then the four kinds of interlaced.
+_PROGRESSIVE = 1
+
+
+def read_container(media: str) -> dict[str, Any] | None:
+    """Return the facts in the header and first picture of a video, None where it cannot be opened.
+
+    pixel_aspect : width of a pixel over its height. bits : per colour channel. full_range : whether levels use 0..255.
+    rotation_deg : by which a player rotates the picture. interlaced : by the header. A fact is None if it is not there.
+    """
+    try:
+        with av.open(media, "r", metadata_errors="replace") as container:
+            stream = next(iter(container.streams.video), None)
+            first = None if stream is None or stream.codec_context is None else next(container.decode(stream), None)
+            if stream is None or first is None:
+                return None
+            length_s = container.duration / av.time_base if container.duration else None
+            if stream.duration and stream.time_base:
+                length_s = float(stream.duration * stream.time_base)
+            return {
+                "container": container.format.name,
+                "codec": stream.codec_context.name,
+                "width": first.width,
+                "height": first.height,
+                "rate_hz": float(stream.average_rate) if stream.average_rate else None,
+                "pixel_aspect": float(stream.sample_aspect_ratio or 1),
+                "pixel_format": first.format.name,
+                "bits": max(component.bits for component in first.format.components),
+                "full_range": first.color_range == _FULL_RANGE or first.format.name.startswith("yuvj"),
+                "rotation_deg": int(first.rotation),
+                "interlaced": bool(first.interlaced_frame or stream.codec_context.field_order > _PROGRESSIVE),
+                "frames": stream.frames or None,
+                "length_s": length_s,
+            }
+    except (av.FFmpegError, OSError, ValueError):
+        return None
+
+
+def check_container(facts: dict[str, Any]) -> Iterator[VideoFinding]:
+    """Yield what in the header is unusual."""
+    aspect, rotation, bits = facts["pixel_aspect"], facts["rotation_deg"], facts["bits"]
+    if abs(aspect - 1) > 1e-3:
+        yield VideoFinding(
+            "info", "pixel-aspect", f"pixels are {aspect:.4g} times as wide as high; runs reckon with it"
+        )
+    if bits > 8:
+        yield VideoFinding("info", "bit-depth", f"{bits} bits per channel; runs work on 8")
+    if rotation:
+        message = f"players turn the picture by {rotation} deg; a calibration must fit the picture that runs see"
+        yield VideoFinding("info", "rotation", message)
+    if facts["interlaced"]:
+        message = "the header says that the pictures are interlaced"
+        yield VideoFinding("info", "field-order", message, "--deinterlace, where combs are found, too")

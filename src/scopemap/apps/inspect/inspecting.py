@@ -1,0 +1,188 @@
+"""The one pass over a video: every frame is measured once, in order, and few are kept."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scopemap.apps.inspect import checks
+from scopemap.apps.inspect.burned_in import InsetWatcher, Overlay, OverlayWatcher
+from scopemap.apps.inspect.clip import Clip, VideoFinding
+from scopemap.apps.inspect.container import check_container, read_container
+from scopemap.apps.inspect.field_shape import Field, FieldWatcher, ShareBox
+from scopemap.apps.inspect.frame_measures import FrameInspector, InspectedFrame
+from scopemap.apps.inspect.scope_guess import check_scope
+from scopemap.engine.config import InputSettings
+from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.engine.frame import Frame
+from scopemap.input.opening import open_sequence, open_source
+from scopemap.input.prepared import OF_UNKNOWN_VIEWS, sample_pictures
+from scopemap.input.sequence import Sequence
+from scopemap.input.video_format.stereo_packing import Packing, packing
+
+_KEPT = 8
+_NAMED = 3
+_ORDER = ("error", "warning", "info")
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found in a video.
+
+    path : the file or folder. size : of a picture (of one view, if there are two), px. clip : measures of every
+    picture. container : facts in the file's header, or None. packed : layout of two views in a picture, or None.
+    findings : worst first. samples : a few frames.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    clip: Clip
+    container: dict[str, Any] | None
+    packed: Packing | None
+    field: Field
+    overlays: tuple[Overlay, ...]
+    insets: tuple[ShareBox, ...]
+    findings: tuple[VideoFinding, ...]
+    samples: tuple[InspectedFrame, ...]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the video is, and the usual shares of its pictures; what is not known is left out."""
+        facts = (self.container or {}) | {
+            "width": self.size[0],
+            "height": self.size[1],
+            "pictures": len(self.clip),
+            "span_s": float(np.diff(self.clip["time_s"][[0, -1]])[0]),
+            "usual_rate_hz": self.clip.rate_hz,
+            "motion_per_frame_share": float(np.median(self.clip["motion"])),
+            "motion_fastest_share": float(np.percentile(self.clip["motion"], 95)),
+            "repeated": int(self.clip.repeats.sum()),
+            "field": self.field.shape,
+            "field_share": self.field.share,
+            **checks.exposure_figures(self.clip),
+        }
+        return {name: value for name, value in facts.items() if value is not None}
+
+    @property
+    def forecast(self) -> str:
+        """What a run can be expected to make of the video, in words."""
+        return checks.forecast(self.clip)
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """All of it but the pictures, as JSON has it; boxes as left, top, right, bottom, shares of width and height."""
+        return {
+            "path": str(self.path),
+            "facts": self.facts,
+            "forecast": self.forecast,
+            "findings": [asdict(finding) for finding in self.findings],
+            "field": {"shape": self.field.shape, "share": self.field.share, "box": list(self.field.box)},
+            "overlays": [asdict(overlay) for overlay in self.overlays],
+            "insets": [list(box) for box in self.insets],
+        }
+
+
+def inspect(
+    path: Path,
+    *,
+    dataset: str | None = None,
+    camera: Path | None = None,
+    frames: slice | None = None,
+    listener: Callable[[int, int | None], None] | None = None,
+) -> Inspection:
+    """Read a video, a folder of images or a data set's folder once and return what was found.
+
+    `dataset`, `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called after
+    each. Raises `InputError` and `CalibrationError` where it cannot be opened or holds fewer than two pictures.
+    """
+    plain = InputSettings(stereo="none", skip_duplicates=False)
+    # Whether there are two views comes first: the camera may be that of one.
+    source = open_source(path, dataset=dataset, settings=plain)
+    unknown = source.name in OF_UNKNOWN_VIEWS  # the readers of data sets know what a picture holds
+    packed = packing(sample_pictures(source), source.pixel_aspect) if unknown else None
+    settings = plain if packed is None else plain.model_copy(update={"stereo": packed.layout})
+    sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
+    media = sequence.source.media()
+    container = None if media is None else read_container(media)
+    field, overlays, insets, sampled = FieldWatcher(), OverlayWatcher(), InsetWatcher(), _Sampled()
+    measures, stopped = [], ""
+    try:
+        for item in _inspected(sequence):
+            for watcher in (field, overlays, insets, sampled):
+                watcher.add(item)
+            measures.append(item.measures)
+            if listener is not None:
+                listener(len(measures), sequence.count)
+    except ScopemapError as error:
+        stopped = str(error)
+    if len(measures) < 2:
+        found = stopped or f"{len(measures)} picture(s) could be read, two are needed"
+        raise InputError(f"inspecting {sequence.path}: {found}")
+    clip = Clip(tuple(measures), sequence.source.stamped, sequence.selection)
+    size = sequence.source.width, sequence.source.height
+    findings = [
+        *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
+        *_of_source(list(map(str, sequence.warnings))),
+        *(check_container(container) if container else []),
+        *checks.check_timing(clip, container["length_s"] if container else None),
+        *checks.check_packing(packed, [item.rgb for item in sampled.kept if not item.measures.blank]),
+        *checks.check_repeats(clip),
+        *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
+        *([] if sequence.calibrated else check_scope(field.field(), size, stereo=packed is not None)),
+        *checks.check_frames(clip),
+        *checks.check_dangers(clip),
+    ]
+    return Inspection(
+        path=sequence.path,
+        size=size,
+        clip=clip,
+        container=container,
+        packed=packed,
+        field=field.field(),
+        overlays=tuple(overlays.overlays()),
+        insets=tuple(insets.boxes()),
+        findings=tuple(sorted(findings, key=lambda finding: _ORDER.index(finding.severity))),
+        samples=tuple(sampled.kept),
+    )
+
+
+def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:
+    """Yield the frames, measured, with their positions in the input.
+
+    Unreadable images have a position, too; damaged frames of a video are not counted by `--frames`.
+    """
+    known = sequence.source.stamps(slice(None)) or []
+    start, _, step = sequence.selection.indices(sequence.source.count or sys.maxsize)
+    positions = {index: position for position, (index, _) in enumerate(known)}
+    inspector = FrameInspector()
+    for number, item in enumerate(sequence.source.frames(sequence.selection)):
+        rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
+        frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
+        yield inspector(positions.get(item.index, start + step * number), item.rgb, frame)
+
+
+def _of_source(warnings: list[str]) -> list[VideoFinding]:
+    """Return a finding for each of the reader's warnings, those after the third counted."""
+    more = len(warnings) - _NAMED
+    messages = warnings[:_NAMED] + ([f"and {more} more warnings of the reader"] if more > 0 else [])
+    return [VideoFinding("warning", "source", message) for message in messages]
+
+
+class _Sampled:
+    """Keeps a few frames of a video of unknown length, evenly spread."""
+
+    def __init__(self) -> None:
+        self._step, self._seen = 1, 0
+        self.kept: list[InspectedFrame] = []
+
+    def add(self, item: InspectedFrame) -> None:
+        if self._seen % self._step == 0:
+            self.kept.append(item)
+        if len(self.kept) > _KEPT:
+            self.kept, self._step = self.kept[::2], 2 * self._step
+        self._seen += 1

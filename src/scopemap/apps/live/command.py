@@ -1,0 +1,230 @@
+"""`scopemap live`: a camera, a stream, or a file at its own speed, reconstructed as it comes."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from scopemap.terminal import options
+from scopemap.terminal.figures import print_json, print_warnings
+from scopemap.terminal.interruption import Interruption
+from scopemap.terminal.terminal_keys import terminal_keys
+
+if TYPE_CHECKING:
+    from scopemap.apps.coverage.live_map import LiveCoverage
+    from scopemap.apps.live.live import LiveSession
+    from scopemap.engine.odometry import Step
+    from scopemap.runner.reconstructor import Reconstructor
+
+_SHOWN_EVERY_S, _LINE_EVERY_S = 0.5, 10.0
+_SURFACE_EVERY_S, _SENT_FACES = 5.0, 20_000
+
+
+def live(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="Number of a camera, a device (/dev/video0), an address (rtsp://...), or a video file, played at its "
+            "own speed.",
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option(help="Folder for the result, written at the end.")] = None,
+    serve: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, metavar="PORT", help="Show a page at http://localhost:PORT; 0: any free port."),
+    ] = None,
+    igtl: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=65535, metavar="PORT", help="Send pose, picture and surface to 3D Slicer or PLUS; extra igtl."
+        ),
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so many seconds.")] = None,
+    camera: options.CameraFile = None,
+    fov: options.FieldOfView = None,
+    scope: options.Scope = None,
+    near_far: options.NearFar = None,
+    size: options.Size = None,
+    settings: options.SetPairs = None,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Reconstruct a live picture; frames are dropped rather than late.
+
+    Keys: p pauses, r forgets all and begins anew, s writes a snapshot, q ends. Ctrl-C ends it, too, and writes the
+    result; a second Ctrl-C writes nothing.
+    """
+    from scopemap.apps.coverage.live_map import KeptDepth, LiveCoverage
+    from scopemap.engine.config import Config
+
+    chosen: dict[str, Any] = {"depth.near_far_mm": options.parse_near_far(near_far)} if near_far else {}
+    chosen |= {"input.scope": scope} if scope else {}
+    config = Config.load(
+        "realtime", settings=chosen | {"input.focal": "assume"} | options.parse_settings(settings or [])
+    )
+
+    from scopemap.apps.live.live import LiveSession, finished
+    from scopemap.input.live_source import LiveSource
+    from scopemap.input.opening import sequence_of
+    from scopemap.report.frame_pictures import FramePictures
+    from scopemap.report.page import write_report
+    from scopemap.result.checksums import write_checksums
+    from scopemap.result.result_folder import NOT_OF_THE_RESULT, result_folder
+
+    silent = quiet or as_json
+    pictures = FramePictures()
+    with ExitStack() as stack:
+        sender = stack.enter_context(_sender(igtl, silent=silent))
+        folder = stack.enter_context(result_folder(out, overwrite=overwrite))
+        reading = LiveSource(source)
+        working = options.parse_size(size) if size else None
+        sequence = sequence_of(reading, camera=camera, fov_deg=fov, size=working, settings=config.input)
+        interruption = stack.enter_context(Interruption(reading.stop))
+
+        def observe(step: Step, _: Reconstructor) -> None:
+            interruption.observe(step)
+            if folder is not None:
+                pictures.observe(step)
+
+        kept = KeptDepth(Path(stack.enter_context(TemporaryDirectory())))
+        covered = stack.enter_context(LiveCoverage(kept))
+        observers = observe, *sender, *([] if out is None and serve is None else [kept.observe])
+        observers += () if serve is None else (covered.observe,)
+        snapshots = (folder or Path("scopemap-live")) / "snapshots"
+        session = LiveSession(reading, sequence, config, observers=observers, snapshots=snapshots)
+        stack.enter_context(_controls(session, covered, serve, seconds, silent=silent))
+        reconstructor = session.run()
+        result = finished(reconstructor, reading)
+        covered.settle()
+        if folder is not None:
+            result.save(folder)
+            pictures.save(folder)
+            kept.move_to(folder)
+            write_checksums(folder, without=NOT_OF_THE_RESULT)
+            if serve is not None:
+                covered.finish(folder)
+    state = session.state()
+    if out is not None:
+        write_report(out)
+    if as_json:
+        print_json(result.provenance | {"live": state | {"path": len(state["path"])}})
+    elif not quiet:
+        _print(result.provenance, state, out)
+    if interruption.exit_code:
+        raise typer.Exit(interruption.exit_code)
+
+
+@contextmanager
+def _sender(port: int | None, *, silent: bool) -> Iterator[tuple[Callable[[Step, Reconstructor], None], ...]]:
+    """Yield the observer that sends each step by OpenIGTLink, and the surface now and then; none without a port."""
+    if port is None:
+        yield ()
+        return
+    from scopemap.apps.live.igtl import IgtlServer
+    from scopemap.report.shown_mesh import simplified
+
+    server, sent_s = IgtlServer(port), time.monotonic()
+
+    def send(step: Step, reconstructor: Reconstructor) -> None:
+        nonlocal sent_s
+        frame, lost = step.frame, step.track.reason if step.track.status == "lost" else ""
+        server.send_frame(frame.rgb, frame.camera, frame.T_world_camera, lost)
+        if server.connected and time.monotonic() - sent_s > _SURFACE_EVERY_S:
+            surface = simplified(reconstructor.surface(), _SENT_FACES)
+            server.send_surface(surface.vertices, surface.faces)
+            sent_s = time.monotonic()
+
+    if not silent:
+        typer.echo(f"sending by OpenIGTLink on port {port} of localhost", err=True)
+    try:
+        yield (send,)
+    finally:
+        server.close()
+
+
+@contextmanager
+def _controls(
+    session: LiveSession, covered: LiveCoverage, port: int | None, seconds: float | None, *, silent: bool
+) -> Iterator[None]:
+    """Context in which a session is shown, served, controlled by keys, and ended after some seconds."""
+    keys = {"p": session.pause, "r": session.reset, "s": session.snapshot, "q": session.stop}
+    ended = threading.Event()
+    with ExitStack() as stack:
+        if port is not None:
+            stack.callback(_served(session, covered, port, silent=silent))
+        if seconds is not None:
+            timer = threading.Timer(seconds, session.stop)
+            timer.start()
+            stack.callback(timer.cancel)
+        has_keys = stack.enter_context(terminal_keys(keys))
+        if not silent:
+            if has_keys:
+                typer.echo("p pause, r reset, s snapshot, q end", err=True)
+            thread = threading.Thread(target=_show, args=(session, ended), name="show", daemon=True)
+            thread.start()
+            stack.callback(thread.join)
+        stack.callback(ended.set)
+        yield
+
+
+def _served(session: LiveSession, covered: LiveCoverage, port: int, *, silent: bool) -> Callable[[], None]:
+    """Serve the session's page, and return what ends that."""
+    from scopemap.report.serving import LocalServer, live_page
+
+    def state() -> dict[str, Any]:
+        shown = {"count": covered.count, "drawn": bool(covered.shown.png), "words": covered.shown.words}
+        return session.state() | {"coverage": shown}
+
+    pages = {
+        "/": live_page,
+        "/state": lambda: ("application/json", json.dumps(state()).encode()),
+        "/coverage.png": lambda: ("image/png", png) if (png := covered.shown.png) else None,
+        "/picture.jpg": lambda: ("image/jpeg", jpeg) if (jpeg := session.picture()) else None,
+    }
+    actions = {"/pause": session.pause, "/reset": session.reset, "/snapshot": session.snapshot}
+    server = LocalServer(pages, actions, port)
+    if not silent:
+        typer.echo(f"look at {server.url} in a browser of this machine", err=True)
+    return server.close
+
+
+def _show(session: LiveSession, ended: threading.Event) -> None:
+    """Show a session's state until it ends: in one line of a terminal, else in one every ten seconds and at changes."""
+    terminal, shown, shown_s = sys.stderr.isatty(), "", 0.0
+    while not ended.wait(_SHOWN_EVERY_S):
+        if (state := session.state())["state"] == "ended":  # the summary says so, once
+            continue
+        if terminal:
+            sys.stderr.write("\r\033[K" + _line(state)[:100])
+            sys.stderr.flush()
+        elif state["state"] != shown or time.monotonic() - shown_s > _LINE_EVERY_S:
+            typer.echo(_line(state), err=True)
+            shown, shown_s = state["state"], time.monotonic()
+    if terminal:
+        sys.stderr.write("\n")
+
+
+def _line(state: dict[str, Any]) -> str:
+    latency = f"latency {state['latency_p50_ms']} ms (95 % below {state['latency_p95_ms']})"
+    full = ", surface full" if state["full"] else ""
+    drops = f"{state['dropped']} of {state['read']} frames dropped"
+    return f"{state['words']}: {state['frames_per_s']} frames/s, {latency}, {drops}, map {state['map'] + 1}{full}"
+
+
+def _print(provenance: dict[str, Any], state: dict[str, Any], out: Path | None) -> None:
+    print_warnings(provenance)
+    typer.echo(f"{provenance['tracked']} of {provenance['frames']} frames tracked, {provenance['lost']} lost")
+    typer.echo(_line(state))
+    if out is not None:
+        typer.echo(f"result in {out}, with the depth of some frames; look at {out / 'report.html'}")

@@ -1,0 +1,201 @@
+"""A live session: a source that does not wait is reconstructed as it comes; state, latency, pause, reset, snapshot."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from scopemap.engine.config import Config
+from scopemap.engine.errors import reporting
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.mesh_files import save_mesh
+from scopemap.engine.notices import Notice
+from scopemap.engine.odometry import Step
+from scopemap.input.live_source import LiveSource
+from scopemap.input.sequence import Sequence
+from scopemap.result.reconstruction import Reconstruction
+from scopemap.runner.provenance import Limits
+from scopemap.runner.reconstructor import Reconstructor
+from scopemap.runner.run import Progress
+
+LIMITS = Limits(frames=50_000, maps=8, blocks=80_000)
+"""Of a session: about 60 MB of rows and 1 GB of surfaces."""
+_REMEMBERED = 300  # latencies
+_MOST_POSITIONS = 500
+_AHEAD = 1
+_LOST = "lost: move back slowly"
+
+LiveObserver = Callable[[Step, Reconstructor], None]
+"""Called with each step, in the thread that fuses."""
+
+
+class LiveSession:
+    """Reconstructs a live source until its end or `stop`, observed step by step; any thread may call its methods."""
+
+    def __init__(
+        self,
+        source: LiveSource,
+        sequence: Sequence,
+        config: Config,
+        *,
+        observers: tuple[LiveObserver, ...] = (),
+        snapshots: Path,
+        progress: Progress = lambda doing, done, total: None,
+    ) -> None:
+        self._source, self._sequence, self._config = source, sequence, config
+        self._observers, self._snapshots, self._progress = observers, snapshots, progress
+        self._frames, self._lock = sequence.frames(), threading.Lock()
+        self._wants_reset = self._wants_snapshot = False
+        self._forget()
+        self._ended = False
+        self._last_snapshot = ""
+
+    def run(self) -> Reconstructor:
+        """Load kernels and networks, reconstruct until the end, and return the reconstructor with the last result."""
+        with Reconstructor(self._config, self._sequence, progress=self._progress) as warm:
+            for index in range(2):
+                picture = self._sequence.rectifier.image(np.roll(self._source.first, index, axis=1))
+                warm.step(Frame(index, float(index), picture, warm.camera, self._sequence.rectifier.valid))
+        while True:
+            reconstructor = Reconstructor(self._config, self._sequence, progress=self._progress, limits=LIMITS)
+            for step in reconstructor.steps(self._until_reset(), ahead=_AHEAD):
+                self._take(step, reconstructor)
+            if not self._wants_reset:
+                self._ended = True
+                return reconstructor
+            reconstructor.close()
+            self._wants_reset = False
+            self._forget()
+
+    def stop(self) -> None:
+        """End the session after the frames that are on their way."""
+        self._source.stop()
+
+    def pause(self) -> None:
+        """Leave frames out, or go on."""
+        self._source.paused = not self._source.paused
+
+    def reset(self) -> None:
+        """Forget all that was seen, and begin anew with the next frame."""
+        self._wants_reset, self._source.paused = True, False
+
+    def snapshot(self) -> None:
+        """Write the next frame's picture (PNG), its pose and the surface so far (PLY) to the folder for snapshots."""
+        self._wants_snapshot = True
+
+    def state(self) -> dict[str, Any]:
+        """Return what is shown of the session, as plain values.
+
+        state : "starting", "tracking", "lost", "paused" or "ended"; words : the same for people, reason : why it is
+        lost. frame, frames_per_s, latency_ms, latency_p50_ms, latency_p95_ms : of the last 300 frames, from a frame's
+        time to its pose. read, dropped : frames of the source. tracked, lost : frames since the last reset. map :
+        number of the map. path : up to 500 positions of the camera in this map, mm, (x, y, z). scale_known. snapshot :
+        the last one's file. full : whether the surface takes no more.
+        """
+        with self._lock:
+            latencies, times_s, step = list(self._latencies_ms), list(self._times_s), self._step
+            path = list(self._path)
+        span_s = times_s[-1] - times_s[0] if len(times_s) > 1 else 0.0
+        median, slowest = np.percentile(latencies, [50, 95]) if latencies else (0.0, 0.0)
+        state = self._state_word()
+        words = {"lost": _LOST, "starting": "starting: hold still and look at tissue"}.get(state, state)
+        return {
+            "state": state,
+            "words": words,
+            "reason": step.track.reason if step is not None and state == "lost" else "",
+            "frame": -1 if step is None else step.frame.index,
+            "frames_per_s": round((len(times_s) - 1) / span_s, 1) if span_s > 0 else 0.0,
+            "latency_ms": round(latencies[-1]) if latencies else 0,
+            "latency_p50_ms": round(float(median)),
+            "latency_p95_ms": round(float(slowest)),
+            "read": self._source.read,
+            "dropped": self._source.dropped,
+            "tracked": self._tracked,
+            "lost": self._lost,
+            "map": 0 if step is None else step.track.map,
+            "path": [[round(float(value), 2) for value in position] for position in path],
+            "scale_known": self._scale_known,
+            "snapshot": self._last_snapshot,
+            "full": self._full,
+        }
+
+    def picture(self) -> bytes:
+        """Return the last frame's picture as JPEG, b"" before the first."""
+        with self._lock:
+            step = self._step
+        if step is None:
+            return b""
+        return cv2.imencode(".jpg", step.frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+
+    def _state_word(self) -> str:
+        step = self._step
+        if self._ended or step is None:
+            return "ended" if self._ended else "starting"
+        if self._source.paused:
+            return "paused"
+        if step.track.status == "lost":
+            return "lost" if self._tracked else "starting"
+        return "tracking"
+
+    def _forget(self) -> None:
+        self._latencies_ms: deque[float] = deque(maxlen=_REMEMBERED)
+        self._times_s: deque[float] = deque(maxlen=_REMEMBERED)
+        self._path: list[np.ndarray] = []
+        self._path_every = 1
+        self._step: Step | None = None
+        self._tracked = self._lost = 0
+        self._scale_known = self._full = False
+
+    def _until_reset(self) -> Iterator[Frame]:
+        while not self._wants_reset and (frame := next(self._frames, None)) is not None:
+            yield frame
+
+    def _take(self, step: Step, reconstructor: Reconstructor) -> None:
+        now_s = self._source.now_s()
+        with self._lock:
+            if self._step is not None and self._step.track.map != step.track.map:
+                self._path, self._path_every = [], 1  # another world
+            self._step, is_lost = step, step.track.status == "lost"
+            self._tracked, self._lost = self._tracked + (not is_lost), self._lost + is_lost
+            self._latencies_ms.append(1000 * (now_s - step.frame.time_s))
+            self._times_s.append(now_s)
+            if step.frame.T_world_camera is not None and self._tracked % self._path_every == 0:
+                self._path.append(step.frame.T_world_camera[:3, 3])
+                if len(self._path) > _MOST_POSITIONS:
+                    self._path, self._path_every = self._path[::2], 2 * self._path_every
+            self._scale_known, self._full = reconstructor.scale_known, reconstructor.surface_is_full
+        if self._wants_snapshot:
+            self._wants_snapshot = False
+            self._write_snapshot(step, reconstructor)
+        for observer in self._observers:
+            observer(step, reconstructor)
+
+    def _write_snapshot(self, step: Step, reconstructor: Reconstructor) -> None:
+        frame = step.frame
+        stem = self._snapshots / f"{frame.index:06d}"
+        pose = None if frame.T_world_camera is None else frame.T_world_camera.tolist()
+        facts = {"time_s": frame.time_s, "status": step.track.status, "T_world_camera": pose, "unit": "mm"}
+        with reporting(f"cannot write to {self._snapshots}"):
+            self._snapshots.mkdir(parents=True, exist_ok=True)
+            stem.with_suffix(".png").write_bytes(cv2.imencode(".png", frame.rgb[..., ::-1])[1].tobytes())
+            stem.with_suffix(".json").write_text(json.dumps(facts | {"scale_known": reconstructor.scale_known}))
+            surface = reconstructor.surface()
+            if len(surface.faces):
+                save_mesh(surface, stem.with_suffix(".ply"))
+        self._last_snapshot = str(stem.with_suffix(".png"))
+
+
+def finished(reconstructor: Reconstructor, source: LiveSource) -> Reconstruction:
+    """Return a session's result, its provenance with the frames that were dropped."""
+    result = reconstructor.result()
+    if source.dropped:
+        dropped = Notice("frames-dropped", {"dropped": source.dropped, "read": source.read})
+        result.provenance["notices"].append(dropped.as_json())
+    return result

@@ -1,0 +1,1 @@
+"""Where another video is in a result."""

@@ -1,0 +1,50 @@
+"""`scopemap locate`: the frames of another video in the map of a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scopemap.terminal import options
+from scopemap.terminal.figures import print_json
+
+
+def locate(
+    run: Annotated[Path, typer.Argument(metavar="RESULT", help="Folder of a run.")],
+    path: options.Input,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Table to write, .csv: a line and a pose for each frame.")],
+    camera: options.CameraFile = None,
+    dataset: options.Dataset = None,
+    frames: options.Frames = None,
+    source: options.InputNow = None,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Find where each frame of another video is in the map of a result, or that it is not found there.
+
+    Without a calibration of its own, the video has the camera of the result's input.
+    """
+    options.check_output(out, (".csv",), overwrite)
+    import numpy as np
+
+    from scopemap.apps.locate import locate as locating
+    from scopemap.terminal.progress import count_progress
+
+    found, sequence = [], locating.open_other(run, path, camera, dataset, frames)
+    with count_progress("locating", "located", silent=quiet or as_json) as show:
+        for one in locating.locate(run, sequence, source):
+            found.append(one)
+            if show is not None:
+                show(len(found), sequence.count)
+    locating.write_located(found, out)
+    inliers = [one.inliers for one in found if one.status != locating.NOT_FOUND]
+    facts = {"frames": len(found), "found": len(inliers), "inliers": float(np.median(inliers or [0])), "out": str(out)}
+    if as_json:
+        print_json(facts)
+    elif not quiet:
+        median = f", by {facts['inliers']:.0f} features (median)" if inliers else ""
+        typer.echo(f"camera: {sequence.camera_source}")
+        typer.echo(f"{out}: {len(inliers)} of {len(found)} frames found{median}")

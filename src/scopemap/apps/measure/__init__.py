@@ -1,0 +1,1 @@
+"""Sizes on the surface, and of lesions."""

@@ -1,0 +1,112 @@
+"""`scopemap measure`: distances and areas on the surface of a run, and the sizes of a lesion."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from scopemap.terminal.options import AsJson, check_output
+
+if TYPE_CHECKING:
+    from scopemap.apps.measure.measure import Measure
+
+
+def measure(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a submap, result/maps/1.")],
+    frame: Annotated[int | None, typer.Option(help="Number of the frame that the pixels, or the mask, are of.")] = None,
+    points: Annotated[str, typer.Option(help='Pixels "x,y x,y": two for a distance, more for the area inside.')] = "",
+    lesion: Annotated[
+        str,
+        typer.Option(
+            metavar="MASKS",
+            help='Folder of masks numbered as frames; or of --frame one mask or an outline "x,y x,y x,y".',
+        ),
+    ] = "",
+    second: Annotated[float | None, typer.Option(help="Time of the frame, s, instead of its number.")] = None,
+    reference: Annotated[
+        str, typer.Option(help='Two pixels "x,y x,y" of the same frame, whose distance is known.')
+    ] = "",
+    reference_mask: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Mask of an instrument's shaft, as wide as known, instead.")
+    ] = None,
+    reference_frame: Annotated[int | None, typer.Option(help="Frame of the reference, with --lesion.")] = None,
+    reference_mm: Annotated[
+        float | None, typer.Option(min=1e-6, help="Their distance, mm; without it, measures are multiples of it.")
+    ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Draw the lesion's outline in the frames that count.")
+    ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the lesion for 3D Slicer, .mrk.json, or as a DICOM report, .dcm."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure on the surface between pixels of a frame, or a lesion in all frames, with intervals of 95 %.
+
+    Where the run's scale is unknown, a reference is needed.
+    """
+    if bool(points) == bool(lesion):
+        raise typer.BadParameter("give either --points or --lesion")
+    if reference and reference_mask is not None:
+        raise typer.BadParameter("give either --reference or --reference-mask")
+    if points and (
+        frame is None or second is not None or reference_mask or pictures or export or reference_frame is not None
+    ):
+        raise typer.BadParameter("--points needs --frame, and of the others takes --reference and --reference-mm alone")
+    pixels = _pixels(points, "--points") if points else []
+    if points and len(pixels) < 2:
+        raise typer.BadParameter("at least two pixels are needed", param_hint="--points")
+    ends = _pixels(reference, "--reference") if reference else None
+    if ends is not None and len(ends) != 2:
+        raise typer.BadParameter("two pixels are needed", param_hint="--reference")
+    import numpy as np
+
+    from scopemap.apps.measure import lesion as lesions
+    from scopemap.apps.measure import measure as measuring
+    from scopemap.apps.measure.findings import FINDING_ENDINGS, write_findings
+    from scopemap.apps.measure.surface_finding import SurfaceFinding
+
+    if export is not None:
+        check_output(export, FINDING_ENDINGS, overwrite=True)
+
+    if frame is not None and points:
+        known = None if ends is None else np.array(ends)
+        found = measuring.measure(run, frame, np.array(pixels), known, reference_mm)
+        _show(found, [_facts(one) for one in found], as_json)
+        return
+    frame = frame if second is None else lesions.frame_at(run, second)
+    masks = Path(lesion) if Path(lesion).exists() else np.array(_pixels(lesion, "--lesion"))
+    pair = lesions.shaft_width(run, reference_mask) if reference_mask is not None else ends
+    given = None if pair is None else np.array(pair)
+    measured = lesions.measure_lesion(
+        run, masks, frame, reference=given, reference_frame=reference_frame, reference_mm=reference_mm
+    )
+    if export is not None:
+        write_findings(run, [SurfaceFinding("lesion", measured.outline_mm, measured.measures)], measured.scale, export)
+    if pictures is not None:
+        lesions.write_outlines(run, measured.masks, pictures)
+    facts = [_facts(one) for one in measured.measures]
+    _show(measured.measures, {"measures": facts, "scale": measured.scale, "frames": list(measured.masks)}, as_json)
+    if not as_json:
+        typer.echo(f"from {len(measured.masks)} frames; the scale rests on {measured.scale}")
+
+
+def _facts(one: Measure) -> dict[str, Any]:
+    return vars(one) | {"value": one.value if math.isfinite(one.value) else None}
+
+
+def _show(found: list[Measure], facts: Any, as_json: bool) -> None:
+    typer.echo(json.dumps(facts, indent=2) if as_json else "\n".join(map(str, found)))
+
+
+def _pixels(text: str, option: str) -> list[list[float]]:
+    try:
+        return [[float(x), float(y)] for x, y in (word.split(",") for word in text.split())]
+    except ValueError:
+        no_file = ", and there is no such file" if option == "--lesion" else ""
+        raise typer.BadParameter(f'"{text}" is not "x,y x,y ..."{no_file}', param_hint=option) from None

@@ -1,0 +1,1 @@
+"""The networks' weights on this machine."""

@@ -1,0 +1,33 @@
+"""`scopemap report`: the page and the picture of a finished run, made again."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from scopemap.terminal.options import RunFolder
+
+
+def report(
+    run: RunFolder,
+    pictures: Annotated[
+        bool,
+        typer.Option("--pictures", help="Take the frames' pictures from the input again; done where none were kept."),
+    ] = False,
+) -> None:
+    """Write report.html and summary.png of a run into its folder."""
+    from scopemap.engine.errors import InputError
+    from scopemap.report.page import write_report
+    from scopemap.result.run_folder import RunFolder
+    from scopemap.runner.frames_again import keep_pictures_again
+
+    if pictures or not RunFolder(run).pictured:
+        try:
+            keep_pictures_again(run)
+        except InputError as fault:
+            if pictures or not (run / "frames.csv").is_file():
+                raise
+            typer.echo(f"warning: the page shows no frames: {fault}", err=True)
+    for file in write_report(run):
+        typer.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")

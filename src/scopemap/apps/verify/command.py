@@ -1,0 +1,40 @@
+"""`scopemap verify`: whether the files of a result are as they were written."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import typer
+
+from scopemap.terminal.figures import print_json
+from scopemap.terminal.options import AsJson, Quiet, RunFolder
+
+_MOST_NAMED = 20
+
+
+def verify(
+    run: RunFolder,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare the files of a result with its SHA256SUMS, and say which are damaged, missing or not the run's.
+
+    Exit code 1 where a file is damaged or missing. `sha256sum -c SHA256SUMS` in the folder checks the same.
+    """
+    from scopemap.apps.verify.verifying import verify_result
+
+    found = verify_result(run)
+    if as_json:
+        print_json(asdict(found) | {"is_whole": found.is_whole})
+    elif not quiet:
+        for what, names in (("damaged", found.damaged), ("missing", found.missing), ("not of the run", found.added)):
+            for name in names[:_MOST_NAMED]:
+                typer.echo(f"{what}: {name}")
+            if len(names) > _MOST_NAMED:
+                typer.echo(f"{what}: {len(names) - _MOST_NAMED} more, see --json")
+        for note in found.notes:
+            typer.echo(f"note: {note}")
+        counts = f"{len(found.damaged)} damaged, {len(found.missing)} missing"
+        typer.echo(f"{run}: {found.whole} files as they were, {counts}, {found.bytes / 1e6:.1f} MB read")
+    if not found.is_whole:
+        raise typer.Exit(1)

@@ -1,0 +1,72 @@
+"""Verifies a result by the checksums in its folder."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from scopemap.engine.errors import InputError, reporting
+from scopemap.result.checksums import NEEDED, SUMS, digest_of, files_in, read_checksums
+from scopemap.result.run_folder import RunFolder
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What has become of a result.
+
+    whole : number of files that are as they were. damaged, missing : names of those that are not. added : names of
+    files that are not the result's. bytes : of all files that were read. notes : how it came about, and what is other
+    than on this machine.
+    """
+
+    whole: int
+    damaged: list[str]
+    missing: list[str]
+    added: list[str]
+    bytes: int
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is damaged or missing."""
+        return not (self.damaged or self.missing)
+
+
+def verify_result(folder: Path) -> Verified:
+    """Compare the files of a result with its checksums. Raises `InputError` where it has none, or they are damaged."""
+    if not (folder / SUMS).is_file():
+        raise InputError(f"verifying {folder}: there is no {SUMS}, so no finished run, or one of an earlier version")
+    sums, damaged, missing, size = read_checksums(folder), [], [], 0
+    if lacking := [name for name in NEEDED if name not in sums]:
+        raise InputError(f"verifying {folder}: {SUMS} is damaged, it does not name {', '.join(lacking)}")
+    for name, digest in sums.items():
+        with reporting(f"verifying {folder / name}"):
+            if not (folder / name).is_file():
+                missing.append(name)
+                continue
+            size += (folder / name).stat().st_size
+            if digest_of(folder / name) != digest:
+                damaged.append(name)
+    added = [name for name in files_in(folder) if name not in sums and name != SUMS]
+    whole = len(sums) - len(damaged) - len(missing)
+    return Verified(whole, damaged, missing, added, size, [] if "provenance.json" in damaged else _notes(folder))
+
+
+def _notes(folder: Path) -> list[str]:
+    """Return whether the run was interrupted, and versions that are others here."""
+    provenance = RunFolder(folder).provenance
+    versions, last = dict(provenance.get("versions") or {}), provenance.get("interrupted_at_frame")
+    notes = [] if last is None else [f"it was interrupted at frame {last}"]
+    notes.append(f"made by scopemap {versions.get('scopemap', 'of unknown version')}")
+    here = {name: _version(name) for name in versions}
+    other = [f"{name} {then} (here {here[name]})" for name, then in versions.items() if here[name] != then]
+    return notes + ([f"made with other versions than those here: {', '.join(other)}"] if other else [])
+
+
+def _version(name: str) -> str:
+    try:
+        return platform.python_version() if name == "python" else version(name)
+    except PackageNotFoundError:
+        return "none"

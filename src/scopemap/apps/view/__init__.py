@@ -1,0 +1,1 @@
+"""Look at a result: films, paintings, the page."""

@@ -1,0 +1,164 @@
+"""Every setting of every stage, with unit and source; presets `default`, `paper`, `paper-strict`, `realtime`.
+
+Order of precedence: defaults < preset < TOML file < single settings (`--set fusion.every=2`); the preset itself may be
+named by any of them. A range of depth (`depth.near_far_mm`) becomes the anchor unless the same source names another
+one, and another `depth.backend` than the preset's does not get the preset's `depth.model`. An unknown key is an error
+that names the nearest key. Each stage's `method` names a set of its constants.
+
+METHOD below is arXiv 2508.11282. It publishes none of its constants (section "WEMA-RTDL"): those of the tracker were
+chosen by trial on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are
+plausible values that were not searched.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, cast
+
+from pydantic import Field, ValidationError
+
+from scopemap.engine.config.depth import DepthSettings, MapisSettings, NetworkSettings
+from scopemap.engine.config.input import InputSettings, MaskSettings
+from scopemap.engine.config.mapping import FusionSettings, MappingSettings
+from scopemap.engine.config.presets import PRESETS
+from scopemap.engine.config.settings import Settings, hint
+from scopemap.engine.config.tracking import SmoothingSettings, TrackingSettings
+from scopemap.engine.errors import SettingsError
+
+Preset = Literal["default", "paper", "paper-strict", "realtime"]
+_QUOTED = 80  # characters of a value that an error repeats
+
+
+class RunSettings(Settings):
+    """The run as a whole."""
+
+    memory_mb: int | None = Field(
+        None,
+        ge=1,
+        description="limit of memory, MB: fewer observations are adjusted, and voxels are larger, where more would be "
+        "needed; default: none",
+    )
+
+
+class Config(Settings):
+    """All settings of a run."""
+
+    preset: Preset = "default"
+    run: RunSettings = RunSettings()
+    input: InputSettings = InputSettings()
+    mask: MaskSettings = MaskSettings()
+    depth: DepthSettings = DepthSettings()
+    mapis: MapisSettings = MapisSettings()
+    networks: NetworkSettings = NetworkSettings()
+    tracking: TrackingSettings = TrackingSettings()
+    smoothing: SmoothingSettings = SmoothingSettings()
+    mapping: MappingSettings = MappingSettings()
+    fusion: FusionSettings = FusionSettings()
+
+    @classmethod
+    def load(
+        cls, preset: Preset | None = None, file: Path | None = None, settings: dict[str, Any] | None = None
+    ) -> Config:
+        """Return the defaults, changed by a preset, then a TOML file, then dotted single settings.
+
+        `settings` maps names such as "fusion.every" to values or to their text. The preset is the one that they
+        name, else `preset`, else the one that the file names. Raises `SettingsError`.
+        """
+        settings = settings or {}
+        in_file = {} if file is None else _read_toml(file)
+        chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
+        if chosen not in PRESETS:
+            raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
+        tree: dict[str, Any] = {}
+        for key, value in _merged(PRESETS[chosen], in_file, settings, {"preset": chosen}).items():
+            _insert(tree, key, value)
+        try:
+            return cls.model_validate(tree)
+        except ValidationError as error:
+            found = [item for item in error.errors() if item["type"] != "default_factory_not_called"]
+            raise SettingsError("; ".join(map(explain, found))) from None
+
+    @classmethod
+    def chosen(cls, config: Config | str | None) -> Config:
+        """Return settings as they are, those of the preset of that name, or the defaults. Raises `SettingsError`."""
+        if isinstance(config, cls):
+            return config
+        if config is None or isinstance(config, str):
+            return cls.load(cast("Preset | None", config))
+        raise SettingsError(f"{str(config)[:_QUOTED]} holds no settings: give a Config, or the name of a preset")
+
+    def toml(self) -> str:
+        """Return all settings as TOML text that `load` reads back; settings of None are left out."""
+        flat = _flatten(self.model_dump())
+        return "".join(f"{key} = {_toml_value(value)}\n" for key, value in flat.items() if value is not None)
+
+
+def setting_names() -> list[str]:
+    """Return the dotted names of all settings."""
+    return list(_flatten(Config().model_dump()))
+
+
+def _toml_value(value: Any) -> str:
+    # JSON's numbers, booleans, arrays and strings are TOML's too, but for surrogate pairs and a raw DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flatten(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a preset and of other sources, of which later ones win.
+
+    Another backend does not get the preset's weights, a range of depth replaces an earlier anchor, and the use of two
+    views an earlier backend.
+    """
+    flat = dict(preset)
+    for source in others:
+        if str(source.get("input.stereo", "")).startswith("use"):
+            source = {"depth.backend": "stereo"} | source
+        other_network = source.get("depth.backend") not in (None, preset.get("depth.backend"))
+        if other_network and flat.get("depth.model") == preset.get("depth.model"):
+            flat.pop("depth.model", None)
+        flat |= source
+        has_range = source.get("depth.near_far_mm") is not None and "depth.anchor" not in source
+        if has_range and flat.get("depth.anchor", "auto") != "auto":
+            flat["depth.anchor"] = "near-far"
+    return flat
+
+
+def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
+    if dotted not in (names := setting_names()):
+        raise SettingsError(f"unknown setting '{dotted}': {hint(dotted, names)}")
+    *groups, name = dotted.split(".")
+    for group in groups:
+        tree = tree.setdefault(group, {})
+    tree[name] = value
+
+
+def _read_toml(file: Path) -> dict[str, Any]:
+    """Return the settings in a file by their dotted names."""
+    try:
+        return _flatten(tomllib.loads(Path(file).read_text(encoding="utf-8")))
+    # Tables in tables without end, and numbers of thousands of digits, have errors of their own.
+    except (OSError, RecursionError, ValueError) as error:
+        raise SettingsError(f"cannot read the settings in {file}: {error}") from None
+
+
+def explain(error: Any) -> str:
+    """Return one phrase for an error that pydantic found: which setting, what is wrong, what was given."""
+    where = ".".join(str(part) for part in error["loc"])
+    return f"setting '{where}': {error['msg'].removeprefix('Value error, ')} (got {_quoted(error['input'])})"
+
+
+def _quoted(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _QUOTED else f"{text[:_QUOTED]}..."

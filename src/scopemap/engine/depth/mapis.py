@@ -1,0 +1,204 @@
+"""MAPIS: depth that keeps its scale from frame to frame (METHOD section MAPIS-Depth, steps 5-8).
+
+The previous depth is warped along the flow, filtered, and blended with the current estimate by a weight from their
+perceptual distance, by the paper's text; `blend = "paper-equation"` does the reverse. The weight's odds are multiplied
+by the ratio of inverse variances, where known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import MapisSettings
+from scopemap.engine.depth.estimate import DepthKind, PerceptualDistance
+from scopemap.engine.errors import check_shape
+from scopemap.engine.flow.estimator import FlowEstimator, pair_flow
+from scopemap.engine.geometry.uncertainty import blended_sigma, by_variance, faded_sigma, relative_sigma
+from scopemap.engine.geometry.warp import bilateral_filtered, moved_depth, pull
+
+# Share of the image that must be known in both depths for a scale to be fitted; across a cut 0.06 is so by chance.
+_MIN_OVERLAP = 0.2
+
+
+@dataclass(frozen=True)
+class DenseCorrespondence:
+    """Dense correspondence of a frame with the previous one.
+
+    to_previous : (H, W, 2) float32 px, from the current frame. consistent : (H, W) bool, flow check passed.
+    distance : (H, W) float32 perceptual distance of the two images, 0 = alike; constant for a single score.
+    usable_share : share of the current image that shows tissue.
+    """
+
+    to_previous: np.ndarray
+    consistent: np.ndarray
+    distance: np.ndarray
+    usable_share: float = 1.0
+
+
+class DenseMatcher:
+    """Matches masked images, in order, with the previous one."""
+
+    def __init__(self, settings: MapisSettings, flow: FlowEstimator, perceptual: PerceptualDistance) -> None:
+        self._settings, self._flow, self._perceptual = settings, flow, perceptual
+        self._previous: tuple[np.ndarray, np.ndarray] | None = None
+
+    def match(self, rgb: np.ndarray, valid: np.ndarray, *, wanted: bool = True) -> DenseCorrespondence | None:
+        """Return the correspondence of an image (H, W, 3) uint8 to the previous one; None without or not `wanted`."""
+        previous, self._previous = self._previous, (rgb, valid)
+        if previous is None or not wanted:
+            return None
+        rgb_previous, valid_previous = previous
+        flow = pair_flow(self._flow, rgb_previous, rgb, self._settings.constants.consistency_px)
+        # Masked pixels of either image show no tissue.
+        seen = pull(valid_previous.astype(np.float32), flow.to_previous) > 0.5
+        compared = pull(rgb_previous, flow.to_previous) if self._settings.constants.compare_warped else rgb_previous
+        distance = self._perceptual.compare(compared, rgb)
+        values = (
+            np.full_like(distance.map, distance.score) if self._settings.constants.perceptual_score else distance.map
+        )
+        consistent = flow.consistent & seen & valid
+        return DenseCorrespondence(flow.to_previous, consistent, values, float(valid.mean()))
+
+    def reset(self) -> None:
+        """Let the next image have no previous one."""
+        self._previous = None
+
+
+@dataclass(frozen=True)
+class RefinedDepth:
+    """Depth of one frame after the consistency stage.
+
+    depth_mm : (H, W) float32, NaN = unknown. scale : factor applied to the raw depth.
+    warped_share : share of the image with a warped previous depth. sigma_mm : (H, W) float32, one standard
+    deviation of the depth, NaN = unknown.
+    """
+
+    depth_mm: np.ndarray
+    scale: float
+    warped_share: float
+    sigma_mm: np.ndarray
+
+
+class _Propagated(NamedTuple):
+    """Depth (H, W) mm for the next frame, and its relative standard deviation, NaN = unknown."""
+
+    depth_mm: np.ndarray
+    relative_sigma: np.ndarray
+
+
+class Mapis:
+    """Refines the raw depth of frames in order; `reset` starts a new chain after a lost frame."""
+
+    def __init__(self, settings: MapisSettings) -> None:
+        self.settings = settings
+        self._propagated: _Propagated | None = None
+        self._scale = 1.0
+
+    def refine(
+        self,
+        raw_mm: np.ndarray,
+        kind: DepthKind,
+        camera: PinholeCamera,
+        correspondence: DenseCorrespondence | None,
+        T_current_previous: np.ndarray | None,
+        *,
+        sigma_mm: np.ndarray | None = None,
+        anchored: bool = False,
+    ) -> RefinedDepth:
+        """Return the depth of a frame.
+
+        raw_mm : (H, W) float32; sigma_mm : its standard deviation, NaN or None where unknown. correspondence : None for
+        the first frame. T_current_previous : transforms the previous depth; None: it is warped unchanged, as in the
+        paper. anchored : whether the frame was just anchored to a metric depth, which starts a new chain of scales.
+        """
+        check_shape("raw_mm", raw_mm, (camera.height, camera.width))
+        if anchored:
+            self._scale, correspondence = 1.0, None
+        sigma = relative_sigma(raw_mm, sigma_mm)
+        warped_mm, warped_sigma = self._warped(camera, correspondence, T_current_previous, sigma)
+        overlap = float(np.isfinite(warped_mm).mean())
+        if self._scales(kind):
+            self._scale = robust_scale(raw_mm, warped_mm, self._scale)
+            if correspondence is not None and self._propagated is not None:
+                self._scale = self._pulled_back(self._scale, overlap / max(correspondence.usable_share, 1e-6))
+        scaled_mm = raw_mm * np.float32(self._scale)
+        depth_mm, refined_sigma = scaled_mm, sigma
+        blend = self._blend(kind)
+        if correspondence is not None and blend != "none":
+            weight = np.where(np.isfinite(warped_mm), self._weight(blend, correspondence.distance), np.float32(0.0))
+            weight = by_variance(weight, warped_sigma, sigma)
+            depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
+            refined_sigma = blended_sigma(weight, warped_sigma, sigma)
+        self._propagated = (
+            _Propagated(depth_mm, refined_sigma) if self.settings.constants.recursive else _Propagated(scaled_mm, sigma)
+        )
+        return RefinedDepth(depth_mm, self._scale, overlap, refined_sigma * depth_mm)
+
+    def needs_previous(self, kind: DepthKind) -> bool:
+        """Return whether depth of this kind is compared with the previous frame at all."""
+        return self._scales(kind) or self._blend(kind) != "none"
+
+    def reset(self) -> None:
+        """Let the next frame start without a previous depth; the last scale is kept."""
+        self._propagated = None
+
+    def rescale(self, scale: float) -> None:
+        """Let the next frame start with a scale that is known."""
+        self._propagated, self._scale = None, scale
+
+    def _scales(self, kind: DepthKind) -> bool:
+        frame_scale = self.settings.constants.frame_scale
+        return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
+
+    def _pulled_back(self, scale: float, matched_share: float) -> float:
+        """Return the scale pulled back towards 1, the more the fewer pixels are matched to the previous frame."""
+        return float(scale ** (1 - self.settings.constants.scale_pull * max(1 - matched_share, 0.0) ** 2))
+
+    def _blend(self, kind: DepthKind) -> str:
+        if self.settings.constants.blend != "auto":
+            return self.settings.constants.blend
+        return "none" if kind == "measured" else "linear"
+
+    def _warped(
+        self,
+        camera: PinholeCamera,
+        correspondence: DenseCorrespondence | None,
+        T_current_previous: np.ndarray | None,
+        sigma: np.ndarray,
+    ) -> _Propagated:
+        """Warp the previous depth and its uncertainty to the current frame, whose own relative sigma is `sigma`."""
+        if correspondence is None or self._propagated is None:
+            nothing = np.full((camera.height, camera.width), np.nan, np.float32)
+            return _Propagated(nothing, nothing)
+        warped_mm = pull(self._propagated.depth_mm, correspondence.to_previous)
+        warped_mm = np.where(correspondence.consistent, warped_mm, np.float32(np.nan))
+        if T_current_previous is not None:
+            warped_mm = moved_depth(warped_mm, correspondence.to_previous, camera, T_current_previous)
+        filtered_mm = bilateral_filtered(
+            warped_mm, self.settings.constants.filter_sigma_px, self.settings.constants.filter_sigma_mm
+        )
+        warped_sigma = pull(self._propagated.relative_sigma, correspondence.to_previous)
+        return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.constants.sigma_fading))
+
+    def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
+        """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""
+        match blend:
+            case "exponential":
+                return np.exp(-distance / np.float32(self.settings.constants.tau))
+            case "linear":
+                return 1 - np.clip(distance, 0, 1)
+            case "paper-equation":
+                return np.clip(distance, 0, 1)
+        return np.full_like(distance, self.settings.constants.constant_weight)
+
+
+def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:
+    """Return the median ratio of warped to raw depth, or `otherwise` where they overlap too little."""
+    both = np.isfinite(raw_mm) & np.isfinite(warped_mm) & (raw_mm > 0)
+    if both.mean() < _MIN_OVERLAP:
+        return otherwise
+    return float(np.exp(np.median(np.log(warped_mm[both] / raw_mm[both]))))

@@ -1,0 +1,150 @@
+"""How well a fused mesh agrees with frames, without any truth: the mesh is rendered again at their poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import trimesh
+
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import FusionSettings
+from scopemap.engine.depth.estimate import PerceptualDistance
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.albedo import lit_by_lamp
+from scopemap.engine.geometry.rendering import Rendering, render_mesh
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.engine.geometry.similarity import structural_similarity
+from scopemap.engine.mapping.tissue_states import TissueStates
+
+_SAME_SURFACE = 0.02  # between a vertex and what is rendered at its pixel, of its depth: it is not hidden
+
+
+class FrameAgreement(NamedTuple):
+    """Agreement of a mesh with one frame.
+
+    coverage : share, 0..1, of the pixels with known depth where the mesh is seen.
+    depth_error : median of |ln(depth of the mesh / depth of the frame)| where both are known; NaN where nowhere.
+    ssim : mean structural similarity of grey values over all pixels with known depth; holes are black.
+    lpips : mean perceptual distance over the same pixels, all others black in both pictures; NaN: not measured.
+    """
+
+    coverage: float
+    depth_error: float
+    ssim: float
+    lpips: float = float("nan")
+
+
+def compare_with_frame(
+    mesh: trimesh.Trimesh,
+    camera: PinholeCamera,
+    T_world_camera: np.ndarray,
+    rgb: np.ndarray,
+    depth_mm: np.ndarray,
+    *,
+    albedo: bool = False,
+) -> tuple[FrameAgreement, Rendering]:
+    """Return the agreement of a mesh, world mm, vertex colours, with a frame, and the rendering of the mesh there.
+
+    T_world_camera : (4, 4). rgb : (H, W, 3) uint8. depth_mm : (H, W), NaN = unknown or not usable.
+    albedo : whether the vertex colours are those of the tissue: see `lit_like`.
+    """
+    rendering = render_mesh(mesh, camera, T_world_camera)
+    if albedo:
+        rendering = lit_like(rendering, camera, rgb, depth_mm)
+    return compare_rendering(rendering, rgb, depth_mm), rendering
+
+
+def lit_like(rendering: Rendering, camera: PinholeCamera, rgb: np.ndarray, depth_mm: np.ndarray) -> Rendering:
+    """Return the rendering of a mesh in the colours of the tissue as the lamp shows it, exposed as a frame is.
+
+    The light is that of fusion (`engine/fusion/albedo.py`) at the mesh's own distance. One number is fitted to the frame's
+    grey levels, its gain. rgb : (H, W, 3) uint8. depth_mm : (H, W), NaN = unknown or not usable.
+    """
+    lit = lit_by_lamp(rendering.rgb, rendering.depth_mm, camera)
+    seen = (depth_mm > 0) & np.isfinite(rendering.depth_mm)
+    shown, wanted = (cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY)[seen] for image in (lit, rgb))
+    gain = float(shown @ wanted / max(float(shown @ shown), 1.0))
+    return rendering._replace(rgb=np.clip(np.round(gain * lit), 0, 255).astype(np.uint8))
+
+
+def compare_rendering(
+    rendering: Rendering, rgb: np.ndarray, depth_mm: np.ndarray, perceptual: PerceptualDistance | None = None
+) -> FrameAgreement:
+    """Return the agreement of a rendering with a frame, as in `compare_with_frame`; lpips by `perceptual`, if given."""
+    known = depth_mm > 0
+    seen = known & np.isfinite(rendering.depth_mm)
+    error = np.abs(np.log(rendering.depth_mm[seen] / depth_mm[seen]))
+    grey, shown = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (rgb, rendering.rgb))
+    similarity = structural_similarity(grey, shown)
+    lpips = float("nan")
+    if perceptual is not None and known.any():
+        frame, view = (np.where(known[..., None], image, np.uint8(0)) for image in (rgb, rendering.rgb))
+        lpips = float(perceptual.compare(frame, view).map[known].mean())
+    return FrameAgreement(
+        float(seen.sum() / max(known.sum(), 1)),
+        float(np.median(error)) if error.size else float("nan"),
+        float(similarity[known].mean()) if known.any() else float("nan"),
+        lpips,
+    )
+
+
+def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
+    """Return the number of frames, mean and least coverage, median depth error, mean SSIM and LPIPS, where known."""
+    rows = list(agreements)
+    coverage, depth_error, ssim, lpips = (column[np.isfinite(column)] for column in np.array(rows).reshape(-1, 4).T)
+    figures: dict[str, float] = {"frames": len(rows)}
+    if coverage.size:
+        figures |= {"coverage_mean": float(coverage.mean()), "coverage_least": float(coverage.min())}
+    if depth_error.size:
+        figures["depth_error"] = float(np.median(depth_error))
+    if ssim.size:
+        figures["ssim"] = float(ssim.mean())
+    if lpips.size:
+        figures["lpips"] = float(lpips.mean())
+    return figures
+
+
+def surface_agreement(
+    mesh: trimesh.Trimesh, settings: FusionSettings, frames: list[Frame], states: TissueStates | None = None
+) -> dict[str, float]:
+    """Return the figures of a fusion's surface with some of its frames; {} without a surface or frames.
+
+    states : of tissue that moves, with which the surface is in that of each frame.
+    """
+    agreements = []
+    for frame in frames if len(mesh.faces) else []:
+        if frame.T_world_camera is not None and frame.depth_mm is not None:
+            depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
+            seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
+            then = mesh if states is None else states.moved(mesh, frame.index)
+            agreements.append(compare_with_frame(then, *seen, albedo=settings.colours == "albedo")[0])
+    return agreement_figures(agreements) if agreements else {}
+
+
+def vertex_sigmas(mesh: trimesh.Trimesh, frames: list[Frame], states: TissueStates | None = None) -> np.ndarray:
+    """Return the standard deviation of each vertex along the lines of sight, (V,) float32, mm; NaN: no frame sees it.
+
+    It is the root mean square, over the frames that see the vertex, of what their depth and the surface differ by or of
+    the depth's own standard deviation where that is larger. Many frames do not make it smaller: their errors are alike.
+    """
+    total, count = np.zeros(len(mesh.vertices)), np.zeros(len(mesh.vertices))
+    for frame in frames if len(mesh.faces) else []:
+        if frame.T_world_camera is None or frame.depth_mm is None:
+            continue
+        then = mesh if states is None else states.moved(mesh, frame.index)
+        z = transform(inverse(frame.T_world_camera), np.asarray(then.vertices))
+        shown = render_mesh(then, frame.camera, frame.T_world_camera).depth_mm
+        pixels = frame.camera.project(z)
+        limits = [frame.camera.width - 0.5, frame.camera.height - 0.5]
+        inside = np.flatnonzero(((pixels >= -0.5) & (pixels < limits)).all(axis=1))
+        (column, row), z_mm = np.round(pixels[inside]).astype(int).T, z[inside, 2]
+        error = np.abs(np.asarray(frame.depth_mm)[row, column] - z_mm)
+        if frame.depth_sigma_mm is not None:
+            error = np.fmax(error, np.asarray(frame.depth_sigma_mm)[row, column])
+        seen = frame.valid[row, column] & np.isfinite(error) & (np.abs(shown[row, column] / z_mm - 1) < _SAME_SURFACE)
+        total[inside[seen]] += error[seen] ** 2
+        count[inside[seen]] += 1
+    return np.sqrt(np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0)).astype(np.float32)

@@ -1,0 +1,131 @@
+"""Mesh files: PLY and GLB, with normals, colours and the confidence of each vertex; GLB with motion over time."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from scopemap.engine.geometry.rendering import vertex_colours
+from scopemap.engine.mapping.tissue_states import TissueStates
+
+# glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
+T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
+# trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
+_PLY_AXES = "unit: mm; axes: OpenCV (x right, y down, z forward)"
+_WRITTEN_COLOURS = "_COLOR_0"
+_FLOAT, _JSON, _BIN = 5126, 0x4E4F534A, 0x004E4942  # glTF 2.0, sections 3.6.2.2 and 4.4.3
+
+
+def save_mesh(
+    mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Path | None = None, *, comment: str = ""
+) -> None:
+    """Write a mesh with vertex colours, world mm, as binary PLY and as GLB.
+
+    The PLY keeps the world of trajectory.tum: mm, OpenCV axes (y down, z forward); vertex attributes such as
+    `confidence` are properties there. The GLB has metres, y up: 0.001 of the trajectory's unit with y and z negated. It
+    is matt and visible from both sides, its colours are linear with 16 bits (glTF 2.0, section 3.7.2.1): 8 bits would
+    hold dark sRGB levels 0 to 12 in two steps. Both have vertex normals. A mesh without faces gives no GLB. The unit,
+    the axes and `comment` are comments in the PLY and `asset.extras` in the GLB.
+    """
+    if ply_file is not None:
+        ply_file.write_bytes(ply_bytes(mesh, [_PLY_AXES, comment]))
+    if glb_file is not None and len(mesh.faces):
+        glb_file.write_bytes(_glb(mesh, comment))
+
+
+def save_mesh_over_time(mesh: trimesh.Trimesh, states: TissueStates, glb_file: Path, *, comment: str = "") -> None:
+    """Write a mesh as GLB whose tissue moves: a morph target for each curve, and an animation of their weights.
+
+    The animation has a key at each frame of `states`, at its time. Weights are 0 where a curve is lowest, and 1 where
+    it is highest: importers keep them within these. Otherwise as `save_mesh`. A mesh without faces gives no file.
+    """
+    if not len(mesh.faces):
+        return
+    low, high = states.curves.min(0), states.curves.max(0)
+    spread = np.where(high > low, high - low, 1.0)
+    motion = states.motion(np.asarray(mesh.vertices))
+    lowest = mesh.copy()
+    lowest.vertices = mesh.vertices + np.tensordot(low - states.reference, motion, 1)
+    targets = spread[:, None, None] * motion @ T_GLTF_WORLD[:3, :3].T
+    at_rest, weights = (states.reference - low) / spread, (states.curves - low) / spread
+    glb_file.write_bytes(_animated(_glb(lowest, comment), targets, at_rest, states.time_s, weights))
+
+
+def _animated(glb: bytes, targets: np.ndarray, at_rest: np.ndarray, time_s: np.ndarray, weights: np.ndarray) -> bytes:
+    """Return a GLB of one mesh with morph targets (L, V, 3), m, and their weights (F, L) over time.
+
+    glTF 2.0, sections 3.7.2.2, morph targets, and 3.11, animations.
+    """
+    (length,) = struct.unpack_from("<I", glb, 12)
+    tree, binary = json.loads(glb[20 : 20 + length]), bytearray(glb[28 + length :])
+    binary.extend(b"\0" * (-len(binary) % 4))
+
+    def accessor(values: np.ndarray, kind: str) -> int:
+        content = np.ascontiguousarray(values, "<f4")
+        tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": content.nbytes})
+        binary.extend(content.tobytes())
+        rows = content.reshape(len(content), -1)
+        limits = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+        about = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": _FLOAT, "count": len(content)}
+        tree["accessors"].append(about | {"type": kind} | limits)
+        return len(tree["accessors"]) - 1
+
+    (mesh,) = tree["meshes"]
+    mesh["weights"] = at_rest.tolist()
+    for primitive in mesh["primitives"]:
+        primitive["targets"] = [{"POSITION": accessor(target, "VEC3")} for target in targets]
+    node = next(number for number, node in enumerate(tree["nodes"]) if "mesh" in node)
+    sampler = {"input": accessor(time_s - time_s[0], "SCALAR"), "output": accessor(weights.ravel(), "SCALAR")}
+    channel = {"sampler": 0, "target": {"node": node, "path": "weights"}}
+    tree["animations"] = [{"name": "tissue", "samplers": [sampler], "channels": [channel]}]
+    tree["buffers"][0]["byteLength"] = len(binary)
+    text = json.dumps(tree).encode()
+    chunks = ((text + b" " * (-len(text) % 4), _JSON), (bytes(binary), _BIN))
+    body = b"".join(struct.pack("<II", len(content), kind) + content for content, kind in chunks)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
+    """Return a mesh, or its vertices where it has no faces, as binary PLY with these comments but empty ones."""
+    content = trimesh.exchange.ply.export_ply(mesh, encoding="binary", vertex_normal=bool(len(mesh.faces)))
+    head, end, rest = content.partition(b"\nelement vertex")
+    for line in comments:
+        head += f"\ncomment {line}".encode() if line else b""
+    return head + end + rest
+
+
+def _glb(mesh: trimesh.Trimesh, comment: str) -> bytes:
+    R = T_GLTF_WORLD[:3, :3]
+    rotated = trimesh.Trimesh(
+        mesh.vertices @ R.T,
+        mesh.faces,
+        vertex_normals=mesh.vertex_normals @ np.sign(R),
+        vertex_attributes={_WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])},
+        process=False,
+    )
+
+    def finish(tree: dict[str, Any]) -> None:
+        # Without a material viewers show metal.
+        matt = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+        tree["materials"] = [{"doubleSided": True, "pbrMetallicRoughness": matt}]
+        tree["asset"]["extras"] = {"unit": "m", "axes": "y up", "comment": comment}
+        for primitive in (primitive for part in tree["meshes"] for primitive in part["primitives"]):
+            primitive["material"] = 0
+            colours = primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_WRITTEN_COLOURS)
+            tree["accessors"][colours]["normalized"] = True
+
+    return trimesh.exchange.gltf.export_glb(trimesh.Scene(rotated), include_normals=True, tree_postprocessor=finish)
+
+
+def _linear_16_bit(srgb: np.ndarray) -> np.ndarray:
+    """Return (V, 4) uint16 linear colours, opaque, 65535 = 1, of (V, 3) uint8 sRGB colours (IEC 61966-2-1)."""
+    level = np.arange(256) / 255.0
+    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    rgba = np.full((len(srgb), 4), 65535, np.uint16)
+    rgba[:, :3] = np.round(65535 * linear).astype(np.uint16)[srgb]
+    return rgba

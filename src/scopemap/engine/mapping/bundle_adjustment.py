@@ -1,0 +1,359 @@
+"""Bundle adjustment: keyframe poses, a depth scale of each, the depth of every point and, if unknown, the lens.
+
+With the notation of `bundle_problem`:
+
+    sum of rho(|projected - observed| / s) / c  +  sum of rho((u_p - ln depth_p - a_h) / sigma_p)
+    +  sum of (a_k / sigma_a)^2  +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted
+    +  sum of ((lens - expected) / sigma_lens)^2
+
+rho is Cauchy's kernel, s the robust standard deviation of the reprojection errors, c the number of observations that
+count as one, because the errors of flow are alike at neighbouring corners. The second sum holds points to the estimated
+depth, up to the keyframe's factor exp(a_h); the third holds these factors to 1; the fourth holds a keyframe j to its
+tracked motion from keyframe i; the last is for an unknown lens. Dog-leg with Schur complement: Triggs et al., "Bundle
+Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
+
+More than a few hundred keyframes are adjusted window by window, so that time grows with their number, not its cube.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from scopemap.engine.geometry import least_squares
+from scopemap.engine.geometry.least_squares import (
+    CameraBlock,
+    PointBlock,
+    SchurModel,
+    cauchy,
+    minimise,
+    robust_sigma_2d,
+)
+from scopemap.engine.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
+from scopemap.engine.mapping.bundle_problem import (
+    BundleProblem,
+    Observations,
+    Points,
+    Reprojection,
+    State,
+    jacobians,
+    reproject,
+)
+
+PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
+CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
+_BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
+_INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
+_POINT_STEPS = 5  # of the points alone, after the keyframes
+_ADDED_WITH, _ADDED_ITERATIONS = 2, 6  # keyframes before a new one that move with it, and steps of each search
+WINDOW = 300
+"""Most keyframes that are adjusted at once."""
+RIGID_SIGMA_PX = 0.4
+"""Robust standard deviation of reprojection errors above which a scene is hardly rigid: rigid ones leave at most 0.3 px
+between near keyframes (0.45 in a fast, interlaced video, C3VD trans_t2_a), moving tissue leaves 0.4 to 1.5."""
+HELD_SIGMA = 0.01
+"""Least standard deviation of ln depth of points that an earlier window adjusted."""
+
+
+class BundleSolution(NamedTuple):
+    """Where the adjustment ended.
+
+    state : the first keyframe's pose as it was; sigma_px : robust standard deviation of the reprojection errors.
+    log_depth_sigma : (P,) standard deviation of ln depth by the observations alone, keyframes held; infinite where no
+    other keyframe observes a point. iterations : accepted and rejected.
+    """
+
+    state: State
+    log_depth_sigma: np.ndarray
+    iterations: int
+
+    @property
+    def sigma_px(self) -> float:
+        """Robust standard deviation of the reprojection errors, px; NaN without observations."""
+        return self.state.sigma_px
+
+
+def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSolution:
+    """Return the solution of windows of successive keyframes, one after the other; of one window that of `adjust`."""
+    start, count = problem.begin, len(problem.T_camera_world)
+    if count <= window:
+        return adjust(problem)
+    found = BundleSolution(start, np.full(len(start.log_depth), np.inf), 0)
+    # Equally long windows: a last one of few keyframes would hardly be adjusted.
+    edges = np.linspace(0, count, -(-count // window) + 1).astype(int)
+    for first, end in itertools.pairwise(edges):
+        if first:  # From where the window before has ended.
+            state, at_start = found.state, problem.begin.T_camera_world
+            T = state.T_camera_world.copy()
+            T[first:] = at_start[first:] @ inverse(at_start[first - 1]) @ T[first - 1]
+            found = found._replace(state=state._replace(T_camera_world=T))
+        found = _with_window(problem, found, first, end)
+    lengths_px = errors_px(problem, found.state)
+    sigma_px = robust_sigma_2d(lengths_px[np.isfinite(lengths_px)], problem.least_sigma_px)
+    return found._replace(state=found.state._replace(sigma_px=sigma_px))
+
+
+def adjust_one_by_one(problem: BundleProblem) -> BundleSolution:
+    """Return the solution of keyframes that are added one after the other, as incremental structure from motion does.
+
+    Each begins at the pose of the one before and is adjusted with the two before it, those before these held; then all
+    together.
+    """
+    found = BundleSolution(problem.begin, np.full(len(problem.points.host), np.inf), 0)
+    for k in range(1, len(problem.T_camera_world)):
+        T = found.state.T_camera_world.copy()
+        T[k] = T[k - 1]
+        found = found._replace(state=found.state._replace(T_camera_world=T))
+        found = _with_window(problem, found, max(k - _ADDED_WITH, 0), k + 1, _ADDED_ITERATIONS)
+    return adjust_in_windows(replace(problem, start=found.state))
+
+
+def _with_window(
+    problem: BundleProblem, found: BundleSolution, first: int, end: int, max_iterations: int = 20
+) -> BundleSolution:
+    """Return the solution with the keyframes from `first` to before `end` adjusted, those before `first` being so."""
+    points, seen, state = problem.points, problem.observations, found.state
+    moved = state.T_camera_world.copy()
+    host, observer = points.host[seen.point], seen.keyframe
+    some = (np.maximum(host, observer) >= first) & (np.maximum(host, observer) < end)
+    if not some.any():
+        return found
+    keyframes = np.union1d(np.union1d(host[some], observer[some]), np.arange(max(first - 1, 0), end))
+    own = np.union1d(seen.point[some], np.flatnonzero((points.host >= first) & (points.host < end)))
+    place = np.full(len(state.T_camera_world), -1)
+    place[keyframes] = np.arange(len(keyframes))
+    known, log_scale = points.host[own] < first, state.log_scale[points.host[own]]
+    log_depth = np.where(known, state.log_depth[own] - log_scale, points.log_depth[own])
+    sigma = np.where(known, np.clip(found.log_depth_sigma[own], HELD_SIGMA, points.sigma[own]), points.sigma[own])
+    part = replace(
+        problem,
+        T_camera_world=problem.T_camera_world[keyframes],
+        points=Points(place[points.host[own]], points.pixel[own], log_depth, sigma),
+        observations=Observations(np.searchsorted(own, seen.point[some]), place[observer[some]], seen.pixel[some]),
+        neighbours=place[problem.neighbours[(place[problem.neighbours] >= 0).all(1)]],
+        start=State(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.lens),
+        held=int((keyframes < first).sum()),
+    )
+    solved, new = adjust(part, max_iterations=max_iterations), ~known
+    log_depth, sigma, log_scale = state.log_depth.copy(), found.log_depth_sigma.copy(), state.log_scale.copy()
+    log_depth[own[new]], sigma[own[new]] = solved.state.log_depth[new], solved.log_depth_sigma[new]
+    moved[keyframes], log_scale[keyframes] = solved.state.T_camera_world, solved.state.log_scale
+    return BundleSolution(State(moved, log_scale, log_depth, state.lens), sigma, found.iterations + solved.iterations)
+
+
+def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: float = 1e-3) -> BundleSolution:
+    """Return the solution that the search finds from the start; without observations everything stays as tracked."""
+    start = problem.begin
+    if not len(problem.observations.point) or len(problem.T_camera_world) < 2:
+        return BundleSolution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
+
+    def rescaled(state: State) -> State:
+        reprojection = reproject(problem, state)
+        lengths = np.linalg.norm(reprojection.error[reprojection.ahead], axis=1)
+        return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
+
+    options = least_squares.Options(np.inf, max_iterations, min_step=0.0, min_decrease=min_decrease)
+    search = least_squares.Problem(partial(linearised, problem), partial(retract, problem), rescaled)
+    found = minimise(search, rescaled(start), options)
+    state = found.state._replace(T_camera_world=np.stack([orthonormalised(T) for T in found.state.T_camera_world]))
+    if problem.correlated > 1:
+        state = with_points(problem, state)
+    return BundleSolution(state, log_depth_sigma(problem, state), found.iterations)
+
+
+def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
+    """Return the lengths of the reprojection errors (N,) of a state, px; infinite behind a camera."""
+    if not len(problem.observations.point):
+        return np.zeros(0)
+    reprojection = reproject(problem, state)
+    return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
+
+
+def weights(state: State, seen: Reprojection) -> np.ndarray:
+    """Return the robust weights (N,) of the observations, 1/px^2."""
+    return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, CAUCHY)[1], 0) / state.sigma_px**2
+
+
+def linearised(problem: BundleProblem, state: State) -> SchurModel:
+    """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
+    count, lens = len(state.T_camera_world), 0 if problem.lens_sigma is None else 3
+    seen = reproject(problem, state)
+    edges = odometry_edges(problem, state)
+    held = [6 + PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
+    held += [np.arange(6), np.arange(PER_KEYFRAME * problem.held)]
+    unknowns = PER_KEYFRAME * count + lens
+    free = np.setdiff1d(np.arange(unknowns), np.concatenate(held))
+
+    def build() -> tuple[list[PointBlock], list[CameraBlock]]:
+        parts = _Rows(seen.error, weights(state, seen) / problem.correlated, *jacobians(problem, state, seen))
+        hosts = [_host_block(problem, state, host, parts) for host in np.unique(problem.points.host)]
+        return hosts, camera_blocks(problem, state, edges)
+
+    return SchurModel(cost(problem, state, seen, edges), build, free, unknowns, len(state.log_depth))
+
+
+def cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[OdometryEdge]) -> float:
+    """Return what is minimised, at a state."""
+    points, priors = problem.points, problem.priors
+    square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
+    depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
+    cost = cauchy(square, CAUCHY)[0].sum() / problem.correlated + cauchy(depth**2, CAUCHY)[0].sum()
+    cost += 0.5 * sum(float(edge.error @ (edge.information * edge.error)) for edge in edges)
+    if priors.scale > 0:
+        cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
+    if problem.lens_sigma is not None:
+        cost += 0.5 * (((state.lens - problem.tracked.lens) / problem.lens_sigma) ** 2).sum()
+    return float(cost)
+
+
+class OdometryEdge(NamedTuple):
+    """Deviation of two keyframes from the tracked motion between them."""
+
+    i: int
+    j: int
+    error: np.ndarray  # (6,) twist
+    information: np.ndarray  # (6,)
+
+
+def odometry_edges(problem: BundleProblem, state: State) -> list[OdometryEdge]:
+    """Deviations from the tracked motion between neighbours."""
+    priors, tracked, T = problem.priors, problem.T_camera_world, state.T_camera_world
+    information = np.repeat([priors.rotation_rad, priors.translation_share * problem.unit_mm], 3) ** -2.0
+    return [
+        OdometryEdge(i, j, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
+        for i, j in problem.neighbours
+    ]
+
+
+def camera_blocks(problem: BundleProblem, state: State, edges: list[OdometryEdge]) -> list[CameraBlock]:
+    """Return the normal equations of the priors of keyframes, and of the lens."""
+    T, unit, blocks = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), []
+    for i, j, error, information in edges:
+        own = np.append(PER_KEYFRAME * i + np.arange(6), PER_KEYFRAME * j + np.arange(6))
+        J = np.hstack([-_adjoint(T[j] @ inverse(T[i])), np.eye(6)]) * np.tile(unit, 2)
+        blocks.append(CameraBlock(own, J.T @ (information[:, None] * J), J.T @ (information * error)))
+    if problem.priors.scale > 0:
+        information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + PER_KEYFRAME * np.arange(len(T))
+        blocks.append(CameraBlock(own, np.diag(information), information * state.log_scale))
+    if problem.lens_sigma is not None:
+        information, own = problem.lens_sigma**-2.0, PER_KEYFRAME * len(T) + np.arange(3)
+        change = state.lens - problem.tracked.lens
+        blocks.append(CameraBlock(own, np.diag(information), information * change))
+    return blocks
+
+
+class _Rows(NamedTuple):
+    """What is summed over observations: derivatives by the observing camera, the host, ln depth and the lens."""
+
+    error: np.ndarray  # (N, 2)
+    weight: np.ndarray  # (N,)
+    by_camera: np.ndarray  # (N, 2, 6)
+    by_host: np.ndarray  # (N, 2, 6)
+    by_depth: np.ndarray  # (N, 2)
+    by_lens: np.ndarray  # (N, 2, 3), or (N, 2, 0)
+
+
+def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -> PointBlock:
+    """Return the normal equations of the points of one host."""
+    points, observations = problem.points, problem.observations
+    here = slice(*np.searchsorted(points.host, (host, host + 1)))
+    some = slice(*np.searchsorted(observations.point, (here.start, here.stop)))
+    keyframes = np.union1d(observations.keyframe[some], host)
+    count, at = here.stop - here.start, int(np.searchsorted(keyframes, host))
+    number, observer = observations.point[some] - here.start, np.searchsorted(keyframes, observations.keyframe[some])
+    A, b, E, h, g = _summed(_Rows(*(part[some] for part in parts)), number, observer, at, count, len(keyframes))
+    # The prior of the estimated depth, up to the host's scale.
+    off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], PER_KEYFRAME * at + 6
+    held = cauchy((off / points.sigma[here]) ** 2, CAUCHY)[1] / points.sigma[here] ** 2
+    E[:, column] -= held
+    A[column, column] += held.sum()
+    b[column] -= (held * off).sum()
+    columns = (PER_KEYFRAME * keyframes[:, None] + np.arange(PER_KEYFRAME)).ravel()
+    columns = np.append(columns, PER_KEYFRAME * len(state.T_camera_world) + np.arange(parts.by_lens.shape[2]))
+    return PointBlock(columns, A, b, here, h + held, g + held * off, E)
+
+
+@njit(cache=True, nogil=True)
+def _summed(
+    rows: _Rows, point: np.ndarray, observer: np.ndarray, host: int, points: int, keyframes: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return A, b, E, h and g of a `PointBlock`, summed over the observations of a host's points."""
+    error, weight, by_camera, by_host, by_depth, by_lens = rows
+    lens = by_lens.shape[2]
+    last = PER_KEYFRAME * keyframes
+    size = last + lens
+    A = np.zeros((size, size))
+    b, E = np.zeros(size), np.zeros((points, size))
+    h, g = np.zeros(points), np.zeros(points)
+    touched = np.empty(12 + lens, np.int64)
+    touched[6:12] = PER_KEYFRAME * host + np.arange(6)
+    touched[12:] = last + np.arange(lens)
+    rows_of, weighed = np.empty((2, 12 + lens)), np.empty((2, 12 + lens))
+    for k in range(len(weight)):
+        touched[:6] = PER_KEYFRAME * observer[k] + np.arange(6)
+        for axis in range(2):
+            row, own = rows_of[axis], weight[k] * by_depth[k, axis]
+            row[:6], row[6:12], row[12:] = by_camera[k, axis], by_host[k, axis], by_lens[k, axis]
+            weighed[axis] = weight[k] * row
+            h[point[k]] += own * by_depth[k, axis]
+            g[point[k]] += own * error[k, axis]
+        for i in range(12 + lens):
+            one, other, at = weighed[0, i], weighed[1, i], touched[i]
+            E[point[k], at] += one * by_depth[k, 0] + other * by_depth[k, 1]
+            b[at] += one * error[k, 0] + other * error[k, 1]
+            for j in range(i, 12 + lens):
+                A[at, touched[j]] += one * rows_of[0, j] + other * rows_of[1, j]
+    # Of each pair of unknowns one product was added; an observer is never the host.
+    for i in range(size):
+        for j in range(i):
+            A[i, j] += A[j, i]
+            A[j, i] = A[i, j]
+    return A, b, E, h, g
+
+
+def with_points(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> State:
+    """Return the state with the points where all observations place them, keyframes and motion of tissue held."""
+    points, number = problem.points, problem.observations.point
+    for _ in range(_POINT_STEPS):
+        seen = reproject(problem, state, moved)
+        by_depth, weight = jacobians(problem, state, seen)[2], weights(state, seen)
+        h, g = (np.bincount(number, weight * (by_depth * by).sum(1), len(points.host)) for by in (by_depth, seen.error))
+        off = state.log_depth - points.log_depth - state.log_scale[points.host]
+        held = cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2
+        step = -(g + held * off) / (h + held)
+        state = state._replace(log_depth=state.log_depth - np.log(np.clip(1 - step, *_INVERSE_DEPTH_STEP)))
+    return state
+
+
+def log_depth_sigma(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> np.ndarray:
+    """Return the standard deviation of ln depth (P,) by the observations alone; infinite without any."""
+    seen = reproject(problem, state, moved)
+    by_depth = jacobians(problem, state, seen)[2]
+    information = weights(state, seen) * (by_depth**2).sum(1)
+    with np.errstate(divide="ignore"):
+        return 1 / np.sqrt(np.bincount(problem.observations.point, information, len(state.log_depth)))
+
+
+def _adjoint(T: np.ndarray) -> np.ndarray:
+    """Adjoint (6, 6) of a pose for twists of rotation first."""
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = T[:3, :3]
+    adjoint[3:, :3] = hat(T[:3, 3]) @ T[:3, :3]
+    return adjoint
+
+
+def retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
+    """Return the state after a step; points move along their rays in inverse depth, which parallax is linear in."""
+    count = PER_KEYFRAME * len(state.T_camera_world)
+    own = step[:count].reshape(-1, PER_KEYFRAME)
+    twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
+    T = np.stack([se3_exp(twist) @ pose for twist, pose in zip(twists, state.T_camera_world, strict=True)])
+    lens = state.lens if problem.lens_sigma is None else state.lens + step[count : count + 3]
+    by_points = step[len(step) - len(state.log_depth) :]
+    log_depth = state.log_depth - np.log(np.clip(1 - by_points, *_INVERSE_DEPTH_STEP))
+    return State(T, state.log_scale + own[:, 6], log_depth, lens, state.sigma_px)

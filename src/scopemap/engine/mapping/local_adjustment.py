@@ -1,0 +1,227 @@
+"""Local bundle adjustment: each new keyframe with the few before it, before frames are tracked against it.
+
+What ORB-SLAM's local mapping does, but in the tracker's thread, so that a result does not depend on the machine. Frames
+that are tracked against a keyframe take over the correction of its depth. Loops are not closed, maps not merged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.mapping.bundle_adjustment import HELD_SIGMA, RIGID_SIGMA_PX, BundleSolution, adjust
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State
+from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
+from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
+from scopemap.engine.mapping.lens_residual import LensEvidence, LensResidual, lens_evidence
+from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
+from scopemap.engine.mapping.pose_interpolation import KeyframeStep
+from scopemap.engine.notices import Notice
+
+_FREE = 3  # last keyframes of the window that move
+_ITERATIONS = 10
+_LEAST_SEEN = 0.1  # of a keyframe's points that those before it must observe: else nothing corrects its depth
+_REMEMBERED = 1000  # keyframes whose correction is kept: the tracker returns to fewer
+_LENS_EVERY = 4  # adjusted keyframes: windows that have hardly a keyframe in common
+_LENS_SIGMA = 0.01  # of ln f, below which no further windows are asked
+_MOST_REFUSED = 0.1  # of the keyframes: with more, the scene is not rigid
+
+
+class KeyframeCorrection(NamedTuple):
+    """Correction of a keyframe's depth: ln of the factor of all of it, and of that of each pixel (None: 1)."""
+
+    log_scale: float = 0.0
+    field: DepthCorrectionField | None = None
+
+    def corrected(self, frame: Frame) -> Frame:
+        """Return a frame with its depth, and the standard deviation of that, corrected."""
+        depth_mm, sigma_mm = np.asarray(frame.depth_mm), frame.depth_sigma_mm
+        log = 0.0 if self.field is None else self.field.log_factor(depth_mm)
+        factor = np.exp(np.float32(self.log_scale) + log, dtype=np.float32)
+        return replace(
+            frame, depth_mm=depth_mm * factor, depth_sigma_mm=None if sigma_mm is None else sigma_mm * factor
+        )
+
+
+class AdjustedKeyframe(NamedTuple):
+    """A keyframe as adjusted, what was matched of it, and by how much it was moved."""
+
+    keyframe: Frame
+    matches: KeyframeMatches
+    step: KeyframeStep
+
+
+class _WindowKeyframe(NamedTuple):
+    """A keyframe of the window: its frame's number and that of the keyframe it was tracked against, and its state.
+
+    log_depth, sigma : (n,) of its points, ln mm, and the standard deviation of that as in `BundleSolution`.
+    """
+
+    frame: int
+    reference: int
+    T_camera_world: np.ndarray
+    log_scale: float
+    log_depth: np.ndarray
+    sigma: np.ndarray
+
+
+class LocalAdjustment:
+    """Takes keyframes as they are tracked; corrects them, and the depth of the frames tracked against them.
+
+    settings : with `local_window`, keyframes that are adjusted together. flow : between keyframes, in one thread.
+    """
+
+    def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
+        self._settings, self._flow = settings, flow
+        self._tracks = FeatureTracks(settings, flow, gaps=settings.constants.local_gaps)
+        self._window: deque[_WindowKeyframe] = deque(maxlen=settings.constants.local_window)
+        self._corrections: dict[int, KeyframeCorrection] = {}
+        self._adjusted, self._refused = Counter[int](), Counter[int]()
+        self._lens_evidence: LensEvidence | None = None
+        self._lens = LensResidual()
+        self._is_determined = False
+        self._shapes: dict[int, ShapeTest] = {}
+
+    def corrected(self, frame: Frame, reference: int) -> Frame:
+        """Return a frame, tracked against the keyframe of frame `reference`, with its depth corrected as that one's."""
+        return self._correction(reference).corrected(frame)
+
+    def adjusted(self, keyframe: Frame, reference: int, map_number: int) -> AdjustedKeyframe:
+        """Return a new keyframe with its pose adjusted and its depth corrected.
+
+        keyframe : with its pose as tracked, against the keyframe of frame `reference`, and its depth as estimated. It
+        is adjusted with those before it where one of them, or what one of them was tracked against, is the reference.
+        Elsewhere, where these observe hardly any of its points, and where no rigid scene explains the observations, it
+        takes over the correction of the reference.
+        """
+        if reference not in {number for one in self._window for number in (one.frame, one.reference)}:
+            self._begin()
+        matches = self._take(keyframe, reference)
+        correction = self._correction(reference)
+        if len(self._window) > 1:
+            points, observations = self._tracks.collected(self._numbers)
+            found = adjust(self._problem(points, observations, keyframe.camera.fx), max_iterations=_ITERATIONS)
+            found, is_determined = self._with_other_starts(points, observations, found, keyframe.camera.fx, map_number)
+            own_sigma = found.log_depth_sigma[points.host == len(self._window) - 1]
+            is_seen = np.isfinite(own_sigma).sum() > _LEAST_SEEN * len(own_sigma)
+            if not (is_seen and found.sigma_px <= RIGID_SIGMA_PX and is_determined):
+                self._refused[map_number] += int(is_seen)
+                self._begin()
+                self._take(keyframe, reference)
+            else:
+                self._adjusted[map_number] += 1
+                self._test_lens(points, observations, found.state, keyframe.camera.fx)
+                correction = self._update(points, found, keyframe.camera)
+        self._corrections[keyframe.index] = correction
+        while len(self._corrections) > _REMEMBERED:
+            del self._corrections[next(iter(self._corrections))]
+        T_camera_world = self._window[-1].T_camera_world
+        moved = correction.corrected(replace(keyframe, T_world_camera=inverse(T_camera_world)))
+        more = correction.log_scale - self._correction(reference).log_scale
+        step = KeyframeStep(T_camera_world @ np.asarray(keyframe.T_world_camera), more)
+        return AdjustedKeyframe(moved, matches, step)
+
+    def take_over(self, index: int, reference: int) -> None:
+        """Have frames be tracked against frame `index` too, which was tracked against the keyframe of `reference`."""
+        self._corrections[index] = self._correction(reference)
+        if self._window and self._window[-1].frame == reference:
+            self._window[-1] = self._window[-1]._replace(reference=index)
+
+    def notices(self, map_number: int) -> list[Notice]:
+        """Return what was adjusted of a map, what determines its shape, and another lens; [] where nothing was."""
+        adjusted, refused = self._adjusted[map_number], self._refused[map_number]
+        if not adjusted + refused:
+            return []
+        values = {"adjusted": adjusted, "refused": refused}
+        moves = refused > _MOST_REFUSED * (adjusted + refused)
+        shape = self._shapes.get(map_number, ShapeTest()).notices
+        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *shape, *self._lens.notices]
+
+    @property
+    def _numbers(self) -> range:
+        """Numbers of the window's keyframes among those of the feature tracks."""
+        return range(self._tracks.keyframe_count - len(self._window), self._tracks.keyframe_count)
+
+    def _begin(self) -> None:
+        """Begin a window without keyframes."""
+        self._tracks = FeatureTracks(self._settings, self._flow, gaps=self._settings.constants.local_gaps)
+        self._window.clear()
+        self._is_determined = False
+
+    def _correction(self, reference: int) -> KeyframeCorrection:
+        return self._corrections.get(reference, KeyframeCorrection())
+
+    def _take(self, keyframe: Frame, reference: int) -> KeyframeMatches:
+        """Put a keyframe in the window, as tracked; return its matches."""
+        assert keyframe.T_world_camera is not None
+        matches = self._tracks.add(keyframe)
+        points, _ = self._tracks.collected([self._tracks.keyframe_count - 1])
+        log_scale = self._correction(reference).log_scale
+        state = log_scale, points.log_depth + log_scale, np.full(len(points.host), np.inf)
+        self._window.append(_WindowKeyframe(keyframe.index, reference, inverse(keyframe.T_world_camera), *state))
+        self._tracks.keep_last(len(self._window))
+        return matches
+
+    def _problem(self, points: Points, observations: Observations, focal_px: float) -> BundleProblem:
+        """Return the adjustment of the window, from where its keyframes are; the first ones are held."""
+        constants, count = self._settings.constants, len(self._window)
+        _, _, T_camera_world, log_scale, log_depth, found_sigma = map(list, zip(*self._window, strict=True))
+        T, lens = np.stack(T_camera_world), np.array([np.log(focal_px), 0.0, 0.0])
+        start = State(T, np.array(log_scale), np.concatenate(log_depth), lens)
+        held = max(count - _FREE, 0)
+        known, sigma = points.host < held, np.clip(np.concatenate(found_sigma), HELD_SIGMA, points.sigma)
+        estimated = np.where(known, start.log_depth - start.log_scale[points.host], points.log_depth)
+        points = replace(points, log_depth=estimated, sigma=np.where(known, sigma, points.sigma))
+        rotation_rad = math.radians(constants.rotation_sigma_deg)
+        priors = Priors(constants.scale_sigma, rotation_rad, constants.translation_sigma_share)
+        facts = (points, observations, priors, np.arange(count - 1)[:, None] + [0, 1], focal_px)
+        correlated = constants.correlated_observations
+        return BundleProblem(T, *facts, start=start, correlated=correlated, held=held)
+
+    def _with_other_starts(
+        self, points: Points, observations: Observations, found: BundleSolution, focal_px: float, map_number: int
+    ) -> tuple[BundleSolution, bool]:
+        """Return the solution of the start that wins in the first full window that tells, and whether one does."""
+        is_due = len(self._window) == self._window.maxlen and not self._is_determined
+        if not (is_due and self._settings.constants.other_starts):
+            return found, True
+        problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
+        best, test = with_other_starts(problem, found, is_rigid=found.sigma_px <= RIGID_SIGMA_PX)
+        if test.outcome != "not tested":
+            self._is_determined = test.outcome != "not determined"
+            self._shapes[map_number] = test
+        return best, test.outcome != "not determined"
+
+    def _test_lens(self, points: Points, observations: Observations, state: State, focal_px: float) -> None:
+        """Ask one full window in a few what its views tell of the lens, until they tell it."""
+        is_due = len(self._window) == self._window.maxlen and not self._adjusted.total() % _LENS_EVERY
+        if is_due and not self._lens.sigma <= _LENS_SIGMA:
+            problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
+            evidence = lens_evidence(problem, state)
+            if evidence is not None:
+                self._lens_evidence = evidence.and_also(self._lens_evidence)
+                # So short windows do not tell the principal point well: a right lens of a real clip had -0.1 +- 0.02.
+                asked = self._lens_evidence.residual._replace(x=0.0, y=0.0)
+                self._lens = asked.with_effect(problem, state)
+
+    def _update(self, points: Points, found: BundleSolution, camera: PinholeCamera) -> KeyframeCorrection:
+        """Take over an adjustment; return the correction of the window's last keyframe."""
+        state, sigma, last = found.state, found.log_depth_sigma, len(self._window) - 1
+        for k, keyframe in enumerate(self._window):
+            own = points.host == k
+            T, log_scale, log_depth = state.T_camera_world[k], float(state.log_scale[k]), state.log_depth[own]
+            changed = {"T_camera_world": T, "log_scale": log_scale, "log_depth": log_depth, "sigma": sigma[own]}
+            self._window[k] = keyframe._replace(**changed)
+        alone = Points(points.host[own] - last, points.pixel[own], points.log_depth[own], points.sigma[own])
+        error = state.log_depth[own] - alone.log_depth - log_scale
+        step_sigma = self._settings.constants.depth_step_sigma
+        return KeyframeCorrection(log_scale, fit_depth_corrections(camera, alone, 1, error, sigma[own], step_sigma)[0])

@@ -1,0 +1,299 @@
+"""Multi-view depth: the depth of a keyframe, triangulated at every pixel against frames before and after it.
+
+Poses are far more accurate than predicted depth. A neighbour, warped into the keyframe by pose and depth, differs from
+it by a small flow; its part along the epipolar line measures the error of depth, its part across tests the poses and
+the rigidity of the tissue. Estimates of several neighbours are combined by M-estimation, and what they disagree by is
+the standard deviation: where they agree less than the predicted depth is uncertain, that depth stays. Where tissue is
+known to move, frames count the less the farther it moved between them and the keyframe: nothing tests a motion along
+the epipolar line.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.engine.mapping.triangulation import (
+    VIEW_SIGMA,
+    Intrinsics,
+    add_comparison,
+    combine,
+    epipolar_error,
+    parallax_px,
+    project,
+)
+from scopemap.engine.notices import Notice
+
+# Displacements in px per unit of ln depth that are aimed at: the median of all pixels, and that of the farthest fifth.
+# Less is noise, more is hard to match.
+_PARALLAX_PX, _FAR_PARALLAX_PX = (10.0, 20.0), (12.0,)
+_MIN_PARALLAX_PX = 1.5
+_FAR_PERCENTILE = 80
+# Frames before and after a keyframe among which its neighbours are sought, and the step of the pixels that tell.
+_SEARCHED_FRAMES, _SAMPLED_EVERY = 150, 8
+# Standard deviations of flow along one axis, and of predicted ln depth.
+_FLOW_SIGMA_PX, PRIOR_SIGMA = 0.3, 0.3
+# Above this median standard deviation tissue moves or poses are wrong: the predicted depth is better.
+MAX_SIGMA = 0.08
+_MAX_LOG_FACTOR = 0.5
+_MIN_SPREAD = 4.0  # grey levels of normalised contrast, standard deviation
+_WARPS = 2
+_PROPAGATED_EVERY = 2  # pixels of a row and a column are compared with keyframes; what depth is off by is smooth
+_CACHED_VIEWS = 24
+# Standard deviations of Gaussian windows, px: of local contrast, of the disagreement's mean, of the result, and of
+# the result where little is measured.
+_CONTRAST_PX, _DISAGREEMENT_PX, _SMOOTHING_PX, _WIDE_PX = 6.0, 6.0, 2.0, 16.0
+
+
+class StereoView(NamedTuple):
+    """A frame for triangulation.
+
+    contrast : (H, W, 3) uint8, grey values with normalised local contrast, from `normalised_contrast`. depth_mm :
+    (H, W) float32, NaN = unknown or not usable. T_world_camera : (4, 4). moved_px : of a neighbour, how far the tissue
+    at each pixel of the triangulated frame had moved when it was seen, (H, W) float32, px.
+    """
+
+    contrast: np.ndarray
+    depth_mm: np.ndarray
+    T_world_camera: np.ndarray
+    moved_px: np.ndarray | np.float32 = np.float32(0)
+
+
+class TriangulatedDepth(NamedTuple):
+    """Depth of a frame, each (H, W) float32.
+
+    depth_mm : NaN where it was unknown or not usable. sigma : standard deviation of its ln. log_factor : ln of what the
+    depth was multiplied by; continued where depth is not usable.
+    """
+
+    depth_mm: np.ndarray
+    sigma: np.ndarray
+    log_factor: np.ndarray
+
+
+def normalised_contrast(rgb: np.ndarray) -> np.ndarray:
+    """Return grey values (H, W, 3) uint8 without local mean and contrast, so that lamp and exposure cancel."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    contrast = local_contrast(grey - local_mean(grey, _CONTRAST_PX), _CONTRAST_PX, unit=40.0, least=2.0)
+    return cv2.merge([np.clip(128 + contrast, 0, 255).astype(np.uint8)] * 3)
+
+
+def choose_neighbours(
+    index: int, depth_mm: np.ndarray, camera: PinholeCamera, T_world_camera: Mapping[int, np.ndarray]
+) -> list[int]:
+    """Return the numbers of the frames that triangulate a frame's depth best: up to three before, three after it.
+
+    index : of the frame. depth_mm : (H, W), NaN = unknown. T_world_camera : (4, 4) poses by number, of this frame, too.
+    """
+    points = (camera.rays * depth_mm[..., None])[::_SAMPLED_EVERY, ::_SAMPLED_EVERY].reshape(-1, 3)
+    points = points[np.isfinite(points[:, 2])]
+    if not len(points):
+        return []
+    order, chosen = sorted(T_world_camera), list[int]()
+    far, size = points[:, 2] >= np.percentile(points[:, 2], _FAR_PERCENTILE), np.array([camera.width, camera.height])
+    for side in ([number for number in order if number < index], [number for number in order if number > index]):
+        motions = [inverse(T_world_camera[number]) @ T_world_camera[index] for number in side] or np.zeros((0, 4, 4))
+        parallax = parallax_px(points, far, np.array(motions), _intrinsics(camera), size)
+        for kind, wanted in ((0, _PARALLAX_PX), (1, _FAR_PARALLAX_PX)):
+            for wanted_px in wanted:
+                offset = np.abs(np.log(np.maximum(parallax[:, kind], 1e-9) / wanted_px))
+                offset[parallax[:, kind] < _MIN_PARALLAX_PX] = np.inf
+                if np.isfinite(offset).any() and side[int(np.argmin(offset))] not in chosen:
+                    chosen.append(side[int(np.argmin(offset))])
+    return chosen
+
+
+def triangulate_depth(
+    view: StereoView, neighbours: Iterable[StereoView], camera: PinholeCamera, flow: FlowEstimator
+) -> TriangulatedDepth | None:
+    """Return the triangulated depth of a view; None where its neighbours disagree or are fewer than two."""
+    neighbours, total = list(neighbours), np.zeros_like(view.depth_mm)
+    for _ in range(_WARPS):
+        start = view._replace(depth_mm=view.depth_mm * np.exp(total))
+        estimates = _estimates(start, neighbours, camera, flow)
+        if len(estimates) < 2:
+            return None
+        log_factor, information, scatter, compared = combine(*(np.stack(part) for part in zip(*estimates, strict=True)))
+        known, few = _around(compared), np.float32(0.01)  # where few can be compared depth stays
+        with np.errstate(divide="ignore"):
+            variance = (_around(scatter) + few * PRIOR_SIGMA**2) / (known + few) + 1 / information
+        if not np.sqrt(np.median(variance[np.isfinite(view.depth_mm)])) <= MAX_SIGMA:
+            return None
+        shrunk = (total + log_factor) * PRIOR_SIGMA**2 / (PRIOR_SIGMA**2 + variance)
+        total = _smoothed(shrunk, information)
+    sigma = np.sqrt(1 / (1 / variance + PRIOR_SIGMA**-2))
+    return TriangulatedDepth(view.depth_mm * np.exp(total), sigma.astype(np.float32), total)
+
+
+def propagate_depth(
+    depth_mm: np.ndarray, keyframes: Sequence[tuple[np.ndarray, TriangulatedDepth]], camera: PinholeCamera
+) -> TriangulatedDepth:
+    """Return a frame's depth (H, W) mm, NaN = unknown, corrected by T_keyframe_camera and depth of `keyframes`."""
+    height, width = depth_mm.shape
+    total = np.zeros((2, -(-height // _PROPAGATED_EVERY), -(-width // _PROPAGATED_EVERY)), np.float32)
+    for T, keyframe in keyframes:
+        add_comparison(total, depth_mm, T, _intrinsics(camera), keyframe.depth_mm, keyframe.sigma)
+    weighted, information = total
+    mean = np.divide(weighted, information, out=np.zeros_like(weighted), where=information > 0)
+    # Keyframes err alike: their mean is not more certain than one of them.
+    sigma = 1 / np.sqrt(information / len(keyframes) + np.float32(PRIOR_SIGMA**-2))
+    log_factor = _smoothed(mean, information, 1 / _PROPAGATED_EVERY)
+    log_factor, sigma = (_between(image, depth_mm.shape) for image in (log_factor, sigma))
+    return TriangulatedDepth(depth_mm * np.exp(log_factor), sigma, log_factor)
+
+
+class KeyframeDepths:
+    """Depth of the keyframes of a submap, triangulated in a thread of its own, one keyframe ahead.
+
+    view : returns picture (H, W, 3) uint8 and depth (H, W) mm of a frame by its number, from any thread; NaN = unknown
+    or not usable. T_world_camera : (4, 4) pose of each frame by number. keyframes : numbers, increasing. flow : not to
+    be used by another thread meanwhile.
+    """
+
+    def __init__(
+        self,
+        view: Callable[[int], tuple[np.ndarray, np.ndarray]],
+        T_world_camera: Mapping[int, np.ndarray],
+        keyframes: Sequence[int],
+        camera: PinholeCamera,
+        flow: FlowEstimator,
+        states: TissueStates | None = None,
+    ) -> None:
+        self._states = states
+        self._poses, self._order, self.keyframes = T_world_camera, sorted(T_world_camera), list(keyframes)
+        self._stereo_view = lru_cache(_CACHED_VIEWS)(partial(self._read, view))
+        self._camera, self._flow = camera, flow
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="depth")
+        self._found: dict[int, Future[TriangulatedDepth | None]] = {}
+        self.triangulated = 0
+        """Number of keyframes whose depth was triangulated."""
+
+    def depth(self, index: int, depth_mm: np.ndarray) -> TriangulatedDepth | None:
+        """Return the depth of a frame, numbers not falling, (H, W) mm, corrected by keyframes around; or None."""
+        place = bisect_right(self.keyframes, index)
+        is_keyframe = place > 0 and self.keyframes[place - 1] == index
+        around = self.keyframes[max(place - 1 - is_keyframe, 0) : place + 1]
+        for keyframe in [*around, *self.keyframes[place + 1 : place + 2]]:
+            if keyframe not in self._found:
+                self._found[keyframe] = self._worker.submit(self._triangulate, keyframe)
+        for keyframe in [number for number in self._found if number < around[0]]:
+            del self._found[keyframe]
+        if is_keyframe and (own := self._found[index].result()) is not None:
+            return own
+        known = [(number, found) for number in around if (found := self._found[number].result()) is not None]
+        T_camera_world = inverse(self._poses[index])
+        relative = [(inverse(T_camera_world @ self._poses[number]), found) for number, found in known]
+        return propagate_depth(depth_mm, relative, self._camera) if relative else None
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._worker.shutdown(cancel_futures=True)
+
+    @property
+    def notice(self) -> Notice:
+        """How many keyframes were triangulated; complete after the last frame."""
+        return Notice("depth-triangulated", {"triangulated": self.triangulated, "keyframes": len(self.keyframes)})
+
+    def _read(self, view: Callable[[int], tuple[np.ndarray, np.ndarray]], index: int) -> StereoView:
+        rgb, depth_mm = view(index)
+        return StereoView(normalised_contrast(rgb), depth_mm, self._poses[index])
+
+    def _triangulate(self, keyframe: int) -> TriangulatedDepth | None:
+        view = self._stereo_view(keyframe)
+        place = bisect_left(self._order, keyframe)
+        near = self._order[max(0, place - _SEARCHED_FRAMES) : place + 1 + _SEARCHED_FRAMES]
+        chosen = choose_neighbours(keyframe, view.depth_mm, self._camera, {n: self._poses[n] for n in near})
+        found = triangulate_depth(view, self._neighbours(keyframe, view, chosen), self._camera, self._flow)
+        self.triangulated += found is not None
+        return found
+
+    def _neighbours(self, keyframe: int, view: StereoView, chosen: Sequence[int]) -> list[StereoView]:
+        """Return the views of the frames that triangulate a keyframe's depth."""
+        views, states = [self._stereo_view(number) for number in chosen], self._states
+        known = np.isfinite(view.depth_mm)
+        if states is None or not known.any():
+            return views
+        some = (slice(_SAMPLED_EVERY // 2, None, _SAMPLED_EVERY),) * 2
+        filled_mm = np.where(known, view.depth_mm, np.float32(np.median(view.depth_mm[known])))[some]
+        points = transform(view.T_world_camera, (self._camera.rays[some] * filled_mm[..., None]).reshape(-1, 3))
+        motion_px = states.motion(points) * (self._camera.fx / filled_mm).reshape(-1, 1)
+
+        def moved_px(number: int) -> np.ndarray:
+            moved = np.tensordot(states.change(number) - states.change(keyframe), motion_px, 1)
+            lengths = np.linalg.norm(moved, axis=1).reshape(filled_mm.shape).astype(np.float32)
+            return cv2.resize(lengths, known.shape[::-1])
+
+        return [seen._replace(moved_px=moved_px(number)) for seen, number in zip(views, chosen, strict=True)]
+
+
+def _estimates(
+    view: StereoView, neighbours: Sequence[StereoView], camera: PinholeCamera, flow: FlowEstimator
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return each neighbour's ln factor of a view's depth, and its information, 0 = unknown, (H, W) float32."""
+    # Flow of a picture without texture is what it started from.
+    grey = view.contrast[..., 0].astype(np.float32)
+    spread = _around(grey**2) - _around(grey) ** 2
+    textured, found = spread > _MIN_SPREAD**2, []
+    for neighbour in neighbours:
+        T = inverse(neighbour.T_world_camera) @ view.T_world_camera
+        seen = project(view.depth_mm, np.isfinite(neighbour.depth_mm), T, _intrinsics(camera))
+        warped = cv2.remap(neighbour.contrast, seen.x, seen.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        warped = np.where(seen.usable[..., None] > 0, warped, view.contrast)
+        log_factor, slope, across = epipolar_error(flow.estimate_small(view.contrast, warped), seen)
+        # A neighbourhood that moves across the epipolar lines moves along them as well.
+        variance_px = np.float32(_FLOW_SIGMA_PX**2) + across + _around(across)
+        variance_px += neighbour.moved_px**2
+        information = slope / (variance_px + np.float32(VIEW_SIGMA**2) * slope)
+        if (information := np.where(textured, information, np.float32(0))).any():
+            found.append((log_factor, information))
+    return found
+
+
+def _intrinsics(camera: PinholeCamera) -> Intrinsics:
+    return Intrinsics(float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
+
+
+def _between(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an image of every n-th pixel of a row and a column, interpolated at all pixels of `shape` (H, W)."""
+    at = np.diag([1 / _PROPAGATED_EVERY, 1 / _PROPAGATED_EVERY, 1.0])[:2]
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpAffine(image, at, shape[::-1], flags=how, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _around(image: np.ndarray) -> np.ndarray:
+    return local_mean(image, _DISAGREEMENT_PX, downscale=2)
+
+
+def _blurred(image: np.ndarray, sigma_px: float) -> np.ndarray:
+    return cv2.GaussianBlur(image, (0, 0), sigma_px)
+
+
+def _smoothed(log_factor: np.ndarray, information: np.ndarray, share: float = 1.0) -> np.ndarray:
+    """Return the mean of ln factors (H, W) over a small window, weighted by information.
+
+    Where the window holds little information it tends to the mean over a large one, and to 0 where that holds none.
+    share : size of the images over that of the picture.
+    """
+    weighted = (log_factor * information).astype(np.float32)
+    wide = _wide_mean(weighted, share) / (_wide_mean(information, share) + np.float32(1e-3 * PRIOR_SIGMA**-2))
+    prior, window_px = np.float32(PRIOR_SIGMA**-2), share * _SMOOTHING_PX
+    mean = (_blurred(weighted, window_px) + prior * wide) / (_blurred(information, window_px) + prior)
+    return np.clip(mean, -_MAX_LOG_FACTOR, _MAX_LOG_FACTOR)
+
+
+def _wide_mean(image: np.ndarray, share: float) -> np.ndarray:
+    """Return the mean over a wide Gaussian window, computed at a quarter of the picture's size."""
+    (height, width), step = image.shape, max(1, round(4 * share))
+    small = cv2.resize(image, (max(width // step, 1), max(height // step, 1)), interpolation=cv2.INTER_AREA)
+    return cv2.resize(_blurred(small, _WIDE_PX / 4), (width, height), interpolation=cv2.INTER_LINEAR)

@@ -1,0 +1,252 @@
+"""Other starts: does the shape that bundle adjustment finds depend on where the search begins?
+
+A narrow lens that moves sideways sees a scene and its mirror image in depth, turned the other way, almost alike (the
+Necker reversal; Belhumeur, Kriegman and Yuille, "The bas-relief ambiguity", IJCV 1999). The adjustment then stays in
+the valley where the predicted depth put it, and all that is built on that depth agrees with it. Two other starts tell:
+
+mirrored    ln depth of each keyframe's points mirrored about their median, keyframes as tracked
+flat        no depth and no poses: all points equally far, keyframes added one after the other
+
+Both hold points only loosely to their start. Where one of them ends in the same shape, the motion determines it. Else
+the one with clearly smaller errors of tracks left out of all of them wins, if another one has met it. Else the shape is
+not determined. Part of the points decides: some are adjusted, others are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from scopemap.engine.geometry.least_squares import robust_sigma_2d
+from scopemap.engine.mapping.bundle_adjustment import (
+    BundleSolution,
+    adjust_in_windows,
+    adjust_one_by_one,
+    errors_px,
+    log_depth_sigma,
+)
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Priors, State
+from scopemap.engine.mapping.left_out import part_of, placed
+from scopemap.engine.notices import Notice
+
+MOST_KEYFRAMES = 60
+"""That are tested at first."""
+_POINTS = 100  # of a keyframe that are adjusted, and as many that are left out
+_LOOSE_SIGMA = 0.5  # standard deviation of ln depth by which other starts hold their points
+# Of poses without a start: half a radian, half the depth.
+_NO_POSES = Priors(scale=0.3, rotation_rad=0.5, translation_share=0.5)
+_KNOWN_SIGMA = 0.2  # standard deviation of ln depth below which a left-out point tells of the shape
+_LEAST_POINTS = 50  # with fewer such points nothing is compared: the camera hardly moved
+_LEAST_OF_KEYFRAME = 5
+# Two shapes meet. Real clips: the same valley .96 to 1.00 and .003 to .07; another one at most .84, and .07 to .39.
+_LEAST_CORRELATION, _MOST_DIFFERENCE = 0.9, 0.1
+# Errors of left-out tracks over those of the other shape. In the right valley of a laparoscopy .75; where both are
+# wrong, since tissue moves, .93 to 1.1.
+_CLEARLY_LESS = 0.85
+
+Outcome = Literal["determined", "decided", "not determined", "not tested"]
+"""decided: not all starts meet, but the shape with clearly smaller errors was met by a second one. not tested: the
+camera hardly moved."""
+
+
+class ShapeTest(NamedTuple):
+    """What other starts tell of a shape.
+
+    replaced : whether another start's shape was taken. correlation, difference : of the relief, ln depth less its
+    median in each keyframe, with that of the start that meets the shape, or comes nearest to it: correlation, and mean
+    absolute difference. error_px, other_px : errors of left-out tracks, robust standard deviation, of the shape and of
+    the best of those that end elsewhere; NaN without one.
+    """
+
+    outcome: Outcome = "not tested"
+    replaced: bool = False
+    correlation: float = float("nan")
+    difference: float = float("nan")
+    error_px: float = float("nan")
+    other_px: float = float("nan")
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether another start, which ends elsewhere, explains the views about as well, or better."""
+        return self.outcome == "not determined" and not self.error_px < _CLEARLY_LESS * self.other_px
+
+    @property
+    def notices(self) -> list[Notice]:
+        """What determines the shape; [] where that was not tested."""
+        if self.outcome == "determined":
+            return [Notice("shape-determined", {"correlation": self.correlation})]
+        errors = {"error_px": self.error_px, "other_px": self.other_px}
+        if self.outcome == "decided":
+            return [Notice("shape-decided", errors)]
+        return [] if self.outcome == "not tested" else [Notice("shape-not-determined", errors)]
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """Where a start ended: keyframes, left-out points (Q,) ln mm as these place them, which are known, and errors."""
+
+    keyframes: State
+    host: np.ndarray
+    log_depth: np.ndarray
+    known: np.ndarray
+    error_px: float
+
+    def likeness(self, other: _Shape) -> tuple[float, float]:
+        """Return the correlation and the mean absolute difference of two reliefs; NaN where little is known."""
+        both, reliefs = self.known & other.known, []
+        for k in np.unique(self.host):
+            own = both & (self.host == k)
+            if own.sum() >= _LEAST_OF_KEYFRAME:
+                reliefs.append([shape.log_depth[own] - np.median(shape.log_depth[own]) for shape in (self, other)])
+        if sum(len(one) for one, _ in reliefs) < _LEAST_POINTS:
+            return float("nan"), float("nan")
+        one, another = np.hstack(reliefs)
+        return float(np.corrcoef(one, another)[0, 1]), float(np.abs(one - another).mean())
+
+    def meets(self, other: _Shape) -> bool:
+        """Return whether two shapes are the same."""
+        correlation, difference = self.likeness(other)
+        return correlation >= _LEAST_CORRELATION and difference <= _MOST_DIFFERENCE
+
+
+def with_other_starts(
+    problem: BundleProblem, found: BundleSolution, *, is_rigid: bool = True
+) -> tuple[BundleSolution, ShapeTest]:
+    """Return the solution of the start that wins, and what the starts tell.
+
+    found : the solution from the problem's own start. It stays, but where another start clearly wins. is_rigid :
+    whether it explains the observations; where it does not, it cannot win. Of many keyframes those in the middle are
+    tested; all, where another start wins there.
+    """
+    count = len(problem.T_camera_world)
+    middle = _stretch(problem, found.state, (count - MOST_KEYFRAMES) // 2, MOST_KEYFRAMES)
+    tested, keyframes = (problem, found.state) if count <= MOST_KEYFRAMES else middle
+    best, test = _test(tested, keyframes, is_rigid=is_rigid)
+    if test.replaced and tested is not problem:
+        best, test = _test(problem, found.state, is_rigid=is_rigid)
+        if not test.replaced:  # parts of the map tell different things
+            test = test._replace(outcome="not determined")
+    return (_from(problem, best), test) if test.replaced else (found, test)
+
+
+def _test(problem: BundleProblem, keyframes: State, *, is_rigid: bool) -> tuple[State, ShapeTest]:
+    """Return the keyframes of the start that wins, the given ones where none does, and what the starts tell."""
+    adjusted, left_out = _samples(problem)
+    own = None if left_out is None else _shape(left_out, keyframes)
+    if left_out is None or own is None or own.known.sum() < _LEAST_POINTS:
+        return keyframes, ShapeTest()
+    mirrored = _shape(left_out, adjust_in_windows(_mirrored(adjusted)).state)
+    if is_rigid and own.meets(mirrored):
+        return keyframes, ShapeTest("determined", False, *own.likeness(mirrored), own.error_px)
+    if not is_rigid and mirrored.error_px >= _CLEARLY_LESS * own.error_px:
+        return keyframes, ShapeTest("not determined", False, *own.likeness(mirrored), own.error_px, mirrored.error_px)
+    flat = _shape(left_out, adjust_one_by_one(_flat(adjusted)).state)
+    if is_rigid and own.meets(flat) and own.error_px <= mirrored.error_px:
+        # The mirrored one stayed in a valley of its own, which is worse.
+        return keyframes, ShapeTest("decided", False, *own.likeness(flat), own.error_px, mirrored.error_px)
+    if flat.meets(mirrored) and max(flat.error_px, mirrored.error_px) < _CLEARLY_LESS * own.error_px:
+        return flat.keyframes, ShapeTest("decided", True, *flat.likeness(mirrored), flat.error_px, own.error_px)
+    nearest = max((mirrored, flat), key=lambda shape: np.nan_to_num(shape.likeness(own)[0], nan=-1.0))
+    other_px = min(mirrored.error_px, flat.error_px)
+    return keyframes, ShapeTest("not determined", False, *own.likeness(nearest), own.error_px, other_px)
+
+
+def _samples(problem: BundleProblem) -> tuple[BundleProblem, BundleProblem | None]:
+    """Return the problems of points that are adjusted, and of as many others; None where too few are observed."""
+    observed = np.unique(problem.observations.point)
+    step = max(2, -(-len(observed) // (_POINTS * len(problem.T_camera_world))))
+    adjusted, left_out = np.zeros((2, len(problem.points.host)), bool)
+    adjusted[observed[::step]] = left_out[observed[step // 2 :: step]] = True
+    if left_out.sum() < _LEAST_POINTS or len(problem.T_camera_world) < 2:
+        return problem, None
+    return part_of(problem, adjusted), part_of(problem, left_out)
+
+
+def _stretch(problem: BundleProblem, state: State, first: int, count: int) -> tuple[BundleProblem, State]:
+    """Return the problem of `count` successive keyframes alone, and a solution's state of these."""
+    first = max(first, 0)
+    those = slice(first, first + count)
+    own = (problem.points.host >= first) & (problem.points.host < first + count)
+
+    def of(whole: State) -> State:
+        T, log_scale = whole.T_camera_world[those], whole.log_scale[those]
+        return whole._replace(T_camera_world=T, log_scale=log_scale, log_depth=whole.log_depth[own])
+
+    part = part_of(problem, own)
+    seen = part.observations
+    inside = (seen.keyframe >= first) & (seen.keyframe < first + count)
+    seen = Observations(seen.point[inside], seen.keyframe[inside] - first, seen.pixel[inside])
+    pairs = problem.neighbours[((problem.neighbours >= first) & (problem.neighbours < first + count)).all(1)] - first
+    alone = replace(
+        part,
+        T_camera_world=problem.T_camera_world[those],
+        points=replace(part.points, host=part.points.host - first),
+        observations=seen,
+        neighbours=pairs,
+        start=problem.start and of(problem.start),
+    )
+    return alone, of(state)
+
+
+def _shape(left_out: BundleProblem, keyframes: State) -> _Shape:
+    """Return the shape of left-out points as the keyframes of a solution place them."""
+    loose = _loosely(left_out, left_out.points.log_depth)
+    state = placed(loose, keyframes)
+    known = log_depth_sigma(loose, state) < _KNOWN_SIGMA
+    lengths_px = errors_px(loose, state)
+    error_px = robust_sigma_2d(lengths_px[np.isfinite(lengths_px)])
+    return _Shape(keyframes, left_out.points.host, state.log_depth, known, error_px)
+
+
+def _loosely(problem: BundleProblem, log_depth: np.ndarray) -> BundleProblem:
+    """Return the problem with points held loosely to these ln depths (P,), which its search begins with."""
+    sigma = np.full(len(log_depth), _LOOSE_SIGMA)
+    points, begin = replace(problem.points, log_depth=log_depth, sigma=sigma), problem.begin
+    start = begin._replace(log_scale=np.zeros(len(begin.log_scale)), log_depth=log_depth)
+    return replace(problem, points=points, start=start)
+
+
+def _medians(host: np.ndarray, log_depth: np.ndarray) -> np.ndarray:
+    """Return for each point (P,) the median of its host's points."""
+    hosts, which = np.unique(host, return_inverse=True)
+    return np.array([np.median(log_depth[host == k]) for k in hosts])[which]
+
+
+def _mirrored(problem: BundleProblem) -> BundleProblem:
+    """Return the problem from a start with the points of each keyframe mirrored in ln depth about their median."""
+    log_depth = problem.begin.log_depth
+    return _loosely(problem, 2 * _medians(problem.points.host, log_depth) - log_depth)
+
+
+def _flat(problem: BundleProblem) -> BundleProblem:
+    """Return the problem from a start without depth or poses."""
+    flat = _loosely(problem, np.full(len(problem.points.host), np.median(problem.begin.log_depth)))
+    T = np.repeat(problem.begin.T_camera_world[:1], len(problem.T_camera_world), axis=0)
+    successive = np.arange(len(T) - 1)[:, None] + [0, 1]
+    assert flat.start is not None
+    start = flat.start._replace(T_camera_world=T)
+    return replace(flat, T_camera_world=T, priors=_NO_POSES, neighbours=successive, start=start)
+
+
+def _from(problem: BundleProblem, keyframes: State) -> BundleSolution:
+    """Return the solution of all points from keyframes that another start has found.
+
+    Points are held loosely to the depth at which these place them. A keyframe's scale is then the median change of the
+    estimated depth of its points.
+    """
+    host, estimated = problem.points.host, problem.points.log_depth
+    at = placed(_loosely(problem, estimated), keyframes).log_depth
+    loose = _loosely(problem, at)
+    assert loose.start is not None
+    loose = replace(
+        loose,
+        T_camera_world=keyframes.T_camera_world,
+        start=loose.start._replace(T_camera_world=keyframes.T_camera_world),
+    )
+    found = adjust_in_windows(loose)
+    change, log_scale = found.state.log_depth - estimated, found.state.log_scale.copy()
+    hosts = np.unique(host)
+    log_scale[hosts] = [np.median(change[host == k]) for k in hosts]
+    return found._replace(state=found.state._replace(log_scale=log_scale))

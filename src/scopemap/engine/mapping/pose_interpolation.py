@@ -1,0 +1,231 @@
+"""Propagated correction: poses and depth of all frames, interpolated between the adjusted keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import inverse, mean_near, rotation_angle_rad
+from scopemap.engine.mapping.deformation_graph import Deformation
+from scopemap.engine.mapping.depth_correction import DepthCorrectionField
+from scopemap.engine.mapping.lens_residual import LensResidual
+from scopemap.engine.mapping.nonrigid_adjustment import LeftOutTracks
+from scopemap.engine.mapping.other_starts import ShapeTest
+from scopemap.engine.notices import Notice
+
+_AT_REST = 1e-6  # rad
+
+
+class TrackedPose(NamedTuple):
+    """A frame's pose as tracked.
+
+    map : number of its map. keyframe : number of the frame that it was aligned to. T_world_camera : (4, 4), in that
+    map's world. segment : the same number for all frames between which the camera was not lost.
+    """
+
+    map: int
+    keyframe: int
+    T_world_camera: np.ndarray
+    segment: int = 0
+
+
+class KeyframeStep(NamedTuple):
+    """By how much a keyframe was moved as it came; the frames before it, tracked against an earlier one, were not.
+
+    T_camera_arrived : (4, 4), pose as tracked in the camera as moved. log_scale : ln of the factor of its depth, less
+    that of the frames before it.
+    """
+
+    T_camera_arrived: np.ndarray = np.eye(4)
+    log_scale: float = 0.0
+
+
+class TissueMotion(NamedTuple):
+    """Motion of the tissue over the keyframes, in the adjusted world, and what confirms it.
+
+    rate_per_min : how often it repeats itself; NaN where it does not.
+    """
+
+    deformation: Deformation
+    left_out: LeftOutTracks
+    rate_per_min: float
+
+
+@dataclass(frozen=True)
+class FrameCorrection:
+    """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
+
+    index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
+    tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
+    T_world_world_before, log_scale_before : the same for the frames that lead to the keyframe, which its `KeyframeStep`
+    parts from it; None: there is none. sigma_px : robust standard deviation of the reprojection errors; NaN without
+    observations. refused : why nothing is changed, None where it is. loops : number of accepted loop closures.
+    loop_frames : the two frames of each. depth_fields : (K,) further factors of each pixel's depth; (): none.
+    S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
+    number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens_residual :
+    what the observations ask of the lens. tissue : how it moves; None: it is taken to be at rest. shape : what other
+    starts of the adjustment tell of it.
+    """
+
+    index: np.ndarray
+    T_world_world: np.ndarray
+    log_scale: np.ndarray
+    sigma_px: float = float("nan")
+    T_world_world_before: np.ndarray | None = None
+    log_scale_before: np.ndarray | None = None
+    refused: Notice | None = None
+    loops: int = 0
+    loop_frames: Sequence[Sequence[int]] = ()
+    depth_fields: tuple[DepthCorrectionField, ...] = ()
+    S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
+    tracked: Mapping[int, TrackedPose] = field(default_factory=dict)
+    depth_mm: float = 1.0
+    lens_residual: LensResidual = field(default_factory=LensResidual)
+    tissue: TissueMotion | None = None
+    shape: ShapeTest = field(default_factory=ShapeTest)
+
+    @property
+    def notices(self) -> list[Notice]:
+        """What was adjusted and how well it fits, or why nothing was; what determines the shape; another lens."""
+        said = self.tissue is not None or (self.refused and self.refused.code == "mapping-not-determined")
+        tested = [] if said else self.shape.notices
+        return [self.notice, *tested, *self.lens_residual.notices]
+
+    @property
+    def notice(self) -> Notice:
+        """What was adjusted and how well it fits, or why nothing was."""
+        if not np.isfinite(self.sigma_px):
+            return Notice("mapping-without-observations", {"keyframes": len(self.index)})
+        if self.refused:
+            merged = len(self.S_common_map)
+            by_loops = f", {merged} maps merged by {self.loops} loop closures" if merged > 1 else ""
+            return replace(self.refused, values={**self.refused.values, "merged": by_loops})
+        if self.tissue is not None:
+            motion, left_out, rate = self.tissue
+            moved = np.linalg.norm(np.ptp(motion.displacement, axis=0), axis=1).max() / self.depth_mm
+            facts = {"keyframes": len(self.index), "nodes": len(motion.nodes), "moved": float(moved)}
+            facts |= {"rigid_px": left_out.rigid_px, "px": left_out.px}
+            periodic = f", {rate:.0f} times a minute" if np.isfinite(rate) else ""
+            return Notice("mapping-tissue-moves", facts | {"periodic": periodic})
+        rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
+        changes = [np.abs(depth_field.values).mean() for depth_field in self.depth_fields]
+        facts = {"keyframes": len(self.index), "loops": self.loops}
+        facts["maps"] = max(len(self.S_common_map), 1)
+        facts |= {"rotation_deg": float(rotation_deg), "sigma_px": float(self.sigma_px)}
+        return Notice("mapping-adjusted", facts | {"depth_change": float(np.expm1(np.median(changes or [0.0])))})
+
+    def with_steps(
+        self, poses: Sequence[TrackedPose], steps: Sequence[KeyframeStep], S_common_map: Mapping[int, Similarity]
+    ) -> FrameCorrection:
+        """Return it with the step of each keyframe spread over the frames that lead to it.
+
+        poses, steps : of the K keyframes. S_common_map : by number of each map, Sim(3) to the common world.
+        """
+        places = [(S_common_map[pose.map], pose.T_world_camera, step) for pose, step in zip(poses, steps, strict=True)]
+        tracked = np.stack([S.transform_poses(T) for S, T, _ in places])
+        arrived = [S.transform_poses(T @ step.T_camera_arrived) for S, T, step in places]
+        return replace(
+            self,
+            T_world_world_before=self.T_world_world @ tracked @ inverse(np.stack(arrived)),
+            log_scale_before=self.log_scale + [step.log_scale for step in steps],
+        )
+
+    def in_world(self, T_new_world: np.ndarray) -> FrameCorrection:
+        """Return the correction to another common world; `T_new_world` (4, 4) takes points of this one to it."""
+        moved = Similarity(1.0, T_new_world[:3, :3], T_new_world[:3, 3])
+        before = self.T_world_world_before
+        return replace(
+            self,
+            T_world_world=T_new_world @ self.T_world_world @ inverse(T_new_world),
+            T_world_world_before=None if before is None else T_new_world @ before @ inverse(T_new_world),
+            S_common_map={number: moved.after(S) for number, S in self.S_common_map.items()},
+            tissue=self.tissue and self.tissue._replace(deformation=self.tissue.deformation.in_world(T_new_world)),
+        )
+
+    def pose(self, index: int, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return the corrected pose (4, 4) of the frame with this number."""
+        before, after, share = self._between(index)
+        T_world_camera = self._world(index).transform_poses(T_world_camera)
+        poses = [self._T_world_world(k, index) @ T_world_camera for k in (before, after)]
+        return mean_near(poses[0], [poses[1]], [share])
+
+    def depth_factor(self, index: int) -> float:
+        """Return the factor of the whole depth of the frame with this number, without its depth correction field."""
+        before, after, share = self._between(index)
+        log_scale = (1 - share) * self._log_scale(before, index) + share * self._log_scale(after, index)
+        return float(np.exp(log_scale)) * self._world(index).scale
+
+    def depth_factors(self, index: int, depth_mm: np.ndarray) -> np.ndarray:
+        """Return the factors (H, W) float32 of depth (H, W) mm; NaN where depth is unknown."""
+        factor = np.float32(self.depth_factor(index))
+        if not self.depth_fields:
+            return np.full(depth_mm.shape, factor, np.float32)
+        before, after, share = self._between(index)
+        depth_mm = depth_mm * np.float32(self._world(index).scale)
+        log = self.depth_fields[before].log_factor(depth_mm)
+        if after != before:
+            log = (1 - share) * log + share * self.depth_fields[after].log_factor(depth_mm)
+        return factor * np.exp(log.astype(np.float32))
+
+    def _T_world_world(self, k: int, index: int) -> np.ndarray:
+        """Return the correction (4, 4) of a frame near keyframe k, which it follows or leads to."""
+        leads = index < self.index[k] and self.T_world_world_before is not None
+        corrections = self.T_world_world_before if leads else self.T_world_world
+        T: np.ndarray = np.asarray(corrections)[k]
+        return T
+
+    def _log_scale(self, k: int, index: int) -> float:
+        leads = index < self.index[k] and self.log_scale_before is not None
+        return float(np.asarray(self.log_scale_before if leads else self.log_scale)[k])
+
+    def _world(self, index: int) -> Similarity:
+        """Sim(3) from the world of a frame's map to the common one."""
+        tracked = self.tracked.get(index)
+        return self.S_common_map.get(0 if tracked is None else tracked.map, Similarity.identity())
+
+    def _between(self, index: int) -> tuple[int, int, float]:
+        """Two keyframes whose corrections a frame interpolates, and the weight of the second."""
+        after = int(np.searchsorted(self.index, index))
+        if after < len(self.index) and self.index[after] == index:
+            return after, after, 0.0
+        reference = self._reference(index)
+        if reference is not None:
+            follows = after < len(self.index) and self._reference(int(self.index[after])) == reference
+            if not follows or self._lost_between(index, int(self.index[after])):
+                return reference, reference, 0.0
+            if reference != after - 1 or self._lost_between(int(self.index[reference]), index):
+                return after, after, 0.0
+        if after == 0 or after == len(self.index):
+            nearest = min(after, len(self.index) - 1)
+            return nearest, nearest, 0.0
+        return after - 1, after, self._weight(index, after - 1, after)
+
+    def _weight(self, index: int, before: int, after: int) -> float:
+        """Weight of the second of two keyframes: share of the motion between them; of the time where unknown."""
+        frames = (int(self.index[before]), index, int(self.index[after]))
+        if all(frame in self.tracked for frame in frames):
+            first, own, last = (self._world(f).transform_poses(self.tracked[f].T_world_camera) for f in frames)
+            last = inverse(self._T_world_world(after, index)) @ self.T_world_world[after] @ last  # as it arrived
+            motion_before, motion_after = self._motion(first, own), self._motion(own, last)
+            if motion_before + motion_after > _AT_REST:
+                return motion_before / (motion_before + motion_after)
+        return (index - frames[0]) / (frames[2] - frames[0])
+
+    def _motion(self, T_world_one: np.ndarray, T_world_other: np.ndarray) -> float:
+        T = inverse(T_world_one) @ T_world_other
+        return float(np.hypot(rotation_angle_rad(T[:3, :3]), np.linalg.norm(T[:3, 3]) / self.depth_mm))
+
+    def _lost_between(self, one: int, other: int) -> bool:
+        segments = {self.tracked[frame].segment for frame in (one, other) if frame in self.tracked}
+        return len(segments) > 1
+
+    def _reference(self, index: int) -> int | None:
+        """Place in `index` of the keyframe that a frame was aligned to; None where that is unknown."""
+        tracked = self.tracked.get(index)
+        place = 0 if tracked is None else int(np.searchsorted(self.index, tracked.keyframe))
+        known = tracked is not None and place < len(self.index) and self.index[place] == tracked.keyframe
+        return place if known else None

@@ -1,0 +1,1 @@
+"""Weights of networks, and the device they run on."""

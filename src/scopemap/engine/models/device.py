@@ -1,0 +1,59 @@
+"""Where networks run, and what they need to be installed."""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from scopemap.engine.errors import SettingsError
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+
+def cpu_threads() -> int:
+    """Return how many threads a network gets on the CPU: OMP_NUM_THREADS, else the cores that this process may use."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdecimal() and int(wanted):
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def open_network(content: bytes, threads: int = 0) -> onnxruntime.InferenceSession:
+    """Return the session of an ONNX graph on the CPU; raises what the runtime raises. threads : 0: one a core."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or cpu_threads()
+    # Threads that wait must sleep: the tracker needs the cores.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 4  # what is wrong is raised, not printed
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+def missing_packages(what: str, *packages: str) -> str:
+    """Return which of the packages that `what` needs are not installed and how to install them; "" where all are."""
+    missing = [package for package in packages if find_spec(package) is None]
+    return f"{what} needs {' and '.join(missing)}: pip install -e '.[networks]'" if missing else ""
+
+
+def need_packages(what: str, *packages: str) -> None:
+    """Raise `SettingsError` where one of the packages that `what` needs is not installed."""
+    if fault := missing_packages(what, *packages):
+        raise SettingsError(fault)
+
+
+def choose_device(device: str) -> str:
+    """Return the torch device for a setting, "auto": the first CUDA device, else the CPU; raises `SettingsError`."""
+    import torch
+
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        kind = torch.device(device).type
+    except RuntimeError:
+        raise SettingsError(f"unknown device '{device}': use auto, cpu or cuda") from None
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise SettingsError(f"device '{device}' was asked for but torch sees no CUDA device: use auto or cpu")
+    return device

@@ -1,0 +1,201 @@
+"""Poses by frame: tracking against the keyframe (RTDL), depth refined with the motion known (MAPIS), keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from scopemap.engine.config import Config
+from scopemap.engine.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
+from scopemap.engine.faults import StageFaults
+from scopemap.engine.frame import Frame
+from scopemap.engine.mapping.local_adjustment import LocalAdjustment
+from scopemap.engine.mapping.submaps import Mapper
+from scopemap.engine.notices import Notice
+from scopemap.engine.preprocessing import PreprocessedFrame, with_depth, with_unknown_depth, without_depth
+from scopemap.engine.tracking.causes import LossCause
+from scopemap.engine.tracking.relocalisation import RotationFollower
+from scopemap.engine.tracking.smoothing import Wema
+from scopemap.engine.tracking.track import FrameTracker, Track, motion_between
+
+
+@dataclass(frozen=True)
+class Step:
+    """All results for a frame: refined depth (at the size of `raw_mm`'s estimate) and, unless lost, pose as tracked.
+
+    skipped : whether nothing was estimated of it.
+    """
+
+    frame: Frame
+    track: Track
+    raw_mm: np.ndarray
+    refined: RefinedDepth
+    skipped: bool = False
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """The frame's row of a `FrameTable`, as tracked."""
+        frame, refined = self.frame, self.refined
+        pose = np.nan if frame.T_world_camera is None else frame.T_world_camera
+        some_mm = refined.depth_mm[::4, ::4]
+        depth = {"depth_scale": refined.scale, "warped_share": refined.warped_share}
+        depth["median_depth_mm"] = float(np.nanmedian(some_mm)) if np.isfinite(some_mm).any() else np.nan
+        return self.track.row | depth | {"time_s": frame.time_s, "name": frame.name, "T_world_camera": pose}
+
+
+class Odometry:
+    """Tracks frames, in order, each once, and hands keyframes to the mapper.
+
+    local : adjusts keyframes of predicted depth as they come; None: they are as tracked.
+    """
+
+    STATE: ClassVar = (
+        *("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_last_frame"),
+        *("faults", "_rotation", "_local"),
+    )
+    """What changes from frame to frame."""
+
+    def __init__(
+        self, config: Config, tracker: FrameTracker, mapper: Mapper, local: LocalAdjustment | None = None
+    ) -> None:
+        self._config, self._tracker, self.mapper, self._local = config, tracker, mapper, local
+        self._mapis = Mapis(config.mapis)
+        self._smooth = Wema(config.smoothing)
+        self._rotation = RotationFollower()
+        self._last_track: Track | None = None
+        self._last_frame: tuple[Frame, Track] | None = None
+        self.faults = StageFaults("tracking")
+
+    def track(self, preprocessed: PreprocessedFrame) -> Step:
+        """Track a frame, refine its depth, make it a keyframe where one is due; one with which that fails is lost."""
+        self.faults.frames += 1
+        try:
+            step = self._track(preprocessed)
+        except Exception as error:
+            step = self._lost(preprocessed, self.faults.noted(preprocessed.frame.index, error))
+        motion, quality, fault = _motion(preprocessed.correspondence), preprocessed.frame.quality, preprocessed.fault
+        track = replace(step.track, motion=motion, quality=quality)
+        if fault is not None and track.status == "lost":
+            track = replace(track, cause=fault.cause, reason=fault.reason)
+        track = self._rotation.follow(track, preprocessed.small, preprocessed.correspondence)
+        step = replace(step, track=track)
+        self.mapper.observe(step.track)
+        self._last_track = step.track
+        return step
+
+    def _track(self, preprocessed: PreprocessedFrame) -> Step:
+        refined = self._refine(preprocessed, None) if self._config.mapis.constants.order == "refine-first" else None
+        track, last = self._tracker.track(preprocessed.frame), self._last_track
+        if preprocessed.skipped and track.status == "lost":
+            return self._without_pose(preprocessed, track)
+        if track.status == "lost" or (last is not None and last.map != track.map):
+            self._reset()
+        if track.status == "initial" and refined is None:
+            self._mapis.rescale(1.0)  # drift of the maps before is none of a new one
+        if np.isfinite(track.depth_ratio):
+            self._mapis.rescale(track.depth_ratio)
+        refined = refined or self._refine(preprocessed, motion_between(last, track))
+        frame = with_depth(preprocessed.frame, refined.depth_mm, refined.sigma_mm)
+        frame = replace(frame, nonrigidity=track.nonrigidity)
+        if preprocessed.kind == "depth":  # disparity has a scale of its own in every frame
+            frame = replace(frame, depth_scale=refined.scale)
+        self._add_last_keyframe(track)
+        track, frame = self._with_keyframe(track, frame, preprocessed)
+        if track.status == "lost":
+            self._reset()
+        else:
+            frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
+        return Step(frame, track, np.asarray(preprocessed.frame.depth_mm), refined)
+
+    def _lost(self, preprocessed: PreprocessedFrame, reason: str) -> Step:
+        """Return the step of a frame that could not be tracked, without depth."""
+        frame, last = preprocessed.frame, self._last_track
+        if last is None:
+            track = Track(frame.index, "lost", reason, np.eye(4), frame.index, cause=LossCause.OTHER)
+        else:
+            track = Track(frame.index, "lost", reason, last.T_world_camera, last.keyframe, map=last.map)
+            track = replace(track, cause=LossCause.OTHER)
+        return self._without_pose(replace(preprocessed, frame=without_depth(frame)), track)
+
+    def _without_pose(self, preprocessed: PreprocessedFrame, track: Track) -> Step:
+        """Return the step of a lost frame whose depth is unknown."""
+        self._reset()
+        unknown_mm = np.asarray(with_unknown_depth(preprocessed.small).depth_mm)
+        refined, frame = RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm), preprocessed.frame
+        return Step(frame, track, np.asarray(frame.depth_mm), refined, preprocessed.skipped)
+
+    def notices(self, map_number: int) -> list[Notice]:
+        """Return what was adjusted of a map as it came; [] where nothing was."""
+        return [] if self._local is None else self._local.notices(map_number)
+
+    def new_tracker(self) -> FrameTracker | None:
+        """Return a tracker that has seen no frame, to track lost frames anew; None where the tracker cannot."""
+        return self._tracker.another()
+
+    def _refine(self, preprocessed: PreprocessedFrame, T_current_previous: np.ndarray | None) -> RefinedDepth:
+        raw = preprocessed.small
+        return self._mapis.refine(
+            np.asarray(raw.depth_mm),
+            preprocessed.kind,
+            raw.camera,
+            preprocessed.correspondence,
+            T_current_previous,
+            sigma_mm=raw.depth_sigma_mm,
+            anchored=preprocessed.anchored,
+        )
+
+    def _reset(self) -> None:
+        """Forget earlier frames: their relative pose is unknown."""
+        self._mapis.reset()
+        self._smooth.reset()
+
+    def _add_last_keyframe(self, track: Track) -> None:
+        """Hand on the frame that was tracked last where the tracker made it the keyframe of this one."""
+        if track.status == "ok" and self._last_frame is not None and self._last_frame[1].index == track.keyframe:
+            self.mapper.add_keyframe(*self._last_frame)
+            if self._local is not None:
+                self._local.take_over(track.keyframe, self._last_frame[1].keyframe)
+            self._last_frame = None
+
+    def _with_keyframe(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> tuple[Track, Frame]:
+        """Make a frame the keyframe where one is due; return both, adjusted where keyframes are, as they come.
+
+        The first frame of a map that cannot be a keyframe is lost.
+        """
+        if track.status == "lost":
+            return track, frame
+        kind, due, number = preprocessed.kind, self._tracker.needs_keyframe(), track.keyframe
+        keyframe, matches, step = replace(frame, T_world_camera=track.T_world_camera), None, None
+        if self._local is not None and kind != "measured":
+            if due:
+                keyframe, matches, step = self._local.adjusted(keyframe, number, track.map)
+            else:
+                keyframe = self._local.corrected(keyframe, number)
+        frame, track = replace(keyframe, T_world_camera=None), replace(track, T_world_camera=_pose(keyframe))
+        if not due:
+            if kind != "measured" and self._tracker.remember(keyframe):
+                self._last_frame = keyframe, track
+            return track, frame
+        measured = kind == "measured" and not self._mapis.needs_previous(kind)  # not after MAPIS changed it
+        inserted = self._tracker.insert_keyframe(keyframe, measured=measured)
+        if inserted and kind != "measured":  # with measured depth tracking alone is better
+            self.mapper.add_keyframe(keyframe, track, matches, step)
+        if track.status == "initial" and not inserted:
+            unknown = preprocessed.depth_note or "too little of its depth is known to start from (black or constant?)"
+            return replace(track, status="lost", reason=unknown, cause=LossCause.OTHER), frame
+        return track, frame
+
+
+def _pose(keyframe: Frame) -> np.ndarray:
+    assert keyframe.T_world_camera is not None
+    return keyframe.T_world_camera
+
+
+def _motion(correspondence: DenseCorrespondence | None) -> float:
+    """Return the median flow since the frame before, share of the width."""
+    if correspondence is None:
+        return float("nan")
+    flow = correspondence.to_previous[::4, ::4]
+    return float(np.median(np.hypot(flow[..., 0], flow[..., 1]))) / correspondence.to_previous.shape[1]

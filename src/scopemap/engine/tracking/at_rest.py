@@ -1,0 +1,54 @@
+"""CameraAtRest: the tracker of a camera that is known not to move, so that all motion is the tissue's."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.flow.corners import KeyframeMatcher
+from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.frame import Frame
+from scopemap.engine.tracking.corner_pose import nonrigidity
+from scopemap.engine.tracking.track import FrameTracker, Track
+
+
+class CameraAtRest(FrameTracker):
+    """A `FrameTracker` that gives every frame the first pose, and measures where tissue moves.
+
+    A frame is lost where too little of it is usable alone. flow : of the keyframe's corners; "none": motion is not
+    measured.
+    """
+
+    def __init__(self, settings: TrackingSettings, flow: FlowEstimator) -> None:
+        self._settings = settings
+        self._matcher = None if flow.name == "none" else KeyframeMatcher(flow)
+        self._keyframe: int | None = None
+        self._frames_since_keyframe = 0
+
+    def track(self, frame: Frame) -> Track:
+        """Return the identity, with the motion of the tissue since the keyframe; "lost" where little is usable."""
+        here, share = np.eye(4), float(frame.valid.mean())
+        self._frames_since_keyframe += 1
+        if share < self._settings.constants.min_valid_share:
+            reference = frame.index if self._keyframe is None else self._keyframe
+            return Track(frame.index, "lost", f"only {share:.0%} of the image is usable", here, reference)
+        if self._keyframe is None:
+            return Track(frame.index, "initial", "first frame of the map", here, frame.index)
+        found = None if self._matcher is None else self._matcher.match(frame)
+        # Depth does not matter: nothing but tissue moves.
+        moving = None if found is None else nonrigidity(found, frame.camera, here, 0.0)
+        return Track(frame.index, "ok", "", here, self._keyframe, nonrigidity=moving)
+
+    def needs_keyframe(self) -> bool:
+        """Return whether corners should be found anew in the frame that was tracked last."""
+        return self._keyframe is None or self._frames_since_keyframe >= self._settings.keyframe_every
+
+    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
+        """Follow the corners of this frame from now on; False where too little of its depth is known."""
+        known = frame.valid & np.isfinite(np.asarray(frame.depth_mm))
+        if known.mean() < self._settings.constants.min_valid_share:
+            return False
+        if self._matcher is not None:
+            self._matcher.set_keyframe(frame)
+        self._keyframe, self._frames_since_keyframe = frame.index, 0
+        return True

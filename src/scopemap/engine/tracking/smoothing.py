@@ -1,0 +1,39 @@
+"""WEMA: the weighted mean of the last poses, on the group.
+
+METHOD section WEMA: x_reg = s (alpha x_i + beta x_{i-1} + gamma x_{i-2}) + (1 - s) x_i, s = 1 - exp(-i omega). Poses
+do not add: the mean is taken in the tangent space at the newest pose. The earlier poses are the estimated ones, and
+the tracker does not use the smoothed poses. The mean lags behind a moving camera (see BENCHMARK.md).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scopemap.engine.config import SmoothingSettings
+from scopemap.engine.geometry.se3 import mean_near
+
+
+class Wema:
+    """Weighted exponential moving average of the last three poses; without effect where `settings.method` is "none"."""
+
+    def __init__(self, settings: SmoothingSettings) -> None:
+        self.settings = settings
+        self._past: list[np.ndarray] = []
+        self._count = 0
+
+    def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return the smoothed pose; the first two, also after `reset`, have too short a past and stay as they are."""
+        settings, past = self.settings, self._past
+        smoothed = T_world_camera
+        if len(past) == 2 and settings.method != "none":
+            s = 1.0 - np.exp(-self._count * settings.constants.omega) if settings.constants.dynamic else 1.0
+            weights = [s * settings.constants.alpha, s * settings.constants.beta, s * settings.constants.gamma]
+            # What is left, 1 - s, is the newest pose's too: it is the base of the tangent space.
+            smoothed = mean_near(T_world_camera, [T_world_camera, past[1], past[0]], weights)
+        self._past = [*past, T_world_camera][-2:]
+        self._count += 1
+        return smoothed
+
+    def reset(self) -> None:
+        """Let the next pose start without a past; s goes on growing."""
+        self._past = []

@@ -1,0 +1,331 @@
+"""Tracker: estimates the pose of every frame against the keyframe, and reports why where it cannot."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from scopemap.engine.config import TrackingSettings
+from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.tracking.causes import LossCause
+from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures
+from scopemap.engine.tracking.keyframe_alignment import (
+    MAX_EXTRAPOLATION,
+    MIN_TEXTURE,
+    Keyframe,
+    KeyframeAligner,
+    MotionModel,
+    is_obscured,
+)
+from scopemap.engine.tracking.pyramid import build_pyramid
+from scopemap.engine.tracking.relocalisation import Relocaliser, depth_ratio, is_close_up, nearer_keyframe
+from scopemap.engine.tracking.residuals import View
+from scopemap.engine.tracking.rtdl import Alignment
+from scopemap.engine.tracking.sharpness import SharpnessMonitor
+from scopemap.engine.tracking.track import FrameTracker, Track, TrackingLoss, unusable
+
+_EARLIER_KEYFRAMES = 64  # of the current map, that are searched for one nearer than the current one
+_FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with less the pose hangs on a corner of it
+_WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
+_KEYFRAME_COVERAGE = 0.3  # a frame in which fewer corners are matched becomes a keyframe
+_REVISITED_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
+_CLEAR = 0.8  # of the best quality since the keyframe: below it the next one waits
+_UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
+
+
+class KeyframeChoice:
+    """When the next keyframe is due: by frames and motion since the last one, and by how well they still fit it."""
+
+    def __init__(self, settings: TrackingSettings) -> None:
+        self._settings = settings
+        self.frames_since = 0
+        self._quality = self._best_quality = 0.0
+        self._first_agreement: float | None = None
+        self._last: Alignment | None = None
+        self._depth_mm = 1.0
+
+    def see(self, frame: Frame) -> None:
+        """Count a frame."""
+        self.frames_since += 1
+        self._quality, self._best_quality = frame.quality, max(frame.quality, self._best_quality)
+
+    def accept(self, alignment: Alignment) -> None:
+        """Take the alignment of a tracked frame with the current keyframe."""
+        self._last = alignment
+        if self._first_agreement is None:
+            self._first_agreement = alignment.agreement
+
+    def change(self, depth_mm: float) -> None:
+        """Take another keyframe, of this mean depth, as the current one."""
+        self._first_agreement, self._depth_mm = None, depth_mm
+
+    def begin(self) -> None:
+        """Begin with a new keyframe."""
+        self.frames_since, self._best_quality = 0, 0.0
+
+    def is_due(self, alignment: Alignment | None = None) -> bool:
+        """Return whether a frame with this alignment should become a keyframe; None: the one that was accepted last."""
+        alignment = alignment or self._last
+        constants = self._settings.constants
+        patience = constants.keyframe_patience if self._quality < _CLEAR * self._best_quality else 0
+        if self.frames_since >= self._settings.keyframe_every + patience and self._has_moved(alignment):
+            return True
+        least = constants.min_keyframe_agreement * (self._first_agreement or 0.0)
+        return alignment is not None and (alignment.agreement < least or alignment.coverage < _KEYFRAME_COVERAGE)
+
+    def _has_moved(self, alignment: Alignment | None) -> bool:
+        if alignment is None:
+            return True
+        T = alignment.motion.T_current_reference
+        moved = rotation_angle_rad(T[:3, :3]) + np.linalg.norm(T[:3, 3]) / self._depth_mm
+        return bool(moved >= self._settings.constants.min_keyframe_motion)
+
+
+class Tracker(FrameTracker):
+    """Tracks frames against keyframes.
+
+    The first usable frame fixes the world. A frame's pose has the least reprojection error of the keyframe's corners,
+    matched by `flow`, and is judged photometrically. Where it is rejected and where too few corners are matched,
+    features find the frame in the keyframes most like it. Where the keyframe's depth is measured, the pose comes from
+    photometric alignment (METHOD section WEMA-RTDL). A lost frame is recorded with the reason; the next one is aligned
+    from the last pose, from the extrapolated one, and relocalised in recent keyframes. After several sharp frames lost
+    in a row a new map begins, with its own world; later relocalisation may lead back to an older map.
+    """
+
+    def __init__(
+        self, settings: TrackingSettings, flow: FlowEstimator | None = None, features: FeatureDetector | None = None
+    ) -> None:
+        self.settings = settings
+        self._motion = MotionModel()
+        self._aligner = KeyframeAligner(settings, flow, self._motion)
+        self._relocaliser = Relocaliser(settings, features or SiftFeatures())
+        self._earlier_keyframes: deque[Frame] = deque(maxlen=_EARLIER_KEYFRAMES)
+        self._choice = KeyframeChoice(settings)
+        self._sharpness = SharpnessMonitor()
+        self._keyframe: Keyframe | None = None
+        self._last: Frame | None = None
+        self._sharp_frames_lost = 0
+        self._is_unsharp = self._after_close_up = self._is_revisited = False
+
+    def track(self, frame: Frame) -> Track:
+        """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""
+        self._choice.see(frame)
+        usable = float(frame.valid.mean())
+        if usable < self.settings.constants.min_valid_share:
+            self._sharp_frames_lost = 0
+            return replace(self._lost(frame, unusable(frame)), usable=usable)
+        sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
+        return replace(self._track(frame, sharpness), usable=usable, sharpness=sharpness)
+
+    def _track(self, frame: Frame, sharpness: float) -> Track:
+        self._is_unsharp = sharpness < self.settings.constants.min_sharpness
+        unsharp = TrackingLoss(LossCause.UNSHARP, f"only {sharpness:.0%} of the usual sharpness: blur, smoke or fluid")
+        if self._keyframe is None:
+            if self._is_unsharp:
+                return self._lost(frame, unsharp)
+            return Track(frame.index, "initial", "first frame of the map", np.eye(4), frame.index, map=self._motion.map)
+        frames_lost = self._motion.frames_lost
+        if frames_lost > MAX_EXTRAPOLATION and frames_lost % self.settings.constants.search_every:
+            self._sharp_frames_lost += not self._is_unsharp
+            skipped = f"not searched: one of {self.settings.constants.search_every} lost frames is"
+            return self._lost(frame, TrackingLoss(LossCause.OTHER, skipped))
+        alignment, pyramid = self._aligner.align(self._keyframe, frame)
+        if self._choice.is_due(alignment) and not frames_lost and not self._rejection(alignment):
+            alignment = self._against_earlier_keyframe(frame, alignment)
+        obscured = is_obscured(sharpness, alignment, self.settings.constants.min_sharpness)
+        rejected, relocalised = self._rejection(alignment), False
+        failed, is_weak = obscured or bool(rejected), alignment.coverage < _WEAK_COVERAGE
+        if failed and is_close_up(frame, self._keyframe):
+            self._after_close_up, unsharp, rejected = True, _in_contact(unsharp), rejected and _in_contact(rejected)
+        elif self._after_close_up and not failed and self.settings.constants.relocalisation_keyframes:
+            failed, rejected = True, TrackingLoss(LossCause.VIEW_CHANGED, _UNCONFIRMED)
+        if failed or is_weak or frames_lost:
+            found = self._found(frame, pyramid, sharpness, failed=failed)
+            if found is not None and (failed or found[1].agreement > alignment.agreement):
+                relocalised = found[0].map != self._motion.map or frames_lost > 0
+                obscured, rejected = False, None
+                alignment = self._aligned_to(*found)
+        if obscured:
+            self._sharp_frames_lost = 0
+            return self._lost(frame, unsharp, alignment)
+        if rejected:
+            self._sharp_frames_lost += 1
+            after = self.settings.constants.new_map_after * (2 if self._after_close_up else 1)
+            if self._sharp_frames_lost > after > 0 and not self._is_unsharp:
+                return self._new_map(frame)
+            return self._lost(frame, rejected._replace(reason=f"rejected: {rejected.reason}"), alignment)
+        return self._accept(frame, self._keyframe, alignment, relocalised)
+
+    def remember(self, frame: Frame) -> bool:
+        """Take the frame that was tracked last, with its refined depth and its pose: the next may be matched with it.
+
+        Where tissue moves further than flow follows, features still match successive frames. `Track.keyframe` is then
+        the number of this frame, which is a keyframe from there on.
+        """
+        self._last = None if self._is_unsharp else frame
+        return True
+
+    def another(self) -> Tracker:
+        """Return a tracker with the same parts that has seen no frame."""
+        return Tracker(self.settings, self._aligner.flow, self._relocaliser.detector)
+
+    def needs_keyframe(self) -> bool:
+        """Return whether the frame that was tracked last should become a keyframe."""
+        if self._keyframe is None:
+            return True
+        # The depth of an unsharp frame is no better than its image.
+        return (self._is_revisited or self._choice.is_due()) and not self._is_unsharp
+
+    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
+        """Make a tracked frame the keyframe, with planes if `measured`; False, changing nothing, without depth."""
+        if frame.depth_mm is None or frame.T_world_camera is None:
+            raise ValueError("a keyframe needs a depth and a pose")
+        if self._is_revisited:
+            self._is_revisited, self._choice.frames_since = False, 0
+            return True
+        keyframe = self._keyframe_of(frame, measured)
+        if keyframe is None:
+            return False
+        self._use_keyframe(keyframe)
+        self._motion.T_world_last = frame.T_world_camera  # it may have been adjusted
+        self._relocaliser.add(keyframe)
+        self._earlier_keyframes.append(replace(frame, depth_sigma_mm=None))
+        self._choice.begin()
+        return True
+
+    def _against_earlier_keyframe(self, frame: Frame, alignment: Alignment) -> Alignment:
+        """Return the alignment with an earlier keyframe where one is nearer than the current one, which it replaces."""
+        current = self._keyframe
+        assert current is not None
+        self._is_revisited = False
+        if not self._aligner.has_corners(current):
+            return alignment
+        T_world_camera = current.pose_by(alignment)
+        nearest = nearer_keyframe(self._earlier_keyframes, T_world_camera, current)
+        keyframe = None if nearest is None else self._keyframe_of(nearest, current.measured)
+        if keyframe is None:
+            return alignment
+        T_start = inverse(T_world_camera) @ keyframe.T_world_camera
+        self._aligner.set_keyframe(keyframe, frame, T_start)
+        found = self._aligner.by_corners(keyframe, frame, T_start)
+        if found is None or found.coverage < _REVISITED_COVERAGE or self._aligner.rejection(keyframe, found):
+            self._aligner.set_keyframe(current)
+            return alignment
+        self._use_keyframe(keyframe)
+        self._is_revisited = True
+        return found
+
+    def _keyframe_of(self, frame: Frame, measured: bool) -> Keyframe | None:
+        """Return a keyframe of the current map; None where too little of the frame's depth is known."""
+        assert frame.depth_mm is not None
+        assert frame.T_world_camera is not None
+        known = frame.valid & np.isfinite(frame.depth_mm)
+        if known.mean() < self.settings.constants.min_valid_share:
+            return None
+        pyramid = build_pyramid(frame, self.settings, use_slope=measured)
+        mean_mm = float(frame.depth_mm[known].mean())
+        return Keyframe(frame, frame.T_world_camera, pyramid, mean_mm, measured, self._motion.map)
+
+    def _found(
+        self, frame: Frame, pyramid: list[View] | None, sharpness: float, *, failed: bool
+    ) -> tuple[Keyframe, Alignment] | None:
+        """Return the keyframe in which features find a frame, and its accepted alignment; None without any.
+
+        failed : whether the alignment without features failed; then all maps are searched. After a loss the current one
+        is, else the keyframe and the frame tracked last.
+        """
+        assert self._keyframe is not None
+        views = pyramid or self._aligner.pyramid(self._keyframe, frame)
+        near = [self._keyframe]
+        if self._last is not None and self._last.index != self._keyframe.frame.index:
+            last = self._keyframe_of(self._last, self._keyframe.measured)
+            near += [] if last is None else [last]
+        found = self._relocaliser.find(
+            frame,
+            lambda keyframe, relative: self._aligner.align_from(keyframe, frame, views, relative),
+            lambda keyframe, alignment: (
+                self._aligner.rejection(keyframe, alignment) is None
+                and alignment.overlap >= _FOUND_OVERLAP
+                # Of many keyframes one always fits a picture without texture.
+                and (keyframe.measured or alignment.texture >= MIN_TEXTURE)
+                and not is_obscured(sharpness, alignment, self.settings.constants.min_sharpness)
+            ),
+            near=near,
+            recent=failed or self._motion.frames_lost > 0,
+            other_maps=failed,
+        )
+        self._aligner.set_keyframe(self._keyframe)
+        return found
+
+    def _aligned_to(self, keyframe: Keyframe, alignment: Alignment) -> Alignment:
+        """Make the keyframe in which a frame was found the current one; return its alignment."""
+        if self._last is not None and keyframe.frame.index == self._last.index:
+            self._relocaliser.add(keyframe)
+            self._choice.frames_since = 1
+        self._use_keyframe(keyframe)
+        return replace(alignment, coverage=0.0)  # tracking by flow alone has failed: a keyframe is due
+
+    def _use_keyframe(self, keyframe: Keyframe) -> None:
+        self._keyframe, self._last = keyframe, None
+        self._choice.change(keyframe.depth_mm)
+        self._aligner.set_keyframe(keyframe)
+
+    def _rejection(self, alignment: Alignment) -> TrackingLoss | None:
+        """Return why an alignment with the current keyframe is rejected, or None."""
+        assert self._keyframe is not None
+        return self._aligner.rejection(self._keyframe, alignment)
+
+    def _accept(self, frame: Frame, keyframe: Keyframe, alignment: Alignment, relocalised: bool) -> Track:
+        T_world_camera = keyframe.pose_by(alignment)
+        if keyframe.map != self._motion.map:
+            self._motion.enter_map(keyframe.map, T_world_camera)
+            self._forget_map()
+        ratio = depth_ratio(keyframe, frame, T_world_camera) if self._after_close_up else float("nan")
+        self._after_close_up, self._sharp_frames_lost = False, 0
+        self._motion.follow(T_world_camera)
+        self._relocaliser.count(keyframe.map)
+        self._choice.accept(alignment)
+        track = Track(frame.index, "ok", "relocalised" if relocalised else "", T_world_camera, keyframe.frame.index)
+        return replace(_fitted(track, keyframe, alignment), depth_ratio=ratio, relocalised=relocalised)
+
+    def _lost(self, frame: Frame, loss: TrackingLoss, alignment: Alignment | None = None) -> Track:
+        self._motion.frames_lost += 1
+        reference = self._keyframe.frame.index if self._keyframe else frame.index
+        T_world_camera, number = self._motion.T_world_last, self._motion.map
+        track = Track(frame.index, "lost", loss.reason, T_world_camera, reference, map=number, cause=loss.cause)
+        return track if self._keyframe is None or alignment is None else _fitted(track, self._keyframe, alignment)
+
+    def _new_map(self, frame: Frame) -> Track:
+        """Begin a new map with this frame; its relative pose to the other maps is unknown."""
+        self._motion.begin_map()
+        self._forget_map()
+        self._keyframe, self._after_close_up, self._sharp_frames_lost = None, False, 0
+        return Track(frame.index, "initial", "new map", np.eye(4), frame.index, map=self._motion.map)
+
+    def _forget_map(self) -> None:
+        self._earlier_keyframes.clear()
+        self._last = None
+        self._relocaliser.enter_map(self._motion.map)
+
+
+def _in_contact(loss: TrackingLoss) -> TrackingLoss:
+    """Return a loss as that of a frame in which a close-up without structure fills the picture."""
+    return TrackingLoss(LossCause.CONTACT, f"the wall fills the picture, {loss.reason}")
+
+
+def _fitted(track: Track, keyframe: Keyframe, alignment: Alignment) -> Track:
+    """Return a track with how well it fits the keyframe."""
+    return replace(
+        track,
+        residual=alignment.residual,
+        inlier_share=alignment.inlier_share,
+        correlation=alignment.correlation,
+        overlap=alignment.overlap,
+        iterations=alignment.iterations,
+        map=keyframe.map,
+        nonrigidity=alignment.nonrigidity,
+    )

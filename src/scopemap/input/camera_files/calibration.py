@@ -1,0 +1,139 @@
+"""A camera as a file states it, and the same camera for images of another size."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.errors import CalibrationError, SettingsError
+
+Size: TypeAlias = tuple[int, int]
+SizeOrigin: TypeAlias = Literal["stated", "images", "relative"]
+
+LARGEST_SIDE_PX = 100_000
+_LONGEST_RELATIVE_FOCAL = 10.0
+_ASPECT_TOLERANCE = 0.01
+_CROP = re.compile(r"crop:(\d{1,6}),(\d{1,6})")
+_FOCAL_PER_WIDTH = (0.3, 5.0)
+_FOCAL_RATIO = (0.2, 5.0)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera and where it is from.
+
+    depth_scale_mm : mm per unit of the depth files beside it, or None where the file does not state it. source : how
+    the camera is known, one phrase. file : the file, or its name in errors, or None. size_origin : where the size of
+    `camera` is from. stated: the file. images: the file has none. relative: as images, and the file's numbers are
+    shares of the size.
+    """
+
+    camera: CameraModel
+    depth_scale_mm: float | None
+    source: str
+    size_origin: SizeOrigin = "stated"
+    file: Path | str | None = None
+
+    @property
+    def name(self) -> str:
+        """The name in error messages."""
+        return f"the calibration {self.file}" if self.file else f"the {self.source}"
+
+
+def pinhole_of(intrinsics: Sequence[float], stated: Size | None, image_size: Size) -> tuple[PinholeCamera, SizeOrigin]:
+    """Return the pinhole of fx fy cx cy, px or (cx and cy up to 1) shares of the size, and where its size is from."""
+    fx, fy, cx, cy = intrinsics
+    width, height = check_size(*(stated or image_size))
+    are_shares = max(cx, cy) <= 1 and max(abs(fx), abs(fy)) < _LONGEST_RELATIVE_FOCAL
+    if are_shares:
+        fx, fy, cx, cy = fx * width, fy * height, cx * width, cy * height
+    origin: SizeOrigin = "stated" if stated else "relative" if are_shares else "images"
+    return PinholeCamera(fx, fy, cx, cy, width, height), origin
+
+
+def check_size(width: float, height: float) -> Size:
+    """Return the size in whole pixels; `ValueError` where no image has it."""
+    if not (1 <= width <= LARGEST_SIDE_PX and 1 <= height <= LARGEST_SIDE_PX) or width % 1 or height % 1:
+        raise ValueError(f"its size is {width:g}x{height:g} px, which no image has")
+    return int(width), int(height)
+
+
+def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Calibration:
+    """Return the calibration for images of `image_size` (width, height), px.
+
+    `fit` is the setting `input.camera_fit`, the meaning of another size: exact, scale or crop:X,Y. Raises
+    `CalibrationError`, with both sizes, where the camera is not one of these images.
+    """
+    crop = _CROP.fullmatch(fit)
+    if crop is not None:
+        calibration = _cropped(calibration, image_size, (int(crop[1]), int(crop[2])))
+    elif fit == "scale":
+        calibration = _scaled(calibration, image_size)
+    elif fit != "exact":
+        raise SettingsError(f"fitting a calibration: expected exact, scale or crop:X,Y, found {fit[:40]!r}")
+    camera = calibration.camera
+    if (camera.width, camera.height) != image_size:
+        advice = (
+            "give --camera-fit scale if the images were resized from that size, --camera-fit crop:X,Y if they were "
+        )
+        advice += "cut out of it, else another calibration (--camera)"
+        raise CalibrationError(f"{_sizes(calibration, image_size)}; {advice}")
+    check_plausible(camera, calibration.name)
+    return calibration
+
+
+def check_plausible(camera: CameraModel, name: str) -> None:
+    """Raise `CalibrationError` where no endoscope has such a camera for images of its size."""
+    central, width, height = camera.central, camera.width, camera.height
+    least, most = (share * width for share in _FOCAL_PER_WIDTH)
+    narrow, wide = _FOCAL_RATIO
+    # Written so that NaN is refused, too.
+    if not least < central.fx < most or not narrow < central.fy / central.fx < wide:
+        fault = f"focal length {central.fx:g}, {central.fy:g} px (plausible: {least:g} to {most:g})"
+    elif not (0 <= central.cx < width and 0 <= central.cy < height):
+        fault = f"its principal point {central.cx:g}, {central.cy:g} is outside; it was made for a larger image"
+    else:
+        return
+    raise CalibrationError(f"{name} does not fit images of {width}x{height} px: {fault}")
+
+
+def _scaled(calibration: Calibration, image_size: Size) -> Calibration:
+    camera = calibration.camera
+    if calibration.size_origin == "images":
+        cannot = "so that it cannot be scaled (--camera-fit scale): add image_width and image_height"
+        raise CalibrationError(f"{calibration.name} does not state its image size, {cannot}")
+    width, height = image_size
+    if (camera.width, camera.height) == image_size:
+        return calibration
+    if abs(camera.width * height / (camera.height * width) - 1) > _ASPECT_TOLERANCE:
+        advice = (
+            "give --camera-fit crop:X,Y if the images were cut out of that size, else a calibration for these images"
+        )
+        raise CalibrationError(
+            f"{_sizes(calibration, image_size)}: another aspect, perhaps cropped; {advice} (--camera)"
+        )
+    source = f"{calibration.source}, rescaled from {camera.width}x{camera.height} px"
+    return replace(calibration, camera=camera.resized(width, height), source=source)
+
+
+def _cropped(calibration: Calibration, image_size: Size, corner: tuple[int, int]) -> Calibration:
+    camera, (x, y) = calibration.camera, corner
+    if calibration.size_origin == "relative":
+        cannot = "so that nothing can be cut out of it (--camera-fit crop): add width and height"
+        raise CalibrationError(f"{calibration.name} holds shares of a size that it does not state, {cannot}")
+    is_stated = calibration.size_origin == "stated"
+    if is_stated and (x + image_size[0] > camera.width or y + image_size[1] > camera.height):
+        cut = f"cut out of it at {x},{y} px (--camera-fit crop:{x},{y})"
+        raise CalibrationError(f"{_sizes(calibration, image_size)}: too large to have been {cut}")
+    of_size = f" of {camera.width}x{camera.height} px" if is_stated else ""
+    source = f"{calibration.source}, cut out{of_size} at {x},{y} px"
+    return replace(calibration, camera=camera.cropped(x, y, *image_size), source=source)
+
+
+def _sizes(calibration: Calibration, image_size: Size) -> str:
+    camera, (width, height) = calibration.camera, image_size
+    return f"{calibration.name} is for {camera.width}x{camera.height} px, but the images are {width}x{height} px"

@@ -1,0 +1,202 @@
+"""Calibration files as trees of names, lists and numbers: YAML, JSON, XML and `name: value` lines, in bounded memory.
+
+A tree is a `Fields`, a list, or a leaf (text or number). OpenCV's own parser is not used: nested deeply, a file of
+300 kB makes it take all memory there is.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import yaml
+
+from scopemap.engine.errors import CalibrationError
+
+MOST_TERMS = 20
+_MAX_BYTES = 1 << 20
+_MAX_DEPTH, _MAX_EVENTS = 24, 100_000
+_MAX_NUMBERS = 1000
+_LONGEST_QUOTE = 40
+# ORB-SLAM writes `Camera.fx` or `Camera1.fx` for fx.
+_PASSED_OVER = re.compile(r"^camera1?\.|[-_\s]+")
+_WORD_BREAK = re.compile(r"[-_.\s]+")
+_BARE_POINT = re.compile(r"(?<=\d)\.(?=[\s,\]}eE])")
+_SEPARATORS = str.maketrans(",;[]", "    ")
+_UNSET = ("false", "no", "off", "", "0", "0.0")
+
+
+def calibration_bytes(file: Path) -> bytes:
+    """Return the file's content; `CalibrationError` where it cannot be read or is larger than 1 MiB."""
+    try:
+        if not file.is_file():  # a pipe would be waited for
+            raise OSError("there is no such file" if not file.exists() else "it is no file")
+        if file.stat().st_size > _MAX_BYTES:
+            raise OSError(f"it is larger than any calibration: more than {_MAX_BYTES} bytes")
+        return file.read_bytes()
+    except (OSError, ValueError) as error:
+        raise CalibrationError(f"cannot read the calibration in {file}: {error}") from None
+
+
+class Fields:
+    """A mapping of a file; case, `-`, `_`, blanks and ORB-SLAM's `Camera.` do not matter in names."""
+
+    def __init__(self, pairs: Iterable[tuple[Any, Any]]) -> None:
+        self.pairs = [(name, node) for name, node in pairs if isinstance(name, str)]
+        self._by_name: dict[str, list[tuple[str, Any]]] = {}
+        for name, node in self.pairs:
+            self._by_name.setdefault(_PASSED_OVER.sub("", name.lower()), []).append((name, node))
+
+    def nodes(self, names: Iterable[str]) -> Iterator[tuple[str, Any]]:
+        """Yield spelling and node of each of `names`, same spelling first; `ValueError` where one is there twice."""
+        for name in names:
+            found = self._by_name.get(_PASSED_OVER.sub("", name.lower()), [])
+            if len({spelling for spelling, _ in found}) < len(found):
+                raise ValueError(f"{found[0][0][:_LONGEST_QUOTE]!r} is there twice: leave one out")
+            yield from sorted(found, key=lambda pair: pair[0] != name)
+
+    def number(self, names: Iterable[str]) -> float | None:
+        """Return the first of `names` that is a leaf, None where none is; `ValueError` where it is no finite number."""
+        leaves = (pair for pair in self.nodes(names) if not isinstance(pair[1], Fields | list))
+        return next((as_number(node, name) for name, node in leaves), None)
+
+    def numbers(self, names: Iterable[str], count: int | None = None) -> list[float] | None:
+        """Return the first of `names` that holds several numbers, `count` where it is given; None where none does."""
+        lists = (numbers_in(node, name) for name, node in self.nodes(names))
+        return next((found for found in lists if found is not None and count in (None, len(found))), None)
+
+    def words(self, names: Iterable[str]) -> str:
+        """Return the texts under `names` in lower case, with blanks for hyphens, underscores and dots."""
+        texts = (node for _, node in self.nodes(names) if isinstance(node, str))
+        return " ".join(_WORD_BREAK.sub(" ", text.strip("\"' \t").lower()).strip() for text in texts).strip()
+
+    def flag(self, names: Iterable[str]) -> bool:
+        """Return whether one of `names` is set, to anything but false, no, off or 0."""
+        leaves = (node for _, node in self.nodes(names) if not isinstance(node, Fields | list))
+        return any(str(node).lower() not in _UNSET for node in leaves)
+
+    def inner(self, names: Iterable[str]) -> list[Fields]:
+        """Return the mappings under `names` that are no matrices."""
+        return [node for _, node in self.nodes(names) if isinstance(node, Fields) and not any(node.nodes(("data",)))]
+
+
+def as_number(node: Any, name: str) -> float:
+    """Return a leaf as a number; `ValueError` where it is none, NaN or infinity."""
+    try:
+        value = math.nan if isinstance(node, bool) else float(node)
+    except (TypeError, ValueError, OverflowError):
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, found {str(node)[:_LONGEST_QUOTE]!r}")
+    return value
+
+
+def numbers_in(node: Any, name: str) -> list[float] | None:
+    """Return the numbers of a list, rows, a matrix or a text; None for all else, `ValueError` for infinite ones."""
+    counts: list[float] = []
+    if isinstance(node, Fields):
+        counts = [count for side in ("rows", "cols") if (count := node.number((side,))) is not None]
+        node = next((data for _, data in node.nodes(("data",))), None)
+        node = node.split() if isinstance(node, str) else node
+    if isinstance(node, str) and len(node.split()) > 1 and all(map(is_number, node.split())):
+        node = node.split()
+    if not isinstance(node, list):
+        return None
+    cells = chain.from_iterable(row if isinstance(row, list) else (row,) for row in node)
+    found = [as_number(cell, name) for cell in islice(cells, _MAX_NUMBERS)]
+    if len(counts) == 2 and math.prod(counts) != len(found):
+        raise ValueError(f"{name} holds {len(found)} numbers, but should be {counts[0]:g}x{counts[1]:g}")
+    return found
+
+
+def is_number(leaf: Any) -> bool:
+    """Return whether a leaf is a finite number."""
+    try:
+        return math.isfinite(as_number(leaf, ""))
+    except ValueError:
+        return False
+
+
+def number_rows(text: str) -> list[list[float]] | None:
+    """Return the numbers of each line that has some, comments after # aside; None where there is anything else."""
+    lines = (line.partition("#")[0].translate(_SEPARATORS) for line in text.splitlines() if line.strip())
+    try:
+        return [row for line in lines if (row := [float(word) for word in line.split()])]
+    except ValueError:
+        return None
+
+
+def named_values(text: str) -> Fields | None:
+    """Return `name: value` or `name=value`, on lines of their own or separated by , or ;. None for anything else."""
+    pairs = []
+    lines = (line.partition("#")[0] for line in text.splitlines() if line.strip())
+    for part in (part.strip() for line in lines for part in re.split("[,;]", line)):
+        name, separator, value = (piece.strip() for piece in part.partition("=" if "=" in part else ":"))
+        if part and not (separator and name and value and value[0] not in "[{*&!|>"):  # which begin YAML's other nodes
+            return None
+        pairs += [(name, value)] * bool(part)
+    return Fields(pairs) if pairs else None
+
+
+def read_tree(text: str) -> Any:
+    """Return the tree in JSON, XML or else YAML; `ValueError` for anything else, and for what is nested too deeply."""
+    start = text.lstrip()[:1]
+    try:
+        if start == "<":
+            return _of_element(xml_root(text))
+        if start not in ("{", "["):
+            return _yaml(text)
+        # OpenCV wrote numbers such as 318. into its JSON.
+        return json.loads(_BARE_POINT.sub(".0", text), object_pairs_hook=Fields, parse_int=float)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"it is no JSON: {error}") from None
+    except RecursionError:
+        raise ValueError("it is nested deeper than any calibration") from None
+
+
+class _YamlLoader(getattr(yaml, "CBaseLoader", yaml.BaseLoader)):  # type: ignore[misc]
+    """Reads every leaf as text and every mapping as `Fields`; tags have no effect."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Fields:
+        """Return the pairs, repeated ones included; an alias is the node that it stands for, not a copy."""
+        return Fields([(self.construct_object(k, deep), self.construct_object(v, deep)) for k, v in node.value])
+
+
+def _yaml(text: str) -> Any:
+    """Return the first document."""
+    # OpenCV's first line, %YAML:1.0, is no YAML, and versions later than a parser's own make it stop.
+    text = "\n".join("" if line.startswith("%YAML") else line for line in text.splitlines())
+    depth = 0
+    try:
+        for count, event in enumerate(yaml.parse(text, Loader=_YamlLoader)):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _MAX_DEPTH or count > _MAX_EVENTS:  # deep nesting overflows the stack of PyYAML's C code
+                raise ValueError("it is larger or nested deeper than any calibration")
+            if isinstance(event, yaml.DocumentEndEvent):
+                break  # a recorded topic repeats itself
+        return next(yaml.load_all(text, Loader=_YamlLoader), None)
+    except yaml.YAMLError as error:
+        raise ValueError(f"it is no YAML: {' '.join(str(error).split())[:200]}") from None
+
+
+def xml_root(text: str) -> ElementTree.Element:
+    """Return the root of XML; `ValueError` for anything else, and for entities, which may grow without bound."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("it holds a document type or entities, which no calibration needs")
+    try:
+        return ElementTree.fromstring(text.lstrip())  # noqa: S314 - entities are refused above
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is no XML: {error}") from None
+
+
+def _of_element(element: ElementTree.Element) -> Any:
+    inner = [(child.tag, _of_element(child)) for child in element]
+    if not inner:
+        return (element.text or "").strip()
+    return [node for _, node in inner] if all(tag == "_" for tag, _ in inner) else Fields(inner)

@@ -1,0 +1,161 @@
+"""A folder of images, sorted by the numbers in their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap.engine.errors import CalibrationError, InputError
+from scopemap.input.camera_files.reading import stated_calibration
+from scopemap.input.decoding import by_number, decoded, frame_number, read_decoded
+from scopemap.input.source import OWN_CALIBRATION, Source, SourceFrame
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+_COMPANION = re.compile(r"[_.](depth|normals?|flow|occlusions?|masks?)$", re.IGNORECASE)
+
+DepthCode = tuple[tuple[int, float, int], ...]
+"""How integer images store depth, by bits: (bits, mm per level, largest level that is a depth). Level 0 is unknown."""
+
+
+def numeric_order(path: Path) -> list[tuple[int, int, str]]:
+    """Sorting key: digits in the name count as numbers, so that 10 comes after 9."""
+    parts = re.split(r"(\d+)", path.stem)
+    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Return the colour images in `folder` in numeric order; not depth, not masks, none of a run's folder."""
+    if all((folder / name).is_file() for name in ("trajectory.tum", "provenance.json")):
+        return []
+    files = sorted(_images_in(folder), key=numeric_order)
+    return [file for file in files if not _COMPANION.search(file.stem)]
+
+
+def numbered_images(folder: Path) -> dict[int, Path]:
+    """Return the images in `folder` with a number in their names, depth and masks too, as `by_number`."""
+    return by_number(file for file in _images_in(folder) if frame_number(file) is not None)
+
+
+def read_image(file: Path) -> np.ndarray | None:
+    """Return the image as (h, w, 3) uint8 RGB, whatever its depth and channels; None where it cannot be read."""
+    return _rgb(read_decoded(file, cv2.IMREAD_COLOR))
+
+
+def decoded_image(content: bytes) -> np.ndarray | None:
+    """Return the image in a file's `content` as (h, w, 3) uint8 RGB; None where it holds none."""
+    return _rgb(decoded(content, cv2.IMREAD_COLOR))
+
+
+class ImageFolder(Source):
+    """A folder of images. A reader of a data set fills in what it knows: `poses`, `times_s` and `depth_files`.
+
+    depth_files : depth images by frame number, stored as `depth_code` has it. The calibration is `camera.yaml` in the
+    folder, else beside the images; one that cannot be read is its `camera_fault`. Raises `InputError` where no image
+    can be read.
+    """
+
+    name = "images"
+    depth_code: DepthCode = ((16, 1.0, 65535),)
+
+    def __init__(self, path: Path, files: list[Path] | None = None) -> None:
+        super().__init__(path)
+        self.files = image_files(path) if files is None else files
+        self.numbers: list[int] = _numbers(self.files)
+        self.count = len(self.files)
+        self.depth_files: dict[int, Path] = {}
+        self.notes = [f"time stamps: frame number / {self.rate_hz:g} s (the folder holds none)"]
+        self.height, self.width = self._size()
+        with self._making_camera():
+            use_first_calibration(self, path / OWN_CALIBRATION, self.files[0].with_name(OWN_CALIBRATION))
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether `path` is a folder with images."""
+        return bool(image_files(path))
+
+    @property
+    def file_of(self) -> dict[int, Path]:
+        """The images by frame number."""
+        return dict(zip(self.numbers, self.files, strict=True))
+
+    def frames(self, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the selected frames; an unreadable file is left out with a warning, another size is an `InputError`."""
+        for number, file in list(zip(self.numbers, self.files, strict=True))[selection]:
+            rgb = self._image(file)
+            if rgb is None:
+                self._warn(f"{file} cannot be read and was left out")
+                continue
+            self._check_size(rgb, f"{file}: it")
+            yield SourceFrame(number, self._time_s(number), rgb, file.name)
+
+    def _image(self, file: Path) -> np.ndarray | None:
+        return read_image(file)
+
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        """Return the depth (h, w) float32, mm, NaN = unknown; `InputError` unless stored as `depth_code` has it."""
+        file = self.depth_files.get(index)
+        if file is None:
+            return None
+        levels = self._depth_levels(file)
+        bits = 8 * levels.itemsize if levels is not None and levels.ndim == 2 and levels.dtype.kind == "u" else 0
+        known = next((entry for entry in self.depth_code if entry[0] == bits), None)
+        if levels is None or known is None:
+            allowed = "- or ".join(str(entry[0]) for entry in self.depth_code)
+            raise InputError(f"reading {file}: expected a depth image of one {allowed}-bit channel")
+        _, mm_per_level, largest = known
+        depth_mm = levels * np.float32(self.depth_scale_mm or mm_per_level)
+        return np.where((levels > 0) & (levels <= largest), depth_mm, np.nan).astype(np.float32)
+
+    def _depth_levels(self, file: Path) -> np.ndarray | None:
+        return read_decoded(file)
+
+    def _size(self) -> tuple[int, int]:
+        for file in self.files:
+            image = self._image(file)
+            if image is not None:
+                return image.shape[0], image.shape[1]
+        found = f"none of the {len(self.files)} images can be read" if self.files else "there is no image"
+        raise InputError(f"reading {self.path}: {found} (looked for {', '.join(SUFFIXES)})")
+
+    @contextmanager
+    def _making_camera(self) -> Iterator[None]:
+        """Keep an error about the data set's camera as `camera_fault`: another camera may have been given."""
+        try:
+            yield
+        except (CalibrationError, InputError) as fault:
+            self.camera_fault = fault
+
+
+def _images_in(folder: Path) -> list[Path]:
+    files = folder.iterdir() if folder.is_dir() else ()
+    return [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
+
+
+def _rgb(image: np.ndarray | None) -> np.ndarray | None:
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _numbers(files: list[Path]) -> list[int]:
+    """Return the files' own numbers where they have them and these increase, else their positions."""
+    numbers = [frame_number(file) for file in files]
+    known = [number for number in numbers if number is not None]
+    increase = len(known) == len(files) and all(a < b for a, b in pairwise(known))
+    return known if increase else list(range(len(files)))
+
+
+def use_first_calibration(source: Source, *files: Path) -> bool:
+    """Have a source use the first calibration of these files beside the frames; return whether there is one."""
+    file = next((file for file in files if file.is_file()), None)
+    if file is not None:
+        stated = stated_calibration(file, (source.width, source.height))
+        source.calibration = replace(stated, source=f"{stated.source} beside the frames")
+        source.camera, source.camera_source = stated.camera, source.calibration.source
+        source.depth_scale_mm = stated.depth_scale_mm
+    return file is not None

@@ -1,0 +1,112 @@
+"""Masks from files: pixels that show no tissue, such as instruments; one image per frame, or one for all frames."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from scopemap.engine.cameras.rectification import Rectifier
+from scopemap.engine.config import MaskSettings
+from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.masking.masker import disc
+from scopemap.engine.notices import Notice
+from scopemap.input.decoding import by_number, frame_number, read_decoded
+
+_LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
+_LOSSY = (".jpg", ".jpeg")
+_HALF = 127
+_NO_MASKS = "none"
+
+
+def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None = None) -> MaskFiles | None:
+    """Return the masks that the settings name, where they name none the data set's own, None where there are none.
+
+    own : folder of the data set's masks, or None. Raises as `MaskFiles` does, and `SettingsError` where the settings
+    contradict each other or the input.
+    """
+    folder = None if settings.files == _NO_MASKS else Path(settings.files) if settings.files else own
+    if settings.instruments == "off" and folder is not None and settings.files:
+        raise SettingsError(f"mask.instruments=off contradicts mask.files={settings.files}: leave one of them out")
+    if folder is None or settings.instruments == "off":
+        return None
+    return MaskFiles(folder, rectifier, settings.constants.files_grow_px)
+
+
+class MaskFiles:
+    """Masks in a folder, found by the last whole number in their names, which is the frame's; or one for all frames.
+
+    The one for all frames is the only image of its folder, and has no number in its name.
+
+    folder : holds the images. rectifier : from the camera of the images to the working camera.
+    grow_px : by which masks are widened, at the working size: outlines are drawn a little inside more often than not.
+
+    Raises `InputError` where the folder does not exist, holds no such image, or two for one frame.
+    """
+
+    def __init__(self, folder: Path, rectifier: Rectifier, grow_px: int = 0) -> None:
+        self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
+        self._files, self._single = _numbered(self._folder)
+        self._asked: set[int] = set()
+
+    def covered(self, index: int) -> np.ndarray | None:
+        """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.
+
+        Masked are pixels other than 0, in a JPEG those above 127. Raises `InputError` for a file that is no image,
+        `CalibrationError` for one of another aspect than the images.
+        """
+        if self._single is not None:
+            return self._covered_always
+        self._asked.add(index)
+        file = self._files.get(index)
+        return None if file is None else self._read(file)
+
+    @cached_property
+    def _covered_always(self) -> np.ndarray | None:
+        return None if self._single is None else self._read(self._single)
+
+    def _read(self, file: Path) -> np.ndarray:
+        image = read_decoded(file)
+        if image is None:
+            raise InputError(f"cannot read the mask {file}: it is no image, or damaged")
+        # The alpha channel is ignored.
+        level = image if image.ndim == 2 else image[..., :3].max(-1)
+        masked = self._rectifier.nearest((level > (_HALF if file.suffix.lower() in _LOSSY else 0)).astype(np.uint8))
+        return cv2.dilate(masked, disc(self._grow_px)) > 0
+
+    def provenance(self) -> dict[str, str]:
+        """Return the folder, how many masks it holds, and how many of the frames have one."""
+        if self._single is not None:
+            return {"masks": f"{self._single}, for all frames"}
+        found = f"{len(self._files)} files in {self._folder}"
+        if self._asked:
+            found += f"; {len(self._asked & set(self._files))} of {len(self._asked)} frames have one"
+        return {"masks": found}
+
+    @property
+    def notices(self) -> list[Notice]:
+        """A notice where most frames have no mask, since wrong numbers in the names look the same."""
+        missing = len(self._asked - set(self._files))
+        if 2 * missing <= len(self._asked):
+            return []
+        values = {"missing": missing, "frames": len(self._asked), "folder": str(self._folder)}
+        return [Notice("masks-missing", values)]
+
+
+def _numbered(folder: Path) -> tuple[dict[int, Path], Path | None]:
+    """Return the images by the number in their names, and the only image where that has none."""
+    if not folder.is_dir():
+        raise InputError(f"reading masks: {folder} is no folder; mask.files names the folder of the images")
+    files = (file for file in sorted(folder.iterdir()) if not file.name.startswith("."))
+    images = [file for file in files if file.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
+    numbered = [file for file in images if frame_number(file) is not None]
+    if numbered:
+        return by_number(numbered), None
+    if len(images) == 1:
+        return {}, images[0]
+    raise InputError(
+        f"reading masks: {folder} holds no image with a number in its name, which is the frame's, and not one image "
+        "alone, for all frames"
+    )

@@ -1,0 +1,153 @@
+"""The contract of a reader: frames as they are in a file or a data set, with their camera and truth where known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.cameras.rectification import DepthSensor
+from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.engine.frame import TruthQuality
+from scopemap.engine.notices import Notice
+from scopemap.input.camera_files.calibration import Calibration, fitted
+
+ASSUMED_RATE_HZ = 30.0
+"""Frames per s of inputs that state none."""
+
+OWN_CALIBRATION = "camera.yaml"
+"""Calibration file beside the frames, which comes before a data set's own."""
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One image as it is in the file, not rectified.
+
+    index : number of the frame in the input. time_s : time stamp, s. rgb : (h, w, 3) uint8, sRGB. name : the file's
+    own name, or "". second : the right view where both views of a stereo pair are used, as `rgb`; or None.
+    """
+
+    index: int
+    time_s: float
+    rgb: np.ndarray
+    name: str = ""
+    second: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class SourceTruth:
+    """What is known to be true of an image, in the geometry of the file.
+
+    T_world_camera : (4, 4) float64, mm, or None. depth_mm : (h, w) float32 along the optical axis, NaN = unknown, of
+    the image's view or what the source's `depth_sensor` sees, at any size; or None. quality : how the truth came about.
+    """
+
+    T_world_camera: np.ndarray | None
+    depth_mm: np.ndarray | None
+    quality: TruthQuality
+
+
+class Source:
+    """Frames of a video, a folder or a data set, as they are in the files. Readers derive from it.
+
+    Attributes
+    ----------
+    name : the data set's name. path : the file or folder.
+    width, height : size of the images, px. pixel_aspect : width of a pixel over its height.
+    count : number of frames. numbers : the frames' numbers. Both are None where only reading on tells.
+    stamped : whether its time stamps are its own; False: frame numbers over an assumed rate.
+    times_s : time stamps, s, by frame number; a frame without one has its number / `rate_hz`.
+    calibration : content of the calibration file beside the frames, of whatever size; None where there is none.
+    camera : the camera of the images, or None where it is unknown; that of `calibration` where there is one.
+    camera_source : how the camera is known, one phrase, or "".
+    camera_fault : why the data set's own camera cannot be used, None where it can.
+    poses : true poses, camera to world, (4, 4) float64, mm, by frame number. quality : how poses and depth came about.
+    depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
+    depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
+    frame_limit_s : longest time that a frame may take to read, s, and a second for each that is passed over; None: any.
+    masks : folder of the data set's own masks of what is no tissue, as `MaskFiles` reads them, or None.
+    notes : what had to be assumed.
+    warnings : what was found wrong so far; grows while frames are read.
+    """
+
+    name: str
+    width: int
+    height: int
+    pixel_aspect = 1.0
+    count: int | None = None
+    numbers: Sequence[int] | None = None
+    stamped = False
+    rate_hz = ASSUMED_RATE_HZ
+    frame_limit_s: float | None = 120.0
+    calibration: Calibration | None = None
+    camera: CameraModel | None = None
+    camera_source = ""
+    camera_fault: ScopemapError | None = None
+    quality: TruthQuality = "registered"
+    depth_scale_mm: float | None = None
+    depth_sensor: DepthSensor | None = None
+    masks: Path | None = None
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.poses: dict[int, np.ndarray] = {}
+        self.times_s: dict[int, float] = {}
+        self.notes: list[str | Notice] = []
+        self.warnings: list[str | Notice] = []
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Return whether `path` is of this kind."""
+        return False
+
+    def frames(self, selection: slice) -> Iterator[SourceFrame]:
+        """Yield the selected frames, decoded one at a time; `selection` counts positions, its step is positive."""
+        return iter(())
+
+    def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
+        """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
+        return None if self.numbers is None else [(number, self._time_s(number)) for number in self.numbers[selection]]
+
+    def media(self) -> str | None:
+        """Return the name that FFmpeg opens where the frames are those of one video; None elsewhere."""
+        return None
+
+    def pose(self, index: int) -> np.ndarray | None:
+        """Return the true pose (4, 4), camera to world, mm, of the frame with this index, or None; reads no depth."""
+        return self.poses.get(index)
+
+    def truth(self, index: int) -> SourceTruth | None:
+        """Return pose and depth of the frame with this `SourceFrame.index`; None where neither is known."""
+        pose, depth_mm = self.pose(index), self._depth_mm(index)
+        return None if pose is None and depth_mm is None else SourceTruth(pose, depth_mm, self.quality)
+
+    def _depth_mm(self, index: int) -> np.ndarray | None:
+        return None
+
+    def _time_s(self, number: int) -> float:
+        return self.times_s.get(number, number / self.rate_hz)
+
+    def _check_size(self, rgb: np.ndarray, what: str) -> None:
+        """Raise `InputError` where an image is not of the source's size."""
+        height, width = rgb.shape[:2]
+        if (width, height) != (self.width, self.height):
+            differ = f"{width}x{height} px, those before it are {self.width}x{self.height} px"
+            raise InputError(f"reading {what} is {differ}; a sequence needs frames of one size")
+
+    def _warn(self, message: str | Notice) -> None:
+        if message not in self.warnings:
+            self.warnings.append(message)
+
+    def _set_camera(self, camera: CameraModel, source: str, name: str) -> None:
+        """Take the data set's `camera`, resized to the images; `source` is a phrase, `name` how errors call it."""
+        calibration = fitted(Calibration(camera, None, source, file=name), (self.width, self.height), "scale")
+        self.camera, self.camera_source = calibration.camera, calibration.source
+
+
+def assumed_camera(source: Source, focal_px: float) -> PinholeCamera:
+    """Return a pinhole camera with horizontal focal length `focal_px` and its axis through the image's centre."""
+    cx, cy = (source.width - 1) / 2, (source.height - 1) / 2
+    return PinholeCamera(focal_px, focal_px * source.pixel_aspect, cx, cy, source.width, source.height)

@@ -1,0 +1,1 @@
+"""Trajectories, and the files in which other programs write them."""

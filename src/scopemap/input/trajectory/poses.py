@@ -1,0 +1,83 @@
+"""What all formats share: poses are checked to be rigid, made exactly so, and put into a `Trajectory`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scopemap.engine.errors import InputError
+from scopemap.engine.geometry.se3 import orthonormalised
+from scopemap.input.trajectory.trajectory import ASSUMED_FRAMES_PER_S, Trajectory
+
+_RIGID_TOLERANCE = 1e-2
+_MOST_FRAMES = 1e9  # whole seconds since 1970 are more
+
+
+def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
+    """Return poses (N, 4, 4) with exact rotations; `InputError`, with its `where`, at the first that is not rigid."""
+    wrong = np.flatnonzero(~np.isfinite(T).all(axis=(1, 2)))
+    if wrong.size:
+        raise InputError(f"{where[wrong[0]]}: a pose holds NaN or infinity; leave out frames without a pose")
+    R = T[:, :3, :3]
+    deviation = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+    bottom = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
+    wrong = np.flatnonzero((deviation > _RIGID_TOLERANCE) | (np.linalg.det(R) < 0) | (bottom > _RIGID_TOLERANCE))
+    if wrong.size:
+        raise InputError(
+            f"{where[wrong[0]]}: not a rigid motion (R^T R is off the identity by {deviation[wrong[0]]:.3g}, det R = "
+            f"{np.linalg.det(R[wrong[0]]):.3g}); poses must be without scale"
+        )
+    # Files hold six digits or so, and the inverse by transposition needs exact rotations.
+    return np.stack([orthonormalised(pose) for pose in T])
+
+
+def from_quaternions(xyzw: np.ndarray, positions: np.ndarray, where: list[str]) -> np.ndarray:
+    """Return motions (N, 4, 4) of unit quaternions (N, 4), scalar last, and translations (N, 3); checks the lengths."""
+    norms = np.linalg.norm(xyzw, axis=1)
+    wrong = np.flatnonzero(~(np.abs(norms - 1.0) <= _RIGID_TOLERANCE))
+    if wrong.size:
+        raise InputError(f"{where[wrong[0]]}: the quaternion has length {norms[wrong[0]]:.3g} instead of 1")
+    T = np.tile(np.eye(4), (len(positions), 1, 1))
+    if len(positions):
+        T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()
+        T[:, :3, 3] = positions
+    return T
+
+
+def poses_by_row(rows: np.ndarray, mm_per_unit: float, where: list[str]) -> dict[int, np.ndarray]:
+    """Return the pose (4, 4), translation in mm, of each row (N, 7) `tx ty tz qx qy qz qw`, by number of the row.
+
+    A row that holds NaN or infinity has no pose. Raises `InputError`, with its `where`, for other quaternions.
+    """
+    known = np.flatnonzero(np.isfinite(rows).all(axis=1))
+    T = from_quaternions(rows[known, 3:], rows[known, :3] * mm_per_unit, [where[row] for row in known])
+    return dict(zip(known.tolist(), T, strict=True))
+
+
+def are_frame_numbers(stamps: np.ndarray) -> bool:
+    """Return whether stamps (N,) are all whole, and small enough to count frames."""
+    return bool(np.all((stamps == np.round(stamps)) & (np.abs(stamps) < _MOST_FRAMES)))
+
+
+def stamped(T: np.ndarray, indices: np.ndarray | None, times_s: np.ndarray | None, source: str) -> Trajectory:
+    """Return camera-to-world poses (N, 4, 4), mm, as a trajectory without lost frames.
+
+    Without `indices` (N,) rows are counted and match nothing; without `times_s` (N,) there are 30 frames per s.
+    """
+    numbers = np.arange(len(T), dtype=np.int64) if indices is None else indices.astype(np.int64)
+    times_s = numbers / ASSUMED_FRAMES_PER_S if times_s is None else times_s
+    status = np.array(["initial"] + ["ok"] * (len(T) - 1))
+    return Trajectory(numbers, times_s, T, status, has_indices=indices is not None, source=source)
+
+
+def file_of(path: Path, names: tuple[str, ...]) -> Path:
+    """Return `path`, or the first of the files `names` in the folder `path`; `InputError` where there is none."""
+    if not path.is_dir():
+        return path
+    found = next((path / name for name in names if (path / name).is_file()), None)
+    if found is None:
+        wanted = f"looked for {' and '.join(names)}" if names else "this kind is read from a file"
+        raise InputError(f"cannot read a trajectory from the folder {path}: {wanted}")
+    return found

@@ -1,1 +1,0 @@
-"""Input: videos, image folders, data sets, decoding, and network weights."""

@@ -1,8 +1,0 @@
-"""Mapping: loop closure, map merging and bundle adjustment of keyframes, and the correction of all frames."""
-
-from scopemap.mapping.backend import Backend
-from scopemap.mapping.depth_correction import MAX_LOG_FACTOR
-from scopemap.mapping.pose_interpolation import FrameCorrection, TrackedPose
-from scopemap.mapping.submaps import Mapper, Submap
-
-__all__ = ["MAX_LOG_FACTOR", "Backend", "FrameCorrection", "Mapper", "Submap", "TrackedPose"]

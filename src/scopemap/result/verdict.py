@@ -1,0 +1,286 @@
+"""Whether a run can be trusted: one word, what it may be used for, and the reasons; docs/report.md has the rules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from scopemap.engine.notices import Notice, notices_of
+from scopemap.result.frame_table import ELSEWHERE, NOT_USED, FrameTable
+from scopemap.result.losses import in_words, losses
+from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.run_folder import RunFolder
+from scopemap.result.submap_summaries import doubt_words, submaps_in_time
+
+Result = Reconstruction | RunFolder
+"""A result in memory, or in its folder."""
+Level = Literal["good", "doubtful", "bad", "note", "info"]
+WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
+
+LEAST_FRAMES = 10
+GOOD_SHARE, LEAST_SHARE = 0.8, 0.3
+"""Share of the frames that are in the result, or in submaps that stand for their part of the video."""
+LEAST_SEGMENT_S = 3.0
+"""Least length of a submap that stands for its part of the video."""
+GOOD_COVERAGE, LEAST_COVERAGE = 0.8, 0.5
+"""Mean share of what the frames see that the surface covers."""
+GOOD_DISAGREEMENT, MOST_DISAGREEMENT = 0.05, 0.15
+"""Median relative difference between the surface's depth and the frames' depth."""
+MOST_MOVING = 0.5
+"""Share of the frames in which tissue moves on its own."""
+LEAST_TRIANGULATED = 0.5
+"""Share of the keyframes above which several views agree on depth."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One fact of a verdict: a stable code, its level ("note": it does not change the word), and a sentence."""
+
+    code: str
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on a run.
+
+    level : the worst of its reasons. advice : what the result may be used for. sentence : the main facts.
+    reasons : the worst first; the run's notices are among them, but for those of level info.
+    """
+
+    level: Level
+    advice: str
+    sentence: str
+    reasons: list[Reason]
+
+    @property
+    def word(self) -> str:
+        """good, doubtful or not usable."""
+        return WORDS[self.level]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What provenance.json says of it: `level`, `word`, and `code` and `level` of each of its `reasons`."""
+        reasons = [{"code": reason.code, "level": reason.level} for reason in self.reasons]
+        return {"level": self.level, "word": self.word, "reasons": reasons}
+
+
+def verdict(run: Result) -> Verdict:
+    """Return the verdict on a run, from its frames and its provenance."""
+    found = [*_of_end(run), *_of_notices(run), *_of_adjustment(run), _of_frames(run), *_of_maps(run)]
+    found += [*_of_surface(run), *_of_camera(run)]
+    order: tuple[Level, ...] = ("bad", "doubtful", "note", "good")
+    reasons = sorted(found, key=lambda reason: order.index(reason.level))
+    level: Level = next((reason.level for reason in reasons if reason.level in ("bad", "doubtful")), "good")
+    return Verdict(level, _advice(run, level), _sentence(run), reasons)
+
+
+def state_verdict(result: Reconstruction) -> None:
+    """Put the verdicts on a result and its other submaps into their provenance; that on the result rests on theirs."""
+    for part in reversed(result.submaps):
+        part.provenance["verdict"] = verdict(part).facts
+
+
+def frames_in_result(frames: FrameTable) -> tuple[int, int]:
+    """Return how many frames are in the result, and of how many that were used."""
+    return int(np.sum(frames.place == 0)), int(np.sum(frames.place != NOT_USED))
+
+
+def level_of_submap(submap: Result) -> Level:
+    """Return the level of the verdict on a submap by itself, as it was stated, or else found now."""
+    stated: Level | None = submap.provenance.get("verdict", {}).get("level")
+    return stated or verdict(submap).level
+
+
+def frames_per_s(result: Result) -> float | None:
+    """Return the frames per second of the whole run, without compiling kernels; None where its time is unknown.
+
+    Start-up, adjustment and fusion count, too; of a resumed run the frames and the time since then.
+    """
+    seconds, after = result.provenance.get("seconds", {}), result.provenance.get("resumed_after_frame")
+    passed_s = seconds.get("total", 0.0) - seconds.get("compile kernels", 0.0)
+    done = int(np.sum(result.frames["index"] > (-1 if after is None else after)))
+    return done / passed_s if passed_s > 0 else None
+
+
+def scale_is_known(provenance: dict[str, Any]) -> bool:
+    """Return whether sizes were measured or anchored to a given range; predicted millimetres are a guess."""
+    return bool((provenance.get("scale") or {}).get("known"))
+
+
+def _scale_is_stated(provenance: dict[str, Any]) -> bool:
+    return bool((provenance.get("scale") or {}).get("stated"))
+
+
+def scale_source(provenance: dict[str, Any]) -> str:
+    """Return what the scale comes from, in words."""
+    return str((provenance.get("scale") or {}).get("source", "unknown"))
+
+
+def longest_segment(outside: np.ndarray) -> int:
+    """Return the length of the longest run of True in (N,) bool."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], outside.astype(np.int8), [0]])))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
+
+
+def _advice(run: Result, level: Level) -> str:
+    if level == "bad":
+        return "Do not use this result."
+    use = "The shape can be used." if level == "good" else "Use it with care: read the cautions first."
+    if _scale_is_stated(run.provenance):
+        return f"{use} Sizes rest on your {scale_source(run.provenance)}: check a length that you know."
+    if scale_is_known(run.provenance):
+        return f"{use} Sizes are known (by {scale_source(run.provenance)})."
+    return f"{use} Sizes are unknown: compare shapes, do not measure."
+
+
+def _sentence(run: Result) -> str:
+    inside, used = frames_in_result(run.frames)
+    surface = run.provenance.get("surface") or {}
+    parts = [f"{inside} of {used} frames in one map"]
+    if judged := _submaps_in_words(run):
+        parts.append(f"beside it {judged}")
+    known = "scale as you stated it" if _scale_is_stated(run.provenance) else "scale known"
+    parts.append(known if scale_is_known(run.provenance) else "scale unknown")
+    if not len(run.mesh.faces):
+        parts.append("no surface")
+    elif "coverage_mean" in surface:
+        parts.append(f"surface covers {_percent(surface['coverage_mean'])} of its own pictures, not of the organ")
+    return "; ".join(parts)
+
+
+def _of_frames(run: Result) -> Reason:
+    inside, used = frames_in_result(run.frames)
+    if inside < LEAST_FRAMES:
+        return Reason("frames-too-few", "bad", f"Only {inside} of {used} frames could be joined: too few for a shape.")
+    place = run.frames.place[run.frames.place != NOT_USED]
+    found = np.isin(place, [0, *_segments(run)])
+    share, apart = found.mean(), int(found.sum()) - inside
+    lost_in_a_row = longest_segment(~found)
+    longest = f" Longest gap: {lost_in_a_row} frames." if lost_in_a_row else ""
+    until = "" if run.provenance.get("interrupted_at_frame") is None else " until then"
+    where, counted = "in the result", f"{inside} of {used}"
+    if apart:
+        where += f", or in submaps of {LEAST_SEGMENT_S:g} s and more that can be used by themselves"
+        counted = f"{inside} and {apart} of {used}"
+    text = f"{_percent(share)} of the frames{until} are {where} ({counted}).{longest}"
+    return Reason("frames-in-result", _level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
+
+
+def _segments(run: Result) -> list[int]:
+    """Return the numbers of the submaps that stand for their part of the video."""
+    place, times_s = run.frames.place, run.frames["time_s"]
+    period_s = np.median(np.diff(times_s)) if len(times_s) > 1 else np.nan
+    long = (n for n in range(1, len(run.submaps)) if (place == n).sum() * period_s >= LEAST_SEGMENT_S)
+    return [number for number in long if level_of_submap(run.submaps[number]) != "bad"]
+
+
+def _submaps_in_words(run: Result) -> str:
+    """Return how many other submaps there are and how they are judged by themselves; "" where there are none."""
+    levels = [level_of_submap(submap) for submap in run.submaps[1:]]
+    judged = ", ".join(f"{levels.count(level)} {word}" for level, word in WORDS.items() if level in levels)
+    return f"{len(levels)} {'submap' if len(levels) == 1 else 'submaps'} ({judged})" if levels else ""
+
+
+def _of_maps(run: Result) -> list[Reason]:
+    frames, found = run.frames, []
+    other = int(np.sum((frames.place > 0) | (frames.place == ELSEWHERE)))
+    lost, rotated = frames.counts["lost"], frames.counts["rotation_only"]
+    if other:
+        judged = _submaps_in_words(run)
+        saved = f"; saved and judged by themselves: {judged}" if judged else ""
+        text = f"After losses {other} more frames form submaps of their own: their relative poses are unknown{saved}."
+        found.append(Reason("submaps", "note", text))
+    doubt = doubt_words(submaps_in_time(frames))
+    if doubt:
+        found.append(Reason("submap-doubtful", "note", f"Most doubtful of the submaps is {doubt}."))
+    if lost:
+        how = f" but for its rotation in {rotated}" if rotated else " at all"
+        words = f"In {lost} frames the camera could not be followed{how}. {in_words(losses(frames))}"
+        found.append(Reason("frames-lost", "note", words.rstrip()))
+    return found
+
+
+def _of_surface(run: Result) -> list[Reason]:
+    if not len(run.mesh.faces):
+        return [Reason("surface-missing", "bad", "There is no surface.")]
+    surface, found = run.provenance.get("surface") or {}, []
+    if "coverage_mean" in surface:
+        coverage = float(surface["coverage_mean"])
+        text = f"The surface covers {_percent(coverage)} of the tissue in its own pictures (worst picture: "
+        text += f"{_percent(float(surface['coverage_least']))}). How much of the organ the camera saw is not known."
+        found.append(Reason("surface-coverage", _level(-coverage, -GOOD_COVERAGE, -LEAST_COVERAGE), text))
+    if "depth_error" in surface:
+        error = float(surface["depth_error"])
+        level = _level(error, GOOD_DISAGREEMENT, MOST_DISAGREEMENT)
+        words = {"good": "fits", "doubtful": "fits only roughly", "bad": "contradicts"}[level]
+        text = f"The surface {words} the single frames: distances differ by {_percent(error, 1)} (median)."
+        found.append(Reason("surface-depth", level, text))
+    return found
+
+
+def _of_camera(run: Result) -> list[Reason]:
+    if run.provenance.get("camera", {}).get("origin") != "assumed":
+        return []
+    text = "The lens is a guess (no calibration): depth against width may be wrong."
+    return [Reason("camera-assumed", "doubtful", text)]
+
+
+def _of_notices(run: Result) -> list[Reason]:
+    """Return what the run says about itself, each once, unless another reason says the same."""
+    found = [notice for notice in notices_of(run.provenance) if notice.level != "info" and notice.plain]
+    codes = {notice.code for notice in notices_of(run.provenance)}
+    if "camera-at-rest-stated" in codes:
+        found = [notice for notice in found if notice.code != "camera-at-rest"]
+    one = codes & {"fusion-at-one-moment", "fusion-in-one-state"}
+    shown = "as seen at one moment" if one else "a mean"
+    whole = "" if "camera-at-rest-stated" in codes else " Tissue that moves as a whole looks like a moving camera."
+    more = {"tissue-moves": f" There the surface is {shown}.{whole}"}
+    levels = [n.level if "camera-at-rest-stated" in codes else _level_of(n) for n in found]
+    texts = [n.plain + more.get(n.code, "") for n in found]
+    return [Reason(n.code, level, text) for n, level, text in zip(found, levels, texts, strict=True)]
+
+
+def _level_of(notice: Notice) -> Level:
+    """Return the level of a notice: what moves in most of the frames is no shortcoming of a few."""
+    values = notice.values
+    most_move = notice.code == "tissue-moves" and values["frames"] >= MOST_MOVING * values["measured"]
+    return "doubtful" if most_move else notice.level
+
+
+def _of_adjustment(run: Result) -> list[Reason]:
+    """Return whether several views agree on depth, where the starts of the adjustment do not tell it."""
+    said, found = notices_of(run.provenance), []
+    if {"shape-determined", "shape-decided"} & {notice.code for notice in said}:
+        return []
+    for notice in said:
+        values = notice.values
+        if notice.code == "mapping-without-observations":
+            text = "The camera hardly moved, or nothing was found again: no other view confirms depth and path."
+            found.append(Reason("depth-unconfirmed", "doubtful", text))
+        if notice.code == "depth-triangulated":
+            count, keyframes = values["triangulated"], values["keyframes"]
+            if count <= LEAST_TRIANGULATED * keyframes:
+                text = f"Several views agree on depth in {count} of {keyframes} keyframes only."
+                found.append(Reason("depth-unconfirmed", "doubtful", text))
+    return found
+
+
+def _of_end(run: Result) -> list[Reason]:
+    last = run.provenance.get("interrupted_at_frame")
+    text = f"The run was stopped at frame {last}: the rest is missing."
+    return [] if last is None else [Reason("interrupted", "doubtful", text)]
+
+
+def _level(value: float, good: float, bad: float) -> Level:
+    """Return the level of a value of which less is better; the limits themselves belong to the better side."""
+    return "good" if value <= good else "doubtful" if value <= bad else "bad"
+
+
+def _percent(share: float, digits: int = 0) -> str:
+    """Return a share as text; rounded down, so that not even a pixel short of all is all."""
+    factor = 10.0**digits
+    return f"{np.floor(100 * share * factor + 1e-9) / factor:.{digits}f} %"

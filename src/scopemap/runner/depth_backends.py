@@ -1,0 +1,89 @@
+"""Creates the depth estimator and the metric anchor that the settings name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scopemap.engine.cameras.rectification import Rectifier, StereoPair
+from scopemap.engine.config import DepthSettings
+from scopemap.engine.depth.anchor import AnchoredDepth
+from scopemap.engine.depth.estimate import DepthEstimator
+from scopemap.engine.depth.shading import ShadingDepth
+from scopemap.engine.depth.stereo import StereoDepth
+from scopemap.engine.errors import CalibrationError, SettingsError
+from scopemap.input.depth_files import FilesDepth
+
+_FILES = "files:"
+
+
+def create_depth(
+    settings: DepthSettings,
+    rectifier: Rectifier,
+    device: str,
+    depth_scale_mm: float | None = None,
+    *,
+    calibrated: bool = True,
+    averaged: bool = False,
+    pair: StereoPair | CalibrationError | None = None,
+) -> DepthEstimator:
+    """Return the estimator that `settings.backend` names: scopenet, shading, depth-anything, depth-pro,
+    stereo, files:FOLDER.
+
+    rectifier : from the camera that depth files show the view of to the working camera.
+    device : "auto", "cpu" or "cuda", for networks but scopenet, which runs on the CPU.
+    depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
+    calibrated : whether the frames' camera is known; False: ScopeNet gets no ray directions (wrong ones mislead it).
+    averaged : whether ScopeNet may take three times as long, and err less.
+    pair : the cameras of both views that the frames carry, or why they are not known; None where they carry one.
+
+    Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing,
+    `CalibrationError` where the cameras of both views are not known.
+    """
+    if (pair is None) != (settings.backend != StereoDepth.name):
+        found = f"{'one view' if pair is None else 'two views'} and depth.backend={settings.backend}"
+        raise SettingsError(f"two views (--stereo use) and depth.backend=stereo go together, found {found}")
+    if isinstance(pair, CalibrationError):
+        raise pair
+    if pair is not None:
+        return StereoDepth(pair, rectifier.target)
+    folder = files_folder(settings)
+    if folder is not None:
+        return FilesDepth(folder, rectifier, settings, depth_scale_mm)
+    if settings.backend == "shading":
+        return ShadingDepth(settings)
+    # Networks take seconds to import, so they are imported when chosen.
+    if settings.backend == "scopenet":
+        from scopemap.engine.depth.scopenet.estimator import ScopeNetDepth
+
+        return ScopeNetDepth(settings.model, rays_known=calibrated, averaged=averaged)
+    if settings.backend == "depth-pro":
+        return _depth_pro(settings.model, settings, device)
+    if settings.backend == "depth-anything":
+        from scopemap.engine.depth.depth_anything import DepthAnything
+
+        return DepthAnything.from_folder_or_hub(settings.model, device)
+    raise SettingsError(
+        f"unknown depth '{settings.backend}': choose scopenet, shading, depth-anything, depth-pro or files:FOLDER"
+    )
+
+
+def files_folder(settings: DepthSettings) -> Path | None:
+    """Return the folder that depth files come from, None where depth comes from elsewhere."""
+    return Path(settings.backend.removeprefix(_FILES)) if settings.backend.startswith(_FILES) else None
+
+
+def create_anchor(settings: DepthSettings, device: str) -> AnchoredDepth:
+    """Return the metric anchor of a sequence, with its reference estimator.
+
+    Raises `SettingsError` where the range is missing or impossible, `WeightsError` where Depth Pro is chosen and
+    its weights are missing.
+    """
+    needs_network = settings.anchor == "depth-pro" and settings.backend != "depth-pro"
+    reference = _depth_pro(settings.anchor_model, settings, device) if needs_network else ShadingDepth(settings)
+    return AnchoredDepth(settings, reference)
+
+
+def _depth_pro(model: str, settings: DepthSettings, device: str) -> DepthEstimator:
+    from scopemap.engine.depth.depth_pro import DepthPro
+
+    return DepthPro.from_folder_or_hub(model, device, use_known_focal=settings.constants.depth_pro_focal == "camera")

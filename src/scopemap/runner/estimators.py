@@ -1,0 +1,105 @@
+"""Creates the estimators that the settings name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from scopemap.engine.config import Config
+from scopemap.engine.depth.anchor import max_depth_mm
+from scopemap.engine.depth.estimate import DepthEstimator
+from scopemap.engine.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOINTS
+from scopemap.engine.depth.perceptual import create_perceptual
+from scopemap.engine.depth.stereo import StereoDepth
+from scopemap.engine.errors import WeightsError
+from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.flow.flows import create_flow
+from scopemap.engine.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
+from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
+from scopemap.engine.models import weights
+from scopemap.engine.preprocessing import Estimators
+from scopemap.engine.tracking.alike import AlikeFeatures
+from scopemap.engine.tracking.at_rest import CameraAtRest
+from scopemap.engine.tracking.features import SiftFeatures
+from scopemap.input.depth_files import FilesDepth
+from scopemap.input.mask_files import create_masks
+from scopemap.input.sequence import Sequence
+from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder
+
+
+@dataclass(frozen=True)
+class OwnEstimators:
+    """Estimators of the caller in place of those that the settings name; None: by the settings."""
+
+    depth: DepthEstimator | None = None
+    flow: FlowEstimator | None = None
+
+
+def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | None = None) -> Estimators:
+    """Return the estimators; raises `WeightsError`, `InputError` or `SettingsError` as their factories do.
+
+    own : replace those of the settings; a flow must then be safe in several threads.
+    """
+    own = own or OwnEstimators()
+    if own == OwnEstimators() and len(lacking := missing_weights(config)) > 1:
+        pulls = " && ".join(f"scopemap models pull {name}" for name in lacking)
+        raise WeightsError(f"weights are missing: {pulls}; `scopemap models list` says where they are looked for")
+    networks, folder = config.networks, files_folder(config.depth)
+    in_input = folder is not None and folder.resolve() == sequence.path.resolve()
+    depth = own.depth or create_depth(
+        config.depth,
+        sequence.depth_rectifier if in_input else sequence.rectifier,
+        networks.device,
+        sequence.depth_scale_mm,
+        calibrated=sequence.calibrated,
+        averaged=config.tracking.camera_at_rest,  # no parallax corrects its shape
+        pair=sequence.pair,
+    )
+    corner_flow = own.flow or create_flow(networks.keyframe_flow, networks.device)
+    return Estimators(
+        depth,
+        create_anchor(config.depth, networks.device),
+        own.flow or create_flow(networks.flow, networks.device),
+        corner_flow,
+        own.flow or create_flow(networks.keyframe_flow, networks.device),
+        create_perceptual(networks.perceptual, networks.device),
+        create_masks(config.mask, sequence.rectifier, sequence.source.masks),
+        AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
+        partial(CameraAtRest, config.tracking, corner_flow) if config.tracking.camera_at_rest else None,
+    )
+
+
+def missing_weights(config: Config, *other_flows: str, verified: bool = False) -> list[str]:
+    """Return the names of the weights that the settings need and this machine does not have; nothing is loaded.
+
+    other_flows : names of flows that are needed besides. verified : also "NAME (damaged)" where a hash is wrong.
+    """
+    depth, networks = config.depth, config.networks
+    models = {depth.backend: depth.model} if depth.backend in ("depth-anything", "depth-pro") else {}
+    if depth.anchor == "depth-pro":
+        models.setdefault("depth-pro", depth.anchor_model)
+    needed: list[tuple[str, ...]] = [
+        (model or name,) for name, model in models.items() if not (model and Path(model).is_dir())
+    ]
+    flows = {networks.flow, networks.keyframe_flow, *other_flows}
+    needed += [names for size, names in RAFT_CHECKPOINTS.items() if f"raft-{size}" in flows]
+    if networks.perceptual == "lpips":
+        needed.append(PERCEPTUAL_CHECKPOINTS)
+    if verified:
+        return [fault for names in needed if (fault := weights.fault(*names))]
+    return [names[0] for names in needed if not weights.is_present(*names)]
+
+
+def largest_depth_mm(config: Config, estimators: Estimators) -> float:
+    """Return the largest depth that a result can hold, mm: of measured depth its own, else that of the settings.
+
+    A back end may scale predicted depth; three standard deviations of that are included.
+    """
+    if isinstance(estimators.depth, FilesDepth | StereoDepth) and estimators.depth.measured_max_mm:
+        return estimators.depth.measured_max_mm
+    mapping, log_factor = config.mapping.constants, 0.0
+    if config.mapping.method != "none":
+        log_factor = 3 * mapping.scale_sigma + (MAX_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
+    return math.exp(log_factor) * max_depth_mm(config.depth)

@@ -1,0 +1,174 @@
+"""Options that several commands share, and parsers of their texts, which raise `SettingsError`."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from scopemap.engine.errors import InputError, SettingsError
+
+_QUOTED = 80  # characters of a text that an error repeats
+advanced = partial(typer.Option, rich_help_panel="Advanced")
+"""An option below the first page of a command's help."""
+
+Align = Literal["none", "origin", "se3", "sim3", "scale"]
+Unit = Literal["mm", "m"]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
+RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
+Input = Annotated[
+    Path, typer.Argument(metavar="INPUT", help="A video file, a folder of images, the folder of a data set's sequence.")
+]
+InputNow = Annotated[
+    Path | None,
+    typer.Option("--input", metavar="PATH", help="Where the run's input is now, if it is not found where it was."),
+]
+PresetName = Annotated[
+    Literal["default", "paper", "paper-strict", "realtime"] | None,
+    typer.Option(
+        help="default: best of what needs no download; paper: the method as published, made robust; paper-strict: "
+        "without what it does beyond the text; realtime: fast."
+    ),
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
+]
+Dataset = Annotated[
+    str | None, advanced(metavar="NAME", help="Its reader (`scopemap datasets list`); recognised if left out.")
+]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE|NUMBERS", help="Calibration file or 'fx fy cx cy [k1 k2 p1 p2 \\[k3]]', px of the input's images."
+    ),
+]
+FieldOfView = Annotated[
+    float | None,
+    typer.Option(
+        min=5.0,
+        max=170.0,
+        help="Horizontal field of view, degrees, of an unknown camera; default: estimated, or 70 (live: 70).",
+    ),
+]
+Scope = Annotated[
+    str | None,
+    typer.Option(
+        metavar="KIND",
+        help="Kind of endoscope of an unknown camera: colonoscope, gastroscope, bronchoscope, laparoscope, cystoscope, "
+        "ureteroscope, sinus, capsule.",
+    ),
+]
+NearFar = Annotated[
+    str | None,
+    typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm; replaces the anchor."),
+]
+Size = Annotated[
+    str | None,
+    typer.Option(metavar="WxH", help="Working size, px; default: the input's over a whole number, at most 400 px."),
+]
+SetPairs = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as tracking.keyframe_every=5.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier call wrote there.")]
+
+
+def check_output(file: Path, endings: tuple[str, ...], overwrite: bool) -> None:
+    """Raise `InputError` for a file that cannot be written, before the work: its name, or what is there already."""
+    if file.suffix.lower() not in endings:
+        raise InputError(f"cannot write {file}: its name must end in {' or '.join(endings)}")
+    if file.is_dir():
+        raise InputError(f"cannot write {file}: there is a folder of that name")
+    if file.exists() and not overwrite:
+        raise InputError(f"{file} exists; give another name with --out, or --overwrite")
+    around = next(folder for folder in file.absolute().parents if folder.exists())
+    if not around.is_dir():
+        raise InputError(f"cannot write {file}: {around} is a file")
+    if not os.access(file if file.exists() else around, os.W_OK):
+        raise InputError(f"cannot write {file}: no permission to write in {around}")
+
+
+def _matched(text: str, pattern: str, what: str, expected: str) -> re.Match[str]:
+    match = re.fullmatch(pattern, text)
+    if match is None:
+        raise SettingsError(f"cannot read the {what} '{text[:_QUOTED]}': expected {expected}")
+    return match
+
+
+def parse_board(text: str) -> tuple[int, int]:
+    """Return (columns, rows) of "COLUMNSxROWS"."""
+    match = _matched(text, r"(\d{1,3})x(\d{1,3})", "board", "COLUMNSxROWS such as 9x6")
+    return int(match[1]), int(match[2])
+
+
+def parse_part(text: str) -> tuple[int, int]:
+    """Return (k, n) of "K/N", 1 <= k <= n."""
+    expected = "K/N with K from 1 to N, such as 3/10"
+    match = _matched(text, r"(\d{1,6})/(\d{1,6})", "part", expected)
+    if not 1 <= int(match[1]) <= int(match[2]):
+        raise SettingsError(f"cannot read the part '{text}': expected {expected}")
+    return int(match[1]), int(match[2])
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return (width, height) of "WIDTHxHEIGHT", px."""
+    match = _matched(text, r"(\d{1,6})x(\d{1,6})", "size", "WIDTHxHEIGHT such as 320x256")
+    return int(match[1]), int(match[2])
+
+
+def parse_slice(text: str) -> slice:
+    """Return the slice of "A:B:S", as `slice_of` reads it."""
+    from scopemap.input.frame_choice import slice_of
+
+    return slice_of(text)
+
+
+Frames = Annotated[
+    slice | None,
+    typer.Option(parser=parse_slice, metavar="A:B:S", help="Which frames, as a Python slice: 0:5000, ::10."),
+]
+
+
+def parse_box(text: str) -> tuple[int, ...]:
+    """Return (x, y, width, height) of "X,Y,WIDTH,HEIGHT", px."""
+    _matched(text, r"\d{1,6}(,\d{1,6}){3}", "box", "X,Y,WIDTH,HEIGHT in px such as 0,0,300,40")
+    return tuple(int(part) for part in text.split(","))
+
+
+def parse_memory(text: str) -> int:
+    """Return MB of "2GB", "1500MB" or "1.5G"."""
+    pattern = r"(\d{1,6}(?:\.\d{1,3})?)\s*([MGmg])[Bb]?"
+    match = _matched(text.strip(), pattern, "memory", "a size such as 2GB or 1500MB")
+    return round(float(match[1]) * (1000 if match[2].upper() == "G" else 1))
+
+
+def parse_near_far(text: str) -> tuple[float, float]:
+    """Return (nearest, farthest) of "NEAR:FAR", mm."""
+    try:
+        near_mm, far_mm = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise SettingsError(f"cannot read --near-far '{text}': expected NEAR:FAR in mm such as 10:100") from None
+    return near_mm, far_mm
+
+
+def parse_settings(pairs: list[str]) -> dict[str, Any]:
+    """Return the settings of "key=value" texts; values are numbers, true, false, lists in JSON, or plain text."""
+    settings: dict[str, Any] = {}
+    for pair in pairs:
+        key, found, value = pair.partition("=")
+        if not found:
+            raise SettingsError(
+                f"cannot read the setting '{pair[:_QUOTED]}': expected KEY=VALUE such as tracking.keyframe_every=5"
+            )
+        try:
+            settings[key] = json.loads(value)
+        except json.JSONDecodeError:
+            settings[key] = value
+        except (RecursionError, ValueError) as error:  # lists in lists without end, numbers of thousands of digits
+            raise SettingsError(f"cannot read the setting '{pair[:_QUOTED]}': {error}") from None
+    return settings

@@ -1,1 +1,0 @@
-"""Stamped camera poses, and the trajectory files of others."""
