@@ -1,4 +1,4 @@
-"""Tasks by processes, Ray and Slurm: outcomes, deaths, time limits, attempts; batches that lose processes and nodes."""
+"""Tasks by processes and Ray: outcomes, deaths, time limits, attempts; batches that lose processes and nodes."""
 
 from __future__ import annotations
 
@@ -17,25 +17,22 @@ from process_tasks import FAULTS, LIMIT_S, WHATS, act, soon
 
 from scopemap.apps.batch.engines import Engine, WorkerNeeds
 from scopemap.apps.batch.ray_engine import RayEngine
-from scopemap.apps.batch.slurm_engine import SlurmEngine
 from scopemap.engine.errors import InputError
 from scopemap.runner.processes import ProcessLimits, run_in_processes, usable_cores
 from scopemap_bench.scripts.batch import POISONED, single_runs, trial, write_videos
 
 NEEDS = WorkerNeeds(cores=1, memory_gb=0.5)
 CLUSTER = pytest.mark.skipif(
-    any(importlib.util.find_spec(name) is None for name in ("ray", "submitit", "moto", "s3fs")),
+    any(importlib.util.find_spec(name) is None for name in ("ray", "moto", "s3fs")),
     reason="needs the extras cluster and dev",
 )
 
 
-@pytest.fixture(params=["processes", pytest.param("ray", marks=CLUSTER), pytest.param("slurm", marks=CLUSTER)])
-def engine(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Engine:
+@pytest.fixture(params=["processes", pytest.param("ray", marks=CLUSTER)])
+def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Engine:
     """An engine whose workers find the modules of these tests."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
-    (tmp_path / "jobs").mkdir()
-    slurm = SlurmEngine(tmp_path / "jobs", NEEDS, cluster="local")
-    return {"processes": run_in_processes, "ray": RayEngine(NEEDS), "slurm": slurm}[request.param]
+    return {"processes": run_in_processes, "ray": RayEngine(NEEDS)}[request.param]
 
 
 def test_each_task_has_the_outcome_that_it_deserves(engine: Engine, tmp_path: Path) -> None:
@@ -50,7 +47,6 @@ def test_each_task_has_the_outcome_that_it_deserves(engine: Engine, tmp_path: Pa
     assert attempts == [1, 2, 1, 1, 2, 2] == [found[number].attempts for number in range(len(WHATS))]
     assert set(started) == set(found)
     assert found[3].seconds == pytest.approx(LIMIT_S, abs=4)
-    assert list((tmp_path / "jobs").iterdir()) == []
     assert multiprocessing.active_children() == []
 
 
@@ -68,7 +64,6 @@ def test_what_is_begun_ends_with_who_waits_for_it(engine: Engine, tmp_path: Path
         assert number == 1
         assert soon((tmp_path / "hangs").exists)
     assert soon(lambda: not Path(f"/proc/{outcome.value[0]}").exists())
-    assert list((tmp_path / "jobs").iterdir()) == []
 
 
 @pytest.mark.parametrize("run", [run_in_processes, pytest.param(RayEngine(NEEDS), marks=CLUSTER)])
@@ -167,10 +162,7 @@ def test_a_disturbed_batch_has_the_results_of_single_runs(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--worker-cores", 2), "--worker-cores is an option of --engine ray or slurm"),
-        (("--engine", "slurm"), "Give --workers"),
-        (("--engine", "slurm", "--workers", 2, "--worker-gpus", 0.5), "Slurm gives whole GPUs"),
-        (("--engine", "slurm", "--workers", 2), "limit the seconds for one video (--time-limit)"),
+        (("--worker-cores", 2), "--worker-cores is an option of --engine ray"),
         (("--engine", "ray", "--address", "127.0.0.1:1", "--workers", 1), "cannot connect to Ray at 127.0.0.1:1"),
     ],
 )

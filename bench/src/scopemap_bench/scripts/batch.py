@@ -1,6 +1,6 @@
 """Batches that are disturbed: are their results those of single runs, and does the same command do nothing twice?
 
-    python -m scopemap_bench.scripts.batch [--videos N] [--engines processes parts ray slurm s3]
+    python -m scopemap_bench.scripts.batch [--videos N] [--engines processes parts ray s3]
 
 Short phantom videos are run one by one, and as a batch by each engine with two workers, on this machine (`s3`: by a
 local moto server). Meanwhile the process of the poisoned video is killed in each attempt, that of another video once,
@@ -10,7 +10,6 @@ failure is not the one expected, or a file of a finished result is touched again
 
 from __future__ import annotations
 
-import argparse
 import csv
 import logging
 import os
@@ -172,30 +171,6 @@ def by_ray(videos: Path, out: Path) -> Iterator[Disturbed]:
 
 
 @contextmanager
-def by_slurm(videos: Path, out: Path) -> Iterator[Disturbed]:
-    """Yield a batch as jobs of submitit on this machine, of which one is killed."""
-
-    def kill_job(process: subprocess.Popen[bytes]) -> None:
-        kill(next(job for controller in children(process.pid) for job in children(controller)))
-
-    yield Disturbed([sys.executable, __file__, "--local-jobs", str(videos), str(out)], "a job", kill_job)
-
-
-def local_jobs(videos: str, out: Path) -> None:
-    """Do what `scopemap batch --engine slurm` does, by jobs on this machine."""
-    from scopemap.apps.batch.batch import run_batch
-    from scopemap.apps.batch.command import videos_of
-    from scopemap.apps.batch.engines import WorkerNeeds
-    from scopemap.apps.batch.slurm_engine import SlurmEngine
-    from scopemap.input.inputs import named_inputs
-    from scopemap.runner.processes import ProcessLimits
-
-    chosen = videos_of(named_inputs([videos]), {"preset": "realtime", "camera": CAMERA}, {})
-    engine = SlurmEngine(out, WorkerNeeds(cores=1), cluster="local")
-    run_batch(chosen, out, ProcessLimits(2, seconds=120.0, retries=RETRIES), engine=engine)
-
-
-@contextmanager
 def by_s3(videos: Path, out: Path) -> Iterator[Disturbed]:
     """Yield a batch of videos on an S3 server at this machine's loopback address; nothing more is killed."""
     import fsspec
@@ -221,7 +196,6 @@ ENGINES: dict[str, Callable[[Path, Path], AbstractContextManager[Disturbed]]] = 
     "processes": by_processes,
     "parts": by_parts,
     "ray": by_ray,
-    "slurm": by_slurm,
     "s3": by_s3,
 }
 
@@ -286,11 +260,7 @@ def main() -> None:
     parser = measuring.options_of(__doc__)
     parser.add_argument("--videos", type=int, default=24)
     parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES))
-    parser.add_argument("--local-jobs", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if given.local_jobs:
-        local_jobs(given.local_jobs[0], Path(given.local_jobs[1]))
-        return
     sys.exit(0 if print_trials(given.videos, given.engines) else 1)
 
 

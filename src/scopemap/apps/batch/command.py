@@ -60,21 +60,21 @@ def batch(
         int, options.advanced(min=0, metavar="N", help="Further attempts where the process of a video dies.")
     ] = 1,
     engine: Annotated[
-        Literal["processes", "ray", "slurm"],
-        options.advanced(help="What runs the videos: processes here; actors on Ray; jobs of Slurm."),
+        Literal["processes", "ray"],
+        options.advanced(help="What runs the videos: processes here, or actors on Ray."),
     ] = "processes",
     address: Annotated[
         str | None, options.advanced(help="Of a Ray cluster, such as auto; default: a Ray of this machine alone.")
     ] = None,
     worker_cores: Annotated[
-        int | None, options.advanced(min=1, metavar="N", help="Ray, Slurm: cores of each worker (2).")
+        int | None, options.advanced(min=1, metavar="N", help="Ray: cores of each worker (2).")
     ] = None,
     worker_memory: Annotated[
-        str | None, options.advanced(metavar="SIZE", help="Ray, Slurm: memory that each worker is given (4GB).")
+        str | None, options.advanced(metavar="SIZE", help="Ray: memory that each worker is given (4GB).")
     ] = None,
     worker_gpus: Annotated[
         float | None,
-        options.advanced(min=0, help="Ray, Slurm: GPUs of each worker (networks.device=cuda: 1); on Ray 0.25, too."),
+        options.advanced(min=0, help="Ray: GPUs of each worker, 0.25 too (networks.device=cuda: 1)."),
     ] = None,
     part: Annotated[
         str | None, options.advanced(metavar="K/N", help="Only the K-th of N parts, for job arrays.")
@@ -102,12 +102,12 @@ def batch(
     from scopemap.runner.processes import ProcessLimits, usable_cores
 
     videos = videos_of(named_inputs(inputs), shared, of_scope | options.parse_settings(settings or []))
-    if workers is None and (engine == "slurm" or address):
+    if workers is None and address:
         raise SettingsError("how many videos run at once on the cluster? Give --workers")
     limits = ProcessLimits(workers or max(1, usable_cores() // 2), time_limit, retries)
     given: dict[str, Any] = {"address": address, "worker-cores": worker_cores}
     given |= {"worker-memory": worker_memory, "worker-gpus": worker_gpus}
-    run = engine_of(engine, given, videos, out)
+    run = engine_of(engine, given, videos)
     with _ending_by_sigterm():
         if dry_run:
             _forecast(videos[of_part[0] - 1 :: of_part[1]], out, limits, run, as_json=as_json, quiet=quiet)
@@ -184,35 +184,26 @@ def _number(text: str) -> float:
         raise SettingsError(f"cannot read the field of view '{text[:80]}': expected degrees such as 90") from None
 
 
-def engine_of(name: str, given: dict[str, Any], videos: list[Video], out: Path) -> Engine:
+def engine_of(name: str, given: dict[str, Any], videos: list[Video]) -> Engine:
     """Return the engine of a name.
 
     given : the values of its options, None where one is not given. Raises `SettingsError` for those of another engine.
     """
-    of_cluster = ("worker-cores", "worker-memory", "worker-gpus")
-    takes = {"processes": (), "ray": ("address", *of_cluster), "slurm": of_cluster}
-    for option in (option for option, value in given.items() if value is not None and option not in takes[name]):
-        engines = " or ".join(engine for engine, known in takes.items() if option in known)
-        raise SettingsError(f"--{option} is an option of --engine {engines}")
     from scopemap.apps.batch.engines import WorkerNeeds
     from scopemap.runner.processes import run_in_processes
 
     if name == "processes":
+        for option in (option for option, value in given.items() if value is not None):
+            raise SettingsError(f"--{option} is an option of --engine ray")
         return run_in_processes
+    from scopemap.apps.batch.ray_engine import RayEngine
+
     by_default, gpus, memory = WorkerNeeds(), given["worker-gpus"], given["worker-memory"]
     if gpus is None:
         gpus = float(any(video.config.networks.device.startswith("cuda") for video in videos))
     memory_gb = options.parse_memory(memory) / 1000 if memory else by_default.memory_gb
     needs = WorkerNeeds(given["worker-cores"] or by_default.cores, memory_gb, gpus)
-    if name == "ray":
-        from scopemap.apps.batch.ray_engine import RayEngine
-
-        return RayEngine(needs, given["address"])
-    if gpus % 1:
-        raise SettingsError(f"Slurm gives whole GPUs: --worker-gpus {gpus:g}")
-    from scopemap.apps.batch.slurm_engine import SlurmEngine
-
-    return SlurmEngine(out.absolute(), needs)
+    return RayEngine(needs, given["address"])
 
 
 def _forecast(videos: list[Video], out: Path, limits: Any, engine: Engine, *, as_json: bool, quiet: bool) -> None:

@@ -1,6 +1,6 @@
 """The share of the tissue of a result that was never seen, with an interval, and where: a map and blind spots.
 
-The tissue that there should be is the result's surface, closed smoothly where it has gaps (`engine/fusion/watertight.py`),
+The tissue that there should be is the result's surface, closed smoothly where it has gaps (`fusion/watertight.py`),
 in a lumen with 1.3 times the area where it was not seen: what a fold hides has more area than the sheet in front of it.
 """
 

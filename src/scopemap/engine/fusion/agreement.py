@@ -60,7 +60,7 @@ def compare_with_frame(
 def lit_like(rendering: Rendering, camera: PinholeCamera, rgb: np.ndarray, depth_mm: np.ndarray) -> Rendering:
     """Return the rendering of a mesh in the colours of the tissue as the lamp shows it, exposed as a frame is.
 
-    The light is that of fusion (`engine/fusion/albedo.py`) at the mesh's own distance. One number is fitted to the frame's
+    The light is that of fusion (`fusion/albedo.py`) at the mesh's own distance. One number is fitted to the frame's
     grey levels, its gain. rgb : (H, W, 3) uint8. depth_mm : (H, W), NaN = unknown or not usable.
     """
     lit = lit_by_lamp(rendering.rgb, rendering.depth_mm, camera)

@@ -11,7 +11,7 @@ Edges are the tracked motions (r = 0) and the loop closures. Cauchy's loss makes
 outliers. Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", RSS 2010.
 
 Loop closures show drift of the scale where the camera comes back, and the network's scale along new places: each
-frame's depth takes its scale from the one before (`engine/depth/mapis.py`), and errors add up; the network's scale is noisy
+frame's depth takes its scale from the one before (`depth/mapis.py`), and errors add up; the network's scale is noisy
 from frame to frame but does not drift. ln of the chained scale over the network's is drift plus noise. The drift is its
 smooth part (Whittaker, "On a new method of graduation", 1923).
 """
