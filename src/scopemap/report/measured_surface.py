@@ -1,4 +1,4 @@
-"""What `scopemap measure` and the report's page measure on, the same for both: triangles, depths, errors, draws."""
+"""What `scopemap measure` and the report's page measure on, the same for both: triangles, depths, errors."""
 
 from __future__ import annotations
 
@@ -22,8 +22,6 @@ _OTHERS = {
     "pixel_px": 1.0,
     # Standard deviation of a depth over the depth, where the run estimated none: the limit of a good surface.
     "depth": 0.05,
-    "draws": 2000,
-    "tail_percent": 2.5,
     # A shorter reference errs by more than a pixel at each end allows.
     "reference_px": 10,
 }
@@ -65,18 +63,3 @@ def measure_errors(run: RunFolder) -> dict[str, Any]:
         if camera.get("origin") == "assumed":
             focal = max(focal, _ASSUMED_FOCAL_ERROR)
         return {"focal": focal, "scale": _SCALE_ERROR[bool(scale.get("measured"))], **_OTHERS}
-
-
-def drawn(first: int, rows: int, draws: int) -> np.ndarray:
-    """Return rows (R, D) of standard normal numbers, from row `first` of an endless table on.
-
-    Hashed counters (the finaliser of MurmurHash3), then Box and Muller 1958: what JavaScript can repeat.
-    """
-    with np.errstate(over="ignore"):
-        h = (np.arange(2 * first * draws, 2 * (first + rows) * draws, dtype=np.uint32) + np.uint32(1)) * np.uint32(
-            0x9E3779B9
-        )
-        h = (h ^ (h >> np.uint32(16))) * np.uint32(0x85EBCA6B)
-        h = (h ^ (h >> np.uint32(13))) * np.uint32(0xC2B2AE35)
-        u = ((h ^ (h >> np.uint32(16))) + 0.5) / 2.0**32
-    return np.asarray(np.sqrt(-2 * np.log(u[::2])) * np.cos(2 * np.pi * u[1::2])).reshape(rows, draws)

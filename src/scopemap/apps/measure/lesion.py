@@ -16,6 +16,7 @@ import numpy as np
 import trimesh
 from scipy import ndimage
 
+from scopemap.apps.measure.intervals import LogChanges
 from scopemap.apps.measure.measure import Known, KnownScale, Measure, known_scale
 from scopemap.engine.cameras.rectification import Rectifier
 from scopemap.engine.errors import InputError, SettingsError, check_shape
@@ -24,7 +25,6 @@ from scopemap.engine.geometry.rendering import render_mesh, vertex_colours
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.decoding import by_number, read_decoded
-from scopemap.report.measured_surface import drawn
 from scopemap.runner.exported_run import ExportedRun, read_exported, write_image
 
 _FIGURES = {
@@ -42,7 +42,6 @@ _LOWER, _HIGHER = 0.1, 0.7
 _OUTLINE_PX, _LEAST_FACING = 0.5, 0.1
 _EDGE_PX, _LEAST_PX, _MOST_FRAMES = 2, 60, 60
 _IN_FRONT, _LEAST_LEFT, _MOST_DIFFERENCE = 0.1, 0.8, np.log(1.5)
-_FIRST_ROW = 30  # of the drawn numbers, after those of the scale
 _OUTLINE_BGR, _OUTLINE_POINTS = (0, 255, 255), 60
 
 
@@ -90,12 +89,11 @@ def measure_lesion(
     if given is not None:  # a frame of another diameter shows a part of it
         views = {n: view for n, view in views.items() if abs(np.log(view.diameter / given.diameter)) < _MOST_DIFFERENCE}
     found = []
-    for row, (figure, (name, power, common)) in enumerate(_FIGURES.items(), start=_FIRST_ROW):
+    for figure, (name, power, common) in _FIGURES.items():
         value, sigma = _combined(views, shown, figure, common)
-        own = np.exp(sigma * drawn(row, 1, scale.sizes["draws"])[0])
-        draws = (own * scale.from_views) ** power
+        changes = scale.from_views.times(LogChanges.of_own(sigma)).to_power(power)
         unit = scale.unit if power == 1 else scale.square
-        found.append(Measure.of(name, value / scale.divisor**power, draws, unit, scale.sizes))
+        found.append(Measure.of(name, value / scale.divisor**power, changes, unit))
     found.append(_height(views, found[0], scale))
     counted = {index: shown[index] for index in views}
     sizes_px = np.array([mask.sum() for mask in counted.values()])

@@ -1,7 +1,7 @@
 """Distances and areas on the surface of a run, between pixels of a frame, with intervals.
 
 An interval holds 95 % of what the measure may be by what is known of its errors: of the depth at each pixel, of the
-pixels themselves, of the focal length, and of the scale. Errors are drawn; what two measures share, cancels in a ratio.
+pixels themselves, of the focal length, and of the scale (`intervals.py`). What two measures share, cancels in a ratio.
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from scopemap.apps.measure.intervals import SIGMAS, LogChanges
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
-from scopemap.report.measured_surface import drawn, measure_errors, measured_depth, measured_mesh
+from scopemap.report.measured_surface import measure_errors, measured_depth, measured_mesh
 from scopemap.runner.exported_run import ExportedRun, read_exported
 
-_REFERENCE_ROW, _FIRST_ROW = 3, 9
-"""Of the drawn numbers: 0 to 2 are what all share, then three for each point."""
 _REFERENCE_SHARE, _MOST_SIGMA = 0.3, 0.05
 """Share of the depth's standard deviation at a reference that does not cancel in lengths beside it, and its most.
 
@@ -42,10 +41,10 @@ class Measure:
     unit: str
 
     @classmethod
-    def of(cls, what: str, value: float, relative: np.ndarray, unit: str, sizes: dict[str, Any]) -> Measure:
-        """Return a measure by its value and draws (D,) of what it may be over that; sizes : from `measure_errors`."""
-        low, high = np.percentile(relative, [sizes["tail_percent"], 100 - sizes["tail_percent"]])
-        return cls(what, float(value), float(value * min(low, 1.0)), float(value * max(high, 1.0)), unit)
+    def of(cls, what: str, value: float, changes: LogChanges, unit: str) -> Measure:
+        """Return a measure by its value and by what moves it."""
+        low, high = changes.factors
+        return cls(what, float(value), float(value * low), float(value * high), unit)
 
     def __str__(self) -> str:
         if not np.isfinite(self.value):
@@ -66,19 +65,6 @@ class _Picked:
     depth_error: np.ndarray
 
 
-@dataclass(frozen=True)
-class _Errors:
-    """Draws of what all measures of a frame share: depth of the whole frame, focal length and scale, (D,) factors.
-
-    sizes : from `measure_errors`.
-    """
-
-    depth: np.ndarray
-    focal: np.ndarray
-    scale: np.ndarray
-    sizes: dict[str, Any]
-
-
 def measure(
     folder: Path, frame: int, pixels: np.ndarray, reference: np.ndarray | None = None, reference_mm: float | None = None
 ) -> list[Measure]:
@@ -94,18 +80,18 @@ def measure(
     run = read_exported(folder)
     scale = known_scale(run, None if reference is None else Known(frame, reference, reference_mm))
     pose, mesh = _pose(run, frame), measured_mesh(run, frame)
-    picked, errors = _picked(run, mesh, frame, pose, pixels), _drawn(run)
+    picked = _picked(run, mesh, frame, pose, pixels)
     if len(pixels) > 2:
         area = area_inside(mesh, pixels, run.camera, pose)
         if area <= 0:
             raise InputError(f"no surface is seen inside the polygon of frame {frame}")
-        relative = _relative(run, picked, errors, _flat_area, _FIRST_ROW) * scale.draws**2
-        return [Measure.of("area", area / scale.divisor**2, relative, scale.square, scale.sizes)]
-    relative = _relative(run, picked, errors, _straight, _FIRST_ROW) * scale.draws
+        changes = _changes(run, picked, _flat_area).times(scale.changes.to_power(2))
+        return [Measure.of("area", area / scale.divisor**2, changes, scale.square)]
+    changes = _changes(run, picked, _straight).times(scale.changes)
     straight = _straight(np.stack([point.position for point in picked.points]))
     along = path_length(mesh, *picked.points)
     found = {"straight": straight, "along the surface": along}
-    return [Measure.of(what, value / scale.divisor, relative, scale.unit, scale.sizes) for what, value in found.items()]
+    return [Measure.of(what, value / scale.divisor, changes, scale.unit) for what, value in found.items()]
 
 
 @dataclass(frozen=True)
@@ -119,18 +105,17 @@ class Known:
 
 @dataclass(frozen=True)
 class KnownScale:
-    """The scale of a run's millimetres: what lengths are divided by, draws (D,) of its error, and the unit.
+    """The scale of a run's millimetres: what lengths are divided by, what moves lengths by it, and the unit.
 
-    from_views : draws (D,) for lengths from many frames: they err by the focal length, and not by one frame's depth.
-    words : what the scale rests on. sizes : of the errors, from `measure_errors`.
+    from_views : what moves lengths from many frames: they err by the focal length, and not by one frame's depth.
+    words : what the scale rests on.
     """
 
     divisor: float
-    draws: np.ndarray
-    from_views: np.ndarray
+    changes: LogChanges
+    from_views: LogChanges
     unit: str
     words: str
-    sizes: dict[str, Any]
 
     @property
     def square(self) -> str:
@@ -140,28 +125,31 @@ class KnownScale:
 
 def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
     """Return the scale that a run knows, or that of a reference. Raises `InputError` where neither gives one."""
-    errors = _drawn(run)
+    errors = measure_errors(run)
+    by_focal = LogChanges(np.array([[0, 0], _focal_changes(errors["focal"]), [0, 0]]))
     if known is None:
         if not run.scale_known:
             raise InputError(
                 f"{run.path}: {run.scale}; give two points as a reference: measures are then multiples of their "
                 "distance, and millimetres where that is given, too"
             )
-        return KnownScale(1.0, errors.scale, errors.scale / errors.focal, "mm", run.scale, errors.sizes)
-    far_px, least_px = float(np.linalg.norm(known.pixels[1] - known.pixels[0])), errors.sizes["reference_px"]
+        scale = LogChanges.of_scale(errors["scale"])
+        return KnownScale(1.0, scale, scale.times(by_focal), "mm", run.scale)
+    far_px, least_px = float(np.linalg.norm(known.pixels[1] - known.pixels[0])), errors["reference_px"]
     if far_px < least_px:
         raise InputError(f"the reference is {far_px:.1f} px long: {least_px} px are needed")
     picked = _picked(run, measured_mesh(run, known.frame), known.frame, _pose(run, known.frame), known.pixels)
     length = _straight(np.stack([point.position for point in picked.points]))
-    draws = 1 / _relative(run, picked, errors, _straight, _REFERENCE_ROW)
+    changes = _changes(run, picked, _straight).to_power(-1)
     if known.length_mm is None:
         unit, words = "times the reference", f"two points of frame {known.frame}, whose distance in mm is not known"
     else:
         unit, words = "mm", f"two points of frame {known.frame}, taken to be {known.length_mm:g} mm apart"
     beside = replace(picked, depth_error=np.sqrt(2) * (_REFERENCE_SHARE * picked.depth_error).clip(max=_MOST_SIGMA))
-    own = replace(errors, depth=np.zeros_like(errors.depth))
-    from_views = 1 / _relative(run, beside, own, _straight, _REFERENCE_ROW) / errors.focal
-    return KnownScale(length / (known.length_mm or 1.0), draws, from_views, unit, words, errors.sizes)
+    of_views = _changes(run, beside, _straight)
+    of_views.shared[0] = 0  # the depth of one frame is not that of many
+    from_views = of_views.to_power(-1).times(by_focal)
+    return KnownScale(length / (known.length_mm or 1.0), changes, from_views, unit, words)
 
 
 def _pose(run: ExportedRun, frame: int) -> np.ndarray:
@@ -201,27 +189,34 @@ def _depth_errors(run: ExportedRun, frame: int, pixels: np.ndarray, depth_mm: np
     return np.where(np.isfinite(errors), errors, measure_errors(run)["depth"])
 
 
-def _drawn(run: ExportedRun) -> _Errors:
-    sizes = measure_errors(run)
-    depth, focal, scale = drawn(0, 3, sizes["draws"])
-    return _Errors(depth, 1 + sizes["focal"] * focal, np.exp(sizes["scale"] * scale), sizes)
+def _focal_changes(sigma: float) -> tuple[float, float]:
+    """Return the changes of ln of a length across the view as the focal length stands at its ends."""
+    return -float(np.log1p(-SIGMAS * sigma)), -float(np.log1p(SIGMAS * sigma))
 
 
-def _relative(
-    run: ExportedRun, picked: _Picked, errors: _Errors, figure: Callable[[np.ndarray], np.ndarray], first: int
-) -> np.ndarray:
-    """Return draws (D,) of a figure of the points over its value without errors; first : row of the drawn numbers.
+def _changes(run: ExportedRun, picked: _Picked, figure: Callable[[np.ndarray], np.ndarray]) -> LogChanges:
+    """Return the changes of ln of a figure of the points.
 
     Half of the variance of a depth is that of the whole frame, half its own.
     """
-    count = len(picked.pixels)
-    own = drawn(first, 3 * count, errors.sizes["draws"]).reshape(3, count, -1).transpose(0, 2, 1)
-    depths = picked.depth_mm * np.exp(picked.depth_error * (errors.depth[:, None] + own[0]) / np.sqrt(2))
-    rays = run.camera.unproject(picked.pixels + errors.sizes["pixel_px"] * np.stack([own[1], own[2]], -1))
-    rays[..., :2] /= errors.focal[:, None, None]
-    points = rays * depths[..., None]
-    exact = run.camera.unproject(picked.pixels) * picked.depth_mm[:, None]
-    return np.asarray(figure(points) / np.maximum(figure(exact), 1e-9))
+    errors, count = measure_errors(run), len(picked.pixels)
+    ends = SIGMAS * np.array([-1.0, 1.0])
+    # Of each source both ends: what it does to ln depth (S, 2, N), pixels (S, 2, N, 2) and ln of the focal length.
+    log_depth, pixels = np.zeros((3 * count + 2, 2, count)), np.zeros((3 * count + 2, 2, count, 2))
+    log_focal = np.zeros((3 * count + 2, 2))
+    half = picked.depth_error / np.sqrt(2)
+    log_depth[0] = ends[:, None] * half
+    log_focal[1] = np.log1p(ends * errors["focal"])
+    for n in range(count):
+        log_depth[2 + 3 * n, :, n] = ends * half[n]
+        for axis in range(2):
+            pixels[3 + axis + 3 * n, :, n, axis] = ends * errors["pixel_px"]
+    rays = run.camera.unproject(picked.pixels + pixels)
+    rays[..., :2] /= np.exp(log_focal)[..., None, None]
+    moved = figure(rays * (picked.depth_mm * np.exp(log_depth))[..., None])
+    exact = figure(run.camera.unproject(picked.pixels) * picked.depth_mm[:, None])
+    changes = np.log(np.maximum(moved, 1e-9) / np.maximum(exact, 1e-9))
+    return LogChanges(np.concatenate([changes[:2], np.zeros((1, 2))]), changes[2:])
 
 
 def _straight(points: np.ndarray) -> Any:

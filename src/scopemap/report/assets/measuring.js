@@ -1,5 +1,5 @@
-// Distances and areas as `scopemap measure` gives them (actions/measure.py, geometry/surface_measures.py,
-// report/measured_surface.py), step by step in the same order: the same triangles, depths, errors and drawn numbers.
+// Distances and areas as `scopemap measure` gives them (apps/measure/measure.py, apps/measure/intervals.py,
+// geometry/surface_measures.py, report/measured_surface.py), step by step in the same order: the same triangles, depths, errors.
 
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -159,34 +159,30 @@ function rendered({ p, faces, at }, { fx, fy, cx, cy, width, height }, pose) {
   return inverse.map((w) => (w > 0 ? 1 / w : NaN));
 }
 
-// A row of standard normal numbers of an endless table (`drawn`).
-function drawn(row, draws) {
-  const uniform = (counter) => {
-    let h = Math.imul(counter + 1, 0x9e3779b9);
-    h = Math.imul(h ^ (h >>> 16), 0x85ebca6b);
-    h = Math.imul(h ^ (h >>> 13), 0xc2b2ae35);
-    return (((h ^ (h >>> 16)) >>> 0) + 0.5) / 2 ** 32;
-  };
-  return Float64Array.from({ length: draws }, (_, k) => Math.sqrt(-2 * Math.log(uniform(2 * (row * draws + k)))) * Math.cos(2 * Math.PI * uniform(2 * (row * draws + k) + 1)));
-}
-
 const straight = (points) => norm(minus(points[1], points[0]));
 const flatArea = (points) => 0.5 * norm(points.slice(2).reduce((sum, _, k) => add(sum, cross(minus(points[k + 1], points[0]), minus(points[k + 2], points[0]))), [0, 0, 0]));
 
-// Draws of a figure of picked points over its value without errors.
-function relativeTo(camera, picked, errors, figure, first) {
-  const own = picked.flatMap((_, n) => [0, 1, 2].map((k) => drawn(first + k * picked.length + n, errors.draws))), count = picked.length;
-  const exact = figure(picked.map(({ pixel, depth }) => scaled(unprojected(camera, pixel), depth)));
-  const [shared, focal] = [0, 1].map((row) => drawn(row, errors.draws)), at = (k, n, d) => own[3 * n + k][d];
-  return shared.map((of_frame, d) => figure(picked.map(({ pixel, depth, error }, n) => {
-    const ray = unprojected(camera, [pixel[0] + errors.pixel_px * at(1, n, d), pixel[1] + errors.pixel_px * at(2, n, d)]), lens = 1 + errors.focal * focal[d];
-    return scaled([ray[0] / lens, ray[1] / lens, 1], depth * Math.exp((error * (of_frame + at(0, n, d))) / Math.SQRT2));
-  })) / Math.max(exact, 1e-9));
+// Changes of ln of a figure of picked points as each source of error stands at the ends of its 95 % interval.
+const SIGMAS = 1.96, ENDS = [-SIGMAS, SIGMAS];
+function changesOf(camera, picked, errors, figure) {
+  const exact = Math.max(figure(picked.map(({ pixel, depth }) => scaled(unprojected(camera, pixel), depth))), 1e-9);
+  const moved = (by) => ENDS.map((end) => Math.log(Math.max(figure(picked.map(({ pixel, depth, error }, n) => {
+    const own = by.point === n ? by : {}, half = (error / Math.SQRT2) * end, lens = 1 + (by.focal ? errors.focal * end : 0);
+    const ray = unprojected(camera, [pixel[0] + (own.x ? errors.pixel_px * end : 0), pixel[1] + (own.y ? errors.pixel_px * end : 0)]);
+    return scaled([ray[0] / lens, ray[1] / lens, 1], depth * Math.exp(by.depth || own.ownDepth ? half : 0));
+  })), 1e-9) / exact));
+  const own = picked.flatMap((_, point) => [{ ownDepth: true }, { x: true }, { y: true }].map((which) => moved({ ...which, point })));
+  return { shared: [moved({ depth: true }), moved({ focal: true }), [0, 0]], own };
 }
 
-function percentile(values, percent) {
-  const sorted = values.slice().sort(), place = ((sorted.length - 1) * percent) / 100, k = Math.floor(place), next = sorted[Math.min(k + 1, sorted.length - 1)];
-  return sorted[k] + (next - sorted[k]) * (place - k);
+const toPower = ({ shared, own }, power) => ({ shared: shared.map((ends) => ends.map((x) => power * x)), own: own.map((ends) => ends.map((x) => power * x)) });
+const combined = (a, b) => ({ shared: a.shared.map((ends, k) => ends.map((x, n) => x + b.shared[k][n])), own: [...a.own, ...b.own] });
+
+// The ends of a figure's 95 % interval over its value.
+function factorsOf({ shared, own }) {
+  const all = [...shared, ...own];
+  const lower = Math.hypot(...all.map((ends) => Math.min(0, ...ends))), higher = Math.hypot(...all.map((ends) => Math.max(0, ...ends)));
+  return [Math.exp(-lower), Math.exp(higher)];
 }
 
 // Refuse a reference whose two pixels are so near that errors of picking them would decide.
@@ -207,25 +203,25 @@ function measured(frame, pixels, reference = null, referenceMm = null) {
     return { ...found, pixel, depth, error: known.length ? Math.max(...known) : errors.depth };
   });
   const points = picked(pixels);
-  let unit = "mm", divisor = 1, draws = drawn(2, errors.draws).map((z) => Math.exp(errors.scale * z));
+  let unit = "mm", divisor = 1, ofScale = { shared: [[0, 0], [0, 0], ENDS.map((end) => errors.scale * end)], own: [] };
   if (reference) {
     checkReference(reference, errors);
     const known = picked(reference);
     divisor = straight(known.map((point) => point.at));
-    draws = relativeTo(camera, known, errors, straight, 3).map((one) => 1 / one);
+    ofScale = toPower(changesOf(camera, known, errors, straight), -1);
     if (!referenceMm) unit = "times the reference";
     divisor /= referenceMm || 1;
   }
-  const given = (what, value, relative) => {
-    const [low, high] = [errors.tail_percent, 100 - errors.tail_percent].map((percent) => percentile(relative, percent));
-    return { what, value, low: value * Math.min(low, 1), high: value * Math.max(high, 1), unit };
+  const given = (what, value, changes) => {
+    const [low, high] = factorsOf(changes);
+    return { what, value, low: value * low, high: value * high, unit };
   };
   if (pixels.length > 2) {
     const area = areaInside(surface, pixels, camera, pose);
     if (area <= 0) throw new Error(`no surface is seen inside the polygon of frame ${frame.name}`);
     unit = unit === "mm" ? "mm2" : "times the reference's square";
-    return [given("area", area / divisor ** 2, relativeTo(camera, points, errors, flatArea, 9).map((one, d) => one * draws[d] ** 2))];
+    return [given("area", area / divisor ** 2, combined(changesOf(camera, points, errors, flatArea), toPower(ofScale, 2)))];
   }
-  const relative = relativeTo(camera, points, errors, straight, 9).map((one, d) => one * draws[d]);
-  return [given("straight", straight(points.map((point) => point.at)) / divisor, relative), given("along the surface", pathLength(surface, points) / divisor, relative)];
+  const changes = combined(changesOf(camera, points, errors, straight), ofScale);
+  return [given("straight", straight(points.map((point) => point.at)) / divisor, changes), given("along the surface", pathLength(surface, points) / divisor, changes)];
 }
