@@ -30,7 +30,7 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "Reconstruct": ("", ("open_sequence", "reconstruct", "Config")),
     "Frame by frame": (
         "With examples and tables: [frame by frame](frame-by-frame.md).",
-        ("Reconstructor", "OwnDepth"),
+        ("Reconstructor", "CustomDepth"),
     ),
     "The result": (
         "A finished run is read from its folder. Its `frames` is the table of `frames.csv`: "

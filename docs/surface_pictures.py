@@ -15,11 +15,9 @@ import cv2
 import numpy as np
 import trimesh
 
-from scopemap.runner.frames_again import open_truth
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.agreement import compare_with_frame
 from scopemap.engine.geometry.rendering import Rendering
-from scopemap.result.run_folder import RunFolder
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     MeshView,
@@ -30,6 +28,8 @@ from scopemap.report.mesh_figures import (
     outside_views,
 )
 from scopemap.report.sheet import picture_grid
+from scopemap.result.run_folder import RunFolder
+from scopemap.runner.reread_frames import open_truth
 
 MOST_BYTES = 200_000
 

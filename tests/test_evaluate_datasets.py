@@ -18,7 +18,7 @@ from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import write_tum
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.reference import read_reference, reference_trajectory
-from scopemap.runner.frames_again import open_truth
+from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.cli.evaluate import evaluate
 from scopemap_bench.scoring import default_protocol
 

@@ -12,7 +12,7 @@ from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import so3_exp
 from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.result.trajectories import read_trajectory
-from scopemap.runner.frames_again import open_truth
+from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.evaluation.deformation import displacement_error, shape_over_time
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import DISPLACEMENT, write_phantom

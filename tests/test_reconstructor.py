@@ -12,7 +12,7 @@ import pytest
 from front_door import warned
 from tiny_phantom import write_tiny
 
-from scopemap import Config, OwnDepth, Reconstruction, Reconstructor, open_sequence, reconstruct
+from scopemap import Config, CustomDepth, Reconstruction, Reconstructor, open_sequence, reconstruct
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.frame import Frame
@@ -90,7 +90,7 @@ def test_own_depth_and_flow_replace_those_of_the_settings(folder: Path) -> None:
         return np.zeros((*rgb_from.shape[:2], 2))
 
     pictures = _pictures(folder)[:2]
-    one = Reconstructor(Config.load("realtime"), CAMERA, depth=OwnDepth(_flat, "measured", "flat"), flow=flow)
+    one = Reconstructor(Config.load("realtime"), CAMERA, depth=CustomDepth(_flat, "measured", "flat"), flow=flow)
     steps = [one.step(picture) for picture in pictures]
     np.testing.assert_array_equal(steps[0].raw_mm, np.float32(40))
     assert steps[0].raw_mm.shape == (128, 160)
@@ -99,7 +99,7 @@ def test_own_depth_and_flow_replace_those_of_the_settings(folder: Path) -> None:
     assert facts["estimators"]["keyframe_flow"] == "own"
     assert facts["scale"]["known"]
     assert not shifts  # measured depth is tracked by itself
-    predicted = Reconstructor(Config.load("realtime"), CAMERA, depth=OwnDepth(_flat, "metric"), flow=flow)
+    predicted = Reconstructor(Config.load("realtime"), CAMERA, depth=CustomDepth(_flat, "metric"), flow=flow)
     for picture in pictures:
         predicted.step(picture)
     assert shifts
@@ -110,10 +110,10 @@ def test_kinds_of_own_depth_mean_different_scales(folder: Path) -> None:
     picture = _pictures(folder)[0]
     config = Config.load(settings={"depth.near_far_mm": [20, 80]})
     ramp = np.tile(np.linspace(1, 4, 160), (128, 1))
-    by_range = Reconstructor(config, CAMERA, depth=OwnDepth(lambda rgb: ramp, "disparity")).step(picture).raw_mm
+    by_range = Reconstructor(config, CAMERA, depth=CustomDepth(lambda rgb: ramp, "disparity")).step(picture).raw_mm
     assert np.nanpercentile(by_range, [2, 98]) == pytest.approx([20, 80], rel=0.2)
     assert by_range[64, 5] > by_range[64, 150]
-    own_mm = Reconstructor(None, CAMERA, depth=OwnDepth(lambda rgb: 10 * ramp, "metric")).step(picture).raw_mm
+    own_mm = Reconstructor(None, CAMERA, depth=CustomDepth(lambda rgb: 10 * ramp, "metric")).step(picture).raw_mm
     np.testing.assert_allclose(own_mm, 10 * ramp, rtol=1e-6)
 
 
@@ -126,7 +126,7 @@ def test_kinds_of_own_depth_mean_different_scales(folder: Path) -> None:
     ],
 )
 def test_what_own_depth_returns_is_checked(function: Callable[[np.ndarray], np.ndarray], fault: str) -> None:
-    one = Reconstructor(None, CAMERA, depth=OwnDepth(function, "metric"))
+    one = Reconstructor(None, CAMERA, depth=CustomDepth(function, "metric"))
     tissue = np.random.default_rng(0).integers([120, 50, 40], [180, 90, 80], (128, 160, 3)).astype(np.uint8)
     with pytest.raises(InputError, match=fault):
         one.step(tissue)
@@ -137,7 +137,7 @@ def test_what_own_depth_returns_is_checked(function: Callable[[np.ndarray], np.n
 
 def test_own_parts_without_a_kind_or_a_function_are_refused() -> None:
     with pytest.raises(SettingsError, match="of kind 'depth': choose one of disparity, metric, measured"):
-        OwnDepth(_flat, "depth")  # type: ignore[arg-type]
+        CustomDepth(_flat, "depth")  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="state the kind"):
         Reconstructor(None, CAMERA, depth=_flat)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="expected a function of two pictures, got str"):

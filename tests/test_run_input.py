@@ -17,7 +17,7 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.result.run_folder import RunFolder
 from scopemap.result.run_input import find_input, stated_input
-from scopemap.runner.frames_again import frames_again
+from scopemap.runner.reread_frames import reread_frames
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_exports_are_told_where_the_input_is(
 
 def test_the_pictures_of_a_run_serve_where_its_input_is_gone(tmp_path: Path) -> None:
     run = draw_run(tmp_path / "run")
-    found = {frame.index: frame for frame in frames_again(run, {3, 5})}
+    found = {frame.index: frame for frame in reread_frames(run, {3, 5})}
     assert sorted(found) == [3, 5]
     drawn = render_mesh(tube(), CAMERA, pose_of(3))
     assert np.abs(found[3].rgb.astype(int) - drawn.rgb).mean() < 8
@@ -109,9 +109,9 @@ def test_the_pictures_of_a_run_serve_where_its_input_is_gone(tmp_path: Path) -> 
     np.testing.assert_array_equal(found[3].valid, expected)
     RunFolder(run).picture_file(FRAMES - 1).unlink()
     with pytest.raises(InputError, match=r"frames/ has no picture of 1 of the 2 frames"):
-        list(frames_again(run, {3, FRAMES - 1}))
+        list(reread_frames(run, {3, FRAMES - 1}))
     facts = json.loads((run / "provenance.json").read_text())
     facts["camera"] |= {"width": 800, "height": 640}
     (run / "provenance.json").write_text(json.dumps(facts))
     with pytest.raises(InputError, match=r"frames/ has no picture of frame 3 that is large enough"):
-        list(frames_again(run, {3}))
+        list(reread_frames(run, {3}))

@@ -68,7 +68,7 @@ def test_in_realtime_the_network_looks_at_every_second_frame_and_flow_carries_it
     known = (carried > 0) & (own > 0)
     assert known.mean() > 0.7
     assert np.median(np.abs(np.log(carried[known] / own[known]))) < 0.05
-    (notice,) = (one for one in found[0].provenance["notices"] if one["code"] == "depth-carried")
+    (notice,) = (one for one in found[0].provenance["notices"] if one["code"] == "depth-propagated")
     assert notice["values"] == {"frames": 6, "every": 2}
 
 

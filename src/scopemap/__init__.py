@@ -91,7 +91,7 @@ if TYPE_CHECKING:
     __version__: str
 
     from scopemap.engine.config import Config
-    from scopemap.engine.depth.custom import OwnDepth
+    from scopemap.engine.depth.custom import CustomDepth
     from scopemap.engine.errors import ScopemapError
     from scopemap.engine.frame import Frame
     from scopemap.evaluation.poses import evaluate_poses
@@ -105,8 +105,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Config",
+    "CustomDepth",
     "Frame",
-    "OwnDepth",
     "Reconstruction",
     "Reconstructor",
     "RunFolder",
@@ -122,7 +122,7 @@ __all__ = [
 _HOMES = {
     "Config": "engine.config",
     "Frame": "engine.frame",
-    "OwnDepth": "engine.depth.custom",
+    "CustomDepth": "engine.depth.custom",
     "Reconstruction": "result.reconstruction",
     "Reconstructor": "runner.reconstructor",
     "RunFolder": "result.run_folder",

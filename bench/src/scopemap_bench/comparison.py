@@ -28,7 +28,7 @@ from scopemap.result.depth_maps import DepthReader
 from scopemap.result.reference import read_reference, reference_trajectory
 from scopemap.result.run_folder import RunFolder, read_mesh
 from scopemap.result.trajectories import read_trajectory
-from scopemap.runner.frames_again import open_truth
+from scopemap.runner.reread_frames import open_truth
 from scopemap_bench import pictures
 from scopemap_bench.entry import FILE_NAME as ENTRY
 from scopemap_bench.entry import Entry

@@ -23,7 +23,7 @@ from scopemap.result.depth_maps import DepthReader
 from scopemap.result.reference import reference_trajectory
 from scopemap.result.run_folder import read_mesh
 from scopemap.result.trajectories import read_trajectory
-from scopemap.runner.frames_again import is_camera_of, open_truth
+from scopemap.runner.reread_frames import is_camera_of, open_truth
 from scopemap_bench.climb.submission import with_score
 from scopemap_bench.evaluation import depth as depth_errors
 from scopemap_bench.evaluation.consistency import ConsistencyMeter, FrameMatcher

@@ -86,7 +86,9 @@ KINDS: dict[str, _Kind] = {
     ),
     "frames-failed": _Kind("note", "{frames} frame(s) could not be processed whole (first: frame {first}, {reason})"),
     "frames-without-depth": _Kind("note", "{frames} frame(s) got no depth from the network (first: frame {first})"),
-    "depth-carried": _Kind("info", "depth: the network saw one frame in {every}; flow carried it to {frames} others"),
+    "depth-propagated": _Kind(
+        "info", "depth: the network saw one frame in {every}; flow propagated it to {frames} others"
+    ),
     "frames-skipped": _Kind(
         "info",
         "{frames} frame(s) were skipped, without depth, because nothing in them can be followed: {causes}",

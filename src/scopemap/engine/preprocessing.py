@@ -27,7 +27,7 @@ from scopemap.engine.tracking.sharpness import LEAST_QUALITY, PictureQuality
 from scopemap.engine.tracking.track import FrameTracker, TrackingLoss, unusable
 
 # So many frames in a row with too little texture are looked at: motion blur is shorter.
-_MOST_BARE = 10
+_MOST_LOW_TEXTURE = 10
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class PreprocessedFrame:
     small : the frame at the size of the depth estimate and of `correspondence`, that of `frame` over `depth_downscale`.
     depth_note : that most of its depth is beyond the limit; else "". fault : why it could not be processed.
     skipped : whether nothing was estimated, because the tracker refuses it anyway; its depth is unknown.
-    carried : whether its depth is that of the frame before, by flow, and not the network's.
+    propagated : whether its depth is that of the frame before, by flow, and not the network's.
     """
 
     frame: Frame
@@ -63,22 +63,32 @@ class PreprocessedFrame:
     depth_note: str = ""
     fault: TrackingLoss | None = None
     skipped: bool = False
-    carried: bool = False
+    propagated: bool = False
 
 
 class Preprocessing:
     """Masks frames and estimates their raw depth, in order, each once."""
 
-    STATE: ClassVar = ("_masker", "_quality", "estimators", "faults", "skipped", "carried", "_bare", "_turn", "_kind")
+    STATE: ClassVar = (
+        "_masker",
+        "_quality",
+        "estimators",
+        "faults",
+        "skipped",
+        "propagated",
+        "_low_texture",
+        "_turn",
+        "_kind",
+    )
     """What changes from frame to frame."""
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._config, self.estimators = config, estimators
         self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
-        self.faults, self._bare = StageFaults("depth"), 0
+        self.faults, self._low_texture = StageFaults("depth"), 0
         self.skipped: Counter[str] = Counter()
         """How many frames were skipped, by the cause of their loss."""
-        self.carried = 0
+        self.propagated = 0
         """How many frames got the depth of the one before."""
         from_files = config.depth.backend.startswith("files:") or config.mask.instruments == "auto"
         self._every, self._needs_previous = config.depth.constants.network_every, Mapis(config.mapis).needs_previous
@@ -91,7 +101,9 @@ class Preprocessing:
         """Which frames were skipped, and how many got the depth of the one before, so far."""
         causes = ", ".join(f"{count} {cause}" for cause, count in self.skipped.most_common())
         found = [Notice("frames-skipped", {"frames": self.skipped.total(), "causes": causes})] if causes else []
-        return found + [Notice("depth-carried", {"frames": self.carried, "every": self._every})] * bool(self.carried)
+        return found + [Notice("depth-propagated", {"frames": self.propagated, "every": self._every})] * bool(
+            self.propagated
+        )
 
     def estimate(self, frame: Frame) -> PreprocessedFrame:
         """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
@@ -108,16 +120,16 @@ class Preprocessing:
         if frame.valid.mean() < constants.min_valid_share:
             return self._skipped(frame, unusable(frame))
         found = texture(frame, self._config.tracking) if constants.min_texture else math.inf
-        self._bare = self._bare + 1 if found < constants.min_texture else 0
-        if self._bare > _MOST_BARE:
+        self._low_texture = self._low_texture + 1 if found < constants.min_texture else 0
+        if self._low_texture > _MOST_LOW_TEXTURE:
             bare = TrackingLoss(LossCause.NO_TEXTURE, f"{found:.2f} of texture, noise has 0.32: contact, blur or fluid")
             return self._skipped(without_depth(frame), bare)
         frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))
         small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
         if self._kind is not None and self._turn + 1 < self._every:
-            self._turn, self.carried = self._turn + 1, self.carried + 1
+            self._turn, self.propagated = self._turn + 1, self.propagated + 1
             frame, small = with_unknown_depth(frame), with_unknown_depth(small)
-            return PreprocessedFrame(frame, small, self._kind, None, False, carried=True)
+            return PreprocessedFrame(frame, small, self._kind, None, False, propagated=True)
         estimate = self.estimators.depth.estimate(small)
         if estimate.kind != "measured" and not np.isfinite(estimate.values).any():
             self.faults.has_no_depth(frame.index)
@@ -171,7 +183,7 @@ class Matching:
             return estimated
         try:
             found = self._matcher.match(frame.rgb, frame.valid, wanted=wanted)
-            if estimated.carried and before is not None and found is not None:
+            if estimated.propagated and before is not None and found is not None:
                 estimated = _with_carried_depth(estimated, before, found)
             self._before = estimated.small
             return replace(estimated, correspondence=found)

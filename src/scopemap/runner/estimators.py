@@ -30,20 +30,20 @@ from scopemap.runner.depth_backends import create_anchor, create_depth, files_fo
 
 
 @dataclass(frozen=True)
-class OwnEstimators:
+class CustomEstimators:
     """Estimators of the caller in place of those that the settings name; None: by the settings."""
 
     depth: DepthEstimator | None = None
     flow: FlowEstimator | None = None
 
 
-def create_estimators(config: Config, sequence: Sequence, own: OwnEstimators | None = None) -> Estimators:
+def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators | None = None) -> Estimators:
     """Return the estimators; raises `WeightsError`, `InputError` or `SettingsError` as their factories do.
 
     own : replace those of the settings; a flow must then be safe in several threads.
     """
-    own = own or OwnEstimators()
-    if own == OwnEstimators() and len(lacking := missing_weights(config)) > 1:
+    own = own or CustomEstimators()
+    if own == CustomEstimators() and len(lacking := missing_weights(config)) > 1:
         pulls = " && ".join(f"scopemap models pull {name}" for name in lacking)
         raise WeightsError(f"weights are missing: {pulls}; `scopemap models list` says where they are looked for")
     networks, folder = config.networks, files_folder(config.depth)

@@ -15,7 +15,7 @@ from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.input.decoding import write_encoded
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 from scopemap.result.run_folder import RunFolder
-from scopemap.runner.frames_again import frames_again
+from scopemap.runner.reread_frames import reread_frames
 
 
 class ExportedRun(RunFolder):
@@ -43,12 +43,12 @@ class ExportedRun(RunFolder):
         return known
 
     def tracked_frames(self) -> Iterator[Frame]:
-        """Yield the tracked frames in order, rectified and masked, as `frames_again` has them.
+        """Yield the tracked frames in order, rectified and masked, as `reread_frames` has them.
 
         Raises `InputError` where the input is gone, or has not all of them any more.
         """
         missing = set(self.trajectory.indices.tolist())
-        for frame in frames_again(self.path, missing.copy(), self.source):
+        for frame in reread_frames(self.path, missing.copy(), self.source):
             missing.discard(frame.index)
             yield frame
         if missing:

@@ -49,7 +49,7 @@ class MemoryPlan:
         return [Notice("memory-limited", values)]
 
 
-def give_back_freed() -> None:
+def trim_memory() -> None:
     """Give memory that was freed back to the system, which glibc does too late where large arrays come and go.
 
     A mesh of trimesh refers to itself: until it is collected it keeps all that was computed from it, 60 MB a submap.

@@ -12,7 +12,7 @@ from scopemap.engine.notices import Notice
 from scopemap.engine.preprocessing import Estimators
 from scopemap.input.focal_length.from_motion import with_focal_from_motion
 from scopemap.input.sequence import Sequence
-from scopemap.runner.estimators import OwnEstimators, create_estimators
+from scopemap.runner.estimators import CustomEstimators, create_estimators
 from scopemap.runner.run import Progress
 
 Timed = Callable[..., Any]
@@ -20,7 +20,7 @@ Timed = Callable[..., Any]
 
 
 def prepare(
-    sequence: Sequence, config: Config, timed: Timed, progress: Progress, own: OwnEstimators | None = None
+    sequence: Sequence, config: Config, timed: Timed, progress: Progress, own: CustomEstimators | None = None
 ) -> tuple[Sequence, Config, Estimators, list[Notice]]:
     """Return a sequence with a focal length, resolved settings, the estimators, and notices of what was estimated."""
     progress("preparing", 0, 0)

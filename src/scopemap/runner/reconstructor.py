@@ -14,7 +14,7 @@ from scopemap.engine.cameras.rectification import Rectifier, working_camera, wor
 from scopemap.engine.config import Config
 from scopemap.engine.depth.estimate import DepthEstimator
 from scopemap.engine.errors import SettingsError
-from scopemap.engine.flow.estimator import OwnFlow
+from scopemap.engine.flow.estimator import CustomFlow
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
@@ -28,7 +28,7 @@ from scopemap.result.frame_table import FrameTable
 from scopemap.result.reconstruction import Reconstruction
 from scopemap.result.run_input import stated_input
 from scopemap.result.verdict import state_verdict
-from scopemap.runner.estimators import OwnEstimators, largest_depth_mm
+from scopemap.runner.estimators import CustomEstimators, largest_depth_mm
 from scopemap.runner.memory import memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import Limits, provenance_of, scale_facts
@@ -48,7 +48,7 @@ class Reconstructor:
     source : the camera of the pictures, a pinhole or with a lens (`read_calibration`), or a `Sequence` from
         `open_sequence`, or the path of what it opens, whose frames come from `frames()`. config : settings, or the name
         of a preset, by default `default`.
-    depth : depth estimator in place of the one of the settings: `OwnDepth(function, kind)`.
+    depth : depth estimator in place of the one of the settings: `CustomDepth(function, kind)`.
     flow : function of two pictures (H, W, 3) uint8 that returns the flow (H, W, 2) float, px, for that of the settings.
     progress : called with what is done before the first frame and in `result`, frames done, all frames (0: no count).
     limits : of memory, for runs without an end; beyond them results are no longer those of `reconstruct`.
@@ -68,14 +68,14 @@ class Reconstructor:
         limits: Limits | None = None,
     ) -> None:
         if depth is not None and not hasattr(depth, "estimate"):
-            raise SettingsError("depth is no estimator: state the kind of your function's values, OwnDepth(f, kind)")
+            raise SettingsError("depth is no estimator: state the kind of your function's values, CustomDepth(f, kind)")
         chosen = Config.chosen(config)
         if isinstance(source, Path | str):
             source = open_sequence(source, settings=chosen.input)
         self.config, clock = _with_own(chosen, depth=depth is not None, flow=flow is not None), Clock()
         self._pushed = not isinstance(source, Sequence)
         sequence = source if isinstance(source, Sequence) else _sequence_of(source, self.config)
-        own = OwnEstimators(depth, None if flow is None else OwnFlow(flow))
+        own = CustomEstimators(depth, None if flow is None else CustomFlow(flow))
         self._sequence, self.config, estimators, self._notices = prepare(
             sequence, self.config, clock.timed, progress, own
         )

@@ -33,7 +33,7 @@ from scopemap.input.sequence import Sequence
 from scopemap.result.frame_table import FrameTable, GrowingFrameTable
 from scopemap.result.reconstruction import Reconstruction
 from scopemap.runner.backwards import track_backwards
-from scopemap.runner.memory import MemoryPlan, give_back_freed
+from scopemap.runner.memory import MemoryPlan, trim_memory
 from scopemap.runner.provenance import Limits, motion_notices, notices_of_end, provenance_of
 from scopemap.runner.submap_frames import check_tracked, frames_of_submap
 
@@ -196,7 +196,7 @@ class _Finishing:
 
     def _fused(self, number: int, submaps: list[Submap]) -> Reconstruction:
         """Correct, write and fuse the frames of a submap."""
-        give_back_freed()
+        trim_memory()
         sequence, pipeline, submap = self.run.sequence, self.run.pipeline, submaps[number]
         config, store = pipeline.config, pipeline.fusion.store
         final = FinalFrames(submap, self._stored_poses(submap), store.frame)

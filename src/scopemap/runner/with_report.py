@@ -9,7 +9,7 @@ from scopemap.input.sequence import Sequence
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import write_report
 from scopemap.result.reconstruction import Reconstruction
-from scopemap.runner.memory import give_back_freed
+from scopemap.runner.memory import trim_memory
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Observer, Progress
 
@@ -26,7 +26,7 @@ def reconstruct_with_report(
     """Write the result of a sequence to a folder, with report.html and summary.png; as `reconstruct` otherwise."""
     seen = (FramePictures().observe, *observers)
     result = reconstruct(sequence, config, out=out, overwrite=overwrite, observers=seen, progress=progress)
-    give_back_freed()
+    trim_memory()
     progress("writing the report", 0, 0)
     write_report(out)
     return result

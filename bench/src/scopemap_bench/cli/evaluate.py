@@ -126,7 +126,7 @@ def _surface(trajectory: Path, truth: Path, matched: MatchedTrajectories, *, icp
             raise InputError("--icp needs a run's mesh.ply and a folder with a true surface")
         return {}
     from scopemap.input.opening import open_sequence
-    from scopemap.runner.frames_again import open_truth
+    from scopemap.runner.reread_frames import open_truth
     from scopemap_bench.scoring import surface_figures_of
 
     try:

@@ -17,7 +17,7 @@ from scopemap.engine.geometry.se3 import transform
 from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.trajectories import read_trajectory
-from scopemap.runner.frames_again import open_truth
+from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.datasets.d4d import D4dClip, End
 from scopemap_bench.phantom.writer import DISPLACEMENT
 

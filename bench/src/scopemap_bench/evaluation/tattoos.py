@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.trajectories import read_trajectory
-from scopemap.runner.frames_again import open_truth
+from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.evaluation.deformation import estimated_displacement
 
 THRESHOLDS_PX = (4, 8, 16, 32, 64)

@@ -20,7 +20,7 @@ import numpy as np
 
 from scopemap.apps.evaluate.against_video import RunFrames
 from scopemap.input.mask_files import MaskFiles
-from scopemap.runner.frames_again import open_input
+from scopemap.runner.reread_frames import open_input
 from scopemap_bench.scripts import measuring
 
 EVENTS = "instrument:10-40,instrument:50-75"

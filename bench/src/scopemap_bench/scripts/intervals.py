@@ -19,7 +19,7 @@ from scopemap.apps.measure.measure import measure
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.surface_measures import area_inside
-from scopemap.runner.frames_again import open_truth
+from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.overview import clips, drawn
 

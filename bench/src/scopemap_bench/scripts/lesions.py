@@ -21,7 +21,7 @@ from scopemap.apps.measure.lesion import measure_lesion
 from scopemap.apps.measure.measure import Known, Measure
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
-from scopemap.runner.frames_again import open_truth
+from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.scripts import measuring
 
 SEEDS, FRAMES, AT = (*range(401, 410), 411, 413, 415), 48, (8, 20, 32, 44)

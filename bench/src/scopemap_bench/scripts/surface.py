@@ -25,7 +25,7 @@ from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.trajectories import read_trajectory
-from scopemap.runner.frames_again import open_truth
+from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.overview import PHANTOMS, Clip, clips, drawn
 

@@ -32,7 +32,7 @@ from scopemap.engine.models.device import missing_packages
 from scopemap.engine.notices import notices_of
 from scopemap.report.depth_figures import draw_renderings
 from scopemap.result.run_folder import RunFolder
-from scopemap.runner.frames_again import open_input
+from scopemap.runner.reread_frames import open_input
 
 _HELD_OUT_EVERY = 10
 _WORST = 3  # frames that are drawn

@@ -31,7 +31,7 @@ from scopemap.engine.geometry.rendering import Rendering, render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.warp import pull
 from scopemap.result.run_folder import RunFolder
-from scopemap.runner.frames_again import frames_again
+from scopemap.runner.reread_frames import reread_frames
 
 _LEAST_PAIRS = 30  # in the view of a keyframe
 _OUTLIERS, _FITS = 2.5, 8  # pairs farther apart than so many medians are left out, so many times
@@ -175,7 +175,7 @@ def _correspondences(
 ) -> tuple[Correspondences3D, int]:
     """Return the pairs by the keyframes of the second that are located in the main map, and how many these are."""
     first, second, located = [np.zeros((0, 3))], [np.zeros((0, 3))], 0
-    for frame in frames_again(folder, set(other.poses), source):
+    for frame in reread_frames(folder, set(other.poses), source):
         found, depth_mm = places.locate(frame), other.run.depth.read(frame.index)
         if found.status == NOT_FOUND or found.map or depth_mm is None:
             continue

@@ -24,7 +24,7 @@ from scopemap.input.mask_files import create_masks
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence as FrameSequence
 from scopemap.result.run_folder import RunFolder
-from scopemap.runner.frames_again import frames_again
+from scopemap.runner.reread_frames import reread_frames
 
 _CANDIDATES = 8  # keyframes whose matches are verified
 _STRONGEST = 128  # descriptors by which they are ranked
@@ -96,7 +96,7 @@ class PlaceMap:
             pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
             known = pose_of.keys() & (set(tracked["keyframe"].tolist()) or pose_of.keys())
             poses |= {index: (number, pose_of[index]) for index in known}
-        for frame in frames_again(folder, set(poses), source):
+        for frame in reread_frames(folder, set(poses), source):
             depth_mm = run.depth.read(frame.index)
             if depth_mm is not None:
                 features = self._detector.detect(replace(frame, depth_mm=depth_mm))

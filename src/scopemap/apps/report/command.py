@@ -20,7 +20,7 @@ def report(
     from scopemap.engine.errors import InputError
     from scopemap.report.page import write_report
     from scopemap.result.run_folder import RunFolder
-    from scopemap.runner.frames_again import keep_pictures_again
+    from scopemap.runner.reread_frames import keep_pictures_again
 
     if pictures or not RunFolder(run).pictured:
         try:

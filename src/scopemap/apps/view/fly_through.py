@@ -26,7 +26,7 @@ from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet, rgb_of
 from scopemap.report.shown_mesh import simplified
 from scopemap.result.run_folder import RunFolder
-from scopemap.runner.frames_again import frames_again
+from scopemap.runner.reread_frames import reread_frames
 
 _SMOOTH_S = 0.2  # standard deviation of the path's filter
 _LEAST_SIDE_PX, _FOOT_PX, _TEXT_PX = 360, 54, 15
@@ -89,7 +89,7 @@ def _pictures(run: RunFolder, source: Path | None, painting: Painting | None) ->
     smooth = dict(zip(indices, smoothed_poses(poses, tracked["time_s"]), strict=True))
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)))
     way, lumen = dict(zip(indices, along, strict=True)), _centreline(run)
-    for frame in frames_again(run.path, set(indices), source):
+    for frame in reread_frames(run.path, set(indices), source):
         pose = smooth[frame.index]
         surface, known_mm = _surface(run, mesh, frame, pose)
         if painted is not None:

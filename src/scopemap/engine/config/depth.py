@@ -117,7 +117,7 @@ MAPIS: dict[str, dict[str, Any]] = {
     "exponential-blend": {"blend": "exponential"},
     "constant-blend": {"blend": "constant"},
     "paper-equation": {"blend": "paper-equation"},
-    "values-copied": {"order": "refine-first"},
+    "refine-first": {"order": "refine-first"},
 }
 
 

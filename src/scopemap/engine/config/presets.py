@@ -33,7 +33,7 @@ _BEYOND_PAPER: dict[str, Any] = {
     "depth.model": "LiheYoung/depth-anything-small-hf",
     "depth.max_depth_mm": 10000.0,
     "mapis.method": "paper+no-flow-check",
-    "tracking.method": "paper+least-squares+no-verdicts",
+    "tracking.method": "paper+least-squares+no-pose-checks",
     "fusion.method": "unweighted+all-components",
     "fusion.max_depth_mm": 300.0,
 }

@@ -56,7 +56,7 @@ TRACKING: dict[str, dict[str, Any]] = {
         **{"start": "identity", "channels": "grey", "lamp_gamma": 0.0, "gain_bias": False},
     },
     "least-squares": {"huber": 1e6},
-    "no-verdicts": {"min_valid_share": 0.001, "min_texture": 0.0, "min_inlier_share": 0.0, "max_step": 1e6},
+    "no-pose-checks": {"min_valid_share": 0.001, "min_texture": 0.0, "min_inlier_share": 0.0, "max_step": 1e6},
     "realtime": {"search_every": 3, "max_iterations": 15},
     "no-corners": {"corner_depth_sigma": 0.0},
     "no-early-keyframes": {"min_keyframe_agreement": 0.0},

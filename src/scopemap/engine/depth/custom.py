@@ -11,11 +11,11 @@ from scopemap.engine.depth.estimate import DepthEstimate, DepthKind
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.frame import Frame
 
-OwnKind = Literal["disparity", "metric", "measured"]
+CustomKind = Literal["disparity", "metric", "measured"]
 _KINDS: dict[str, DepthKind] = {"disparity": "disparity", "metric": "depth", "measured": "measured"}
 
 
-class OwnDepth:
+class CustomDepth:
     """A function from a picture to its depth, as a depth estimator.
 
     function : takes (H, W, 3) uint8 sRGB, the rectified picture at the working size; returns (H, W) of a float dtype,
@@ -28,7 +28,7 @@ class OwnDepth:
     function returns another shape or dtype, infinite or negative values.
     """
 
-    def __init__(self, function: Callable[[np.ndarray], np.ndarray], kind: OwnKind, name: str = "own") -> None:
+    def __init__(self, function: Callable[[np.ndarray], np.ndarray], kind: CustomKind, name: str = "own") -> None:
         if kind not in _KINDS:
             raise SettingsError(f"own depth of kind '{kind}': choose one of {', '.join(_KINDS)}")
         if not callable(function):

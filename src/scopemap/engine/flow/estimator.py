@@ -64,7 +64,7 @@ class NoFlow(FlowEstimator):
         return {"flow": self.name}
 
 
-class OwnFlow(FlowEstimator):
+class CustomFlow(FlowEstimator):
     """A function of the caller from two pictures to the flow between them, as a flow estimator for any thread.
 
     function : takes two (H, W, 3) uint8 pictures of one size; returns (H, W, 2) floats, px (x, y): pixel p of the first

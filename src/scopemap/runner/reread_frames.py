@@ -76,7 +76,7 @@ def open_input(run: Path, given: Path | None = None) -> tuple[Sequence, Masker]:
     return sequence, Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
 
 
-def frames_again(run: Path, indices: set[int], given: Path | None = None) -> Iterator[Frame]:
+def reread_frames(run: Path, indices: set[int], given: Path | None = None) -> Iterator[Frame]:
     """Yield the frames with these numbers from the input of the run, rectified and masked. Raises as `open_input`.
 
     Where the input is gone, and the run kept pictures of all these frames that need little enlarging, they are used.
