@@ -90,7 +90,7 @@ def test_the_notice_comes_with_the_weights() -> None:
     assert "Copyright (c) 2022, Zhao Xiaoming" in notice
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     shipped = setup["tool"]["setuptools"]["package-data"]["scopemap"]
-    assert {"tracking/alike.onnx", "tracking/alike.LICENSE.txt"} <= set(shipped)
+    assert {"engine/tracking/alike.onnx", "engine/tracking/alike.LICENSE.txt"} <= set(shipped)
 
 
 def _frame(rgb: np.ndarray) -> Frame:

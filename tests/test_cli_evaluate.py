@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import trimesh
 import typer
-from click.testing import Result
 from sample_trajectories import as_trajectory, vector_a, write_c3vd, write_run
 from tiny_phantom import write_tiny
 from typer.testing import CliRunner
@@ -33,7 +32,7 @@ KEYS = [
 ]
 
 
-def run(*arguments: object, code: int = 0) -> Result:
+def run(*arguments: object, code: int = 0) -> Any:
     app = typer.Typer()
     app.command()(evaluate)
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])

@@ -78,6 +78,7 @@ def test_pixels_and_frames_without_truth_or_depth_do_not_count() -> None:
 
 
 def test_each_weights_file_is_an_estimator_that_tells_sigma(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="needs the extra networks")
     from training.export import export
     from training.network import ScopeNet
 

@@ -7,6 +7,7 @@ import math
 import shutil
 from contextlib import closing
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -113,7 +114,10 @@ def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(
     # Neighbouring frames see the same: their coloured points look alike, and no surface adds to that.
     assert figures["nearest_frame"]["ssim"] > max(0.7, figures["held_out"]["ssim"])
     assert figures["nearest_frame"]["coverage_mean"] > 0.8
-    assert figures["lpips"] == f"left out: needs the weights alexnet or alexnet-features in {tmp_path}"
+    lacking = f"needs the weights alexnet or alexnet-features in {tmp_path}"
+    if find_spec("torch") is None:
+        lacking = "LPIPS needs torch and torchvision and lpips: pip install -e '.[networks]'"
+    assert figures["lpips"] == f"left out: {lacking}"
     rows = pd.read_csv(run_folder / "against_video" / "frames.csv")
     assert rows.loc[rows["fused"] == 0, "index"].tolist() == [5]
     assert cv2.imread(str(run_folder / "against_video" / "worst.png")) is not None

@@ -165,7 +165,7 @@ def test_unknown_names(name: str) -> None:
 
 
 def test_registry_agrees_with_torchvision() -> None:
-    import torchvision
+    torchvision = pytest.importorskip("torchvision", reason="needs the extra networks")
 
     for checkpoint in REGISTRY.values():
         if checkpoint.source == "torchvision":
