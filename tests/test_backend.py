@@ -21,8 +21,8 @@ from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose
 from scopemap.engine.mapping import backend as backend_module
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
+from scopemap.engine.mapping.frame_correction import KeyframeStep
 from scopemap.engine.mapping.other_starts import ShapeTest
-from scopemap.engine.mapping.pose_interpolation import KeyframeStep
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)

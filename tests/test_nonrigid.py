@@ -23,9 +23,9 @@ from scopemap.engine.mapping.deformation_graph import (
     periodic_rate,
     spread_nodes,
 )
+from scopemap.engine.mapping.frame_correction import TissueMotion
 from scopemap.engine.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
 from scopemap.engine.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
-from scopemap.engine.mapping.pose_interpolation import TissueMotion
 
 KEYFRAMES, PER_KEYFRAME, GAPS = 16, 120, (1, 2, 3, 5)
 BREATH = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(KEYFRAMES) / 9)

@@ -153,9 +153,9 @@ KINDS: dict[str, _Kind] = {
     ),
     "shape-not-determined": _Kind(
         "doubtful",
-        "mapping: starts of the adjustment end in different shapes; that of the depth network stands (errors of tracks "
-        "left out {error_px:.2f} px, of the other {other_px:.2f} px)",
-        "The motion does not determine the shape: it rests on the depth network alone",
+        "mapping: starts of the adjustment end in different shapes; the one from the network's depth was taken (errors "
+        "of tracks left out {error_px:.2f} px, of the other {other_px:.2f} px)",
+        "The motion does not determine the shape: another one fits the views about as well",
     ),
     "mapping-not-determined": _Kind(
         "doubtful",

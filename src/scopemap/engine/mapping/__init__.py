@@ -2,7 +2,7 @@
 
 from scopemap.engine.mapping.backend import Backend
 from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
-from scopemap.engine.mapping.pose_interpolation import FrameCorrection, TrackedPose
+from scopemap.engine.mapping.frame_correction import FrameCorrection, TrackedPose
 from scopemap.engine.mapping.submaps import Mapper, Submap
 
 __all__ = ["MAX_LOG_FACTOR", "Backend", "FrameCorrection", "Mapper", "Submap", "TrackedPose"]

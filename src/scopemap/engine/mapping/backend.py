@@ -25,6 +25,7 @@ from scopemap.engine.mapping.depth_correction import (
     growth_of_disagreement,
 )
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
+from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TissueMotion, TrackedPose
 from scopemap.engine.mapping.lens_residual import lens_residual
 from scopemap.engine.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
 from scopemap.engine.mapping.map_merging import (
@@ -44,7 +45,6 @@ from scopemap.engine.mapping.pose_graph import (
     scale_by_network,
     tracked_pairs,
 )
-from scopemap.engine.mapping.pose_interpolation import FrameCorrection, KeyframeStep, TissueMotion, TrackedPose
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.features import FeatureDetector
 
@@ -361,7 +361,7 @@ class Backend:
             errors = {"error_px": shape.error_px, "other_px": shape.other_px}
             return Notice("mapping-not-determined", {**errors, "merged": ""}), ()
         fields = self._fields(chosen, problem.points, found)
-        if shape.outcome != "not tested":  # depth that is not used cannot judge what several starts agree on
+        if shape.outcome != "not tested":  # the starts have judged the shape
             return None, fields
         return self._depth_contradiction(chosen, found, fields, worlds), fields
 

@@ -22,9 +22,9 @@ from scopemap.engine.mapping.bundle_adjustment import HELD_SIGMA, RIGID_SIGMA_PX
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
+from scopemap.engine.mapping.frame_correction import KeyframeStep
 from scopemap.engine.mapping.lens_residual import LensEvidence, LensResidual, lens_evidence
 from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
-from scopemap.engine.mapping.pose_interpolation import KeyframeStep
 from scopemap.engine.notices import Notice
 
 _FREE = 3  # last keyframes of the window that move

@@ -27,8 +27,8 @@ from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.mapping.bundle_problem import BundleProblem, State
+from scopemap.engine.mapping.frame_correction import FrameCorrection, TrackedPose
 from scopemap.engine.mapping.loop_closure import Loop
-from scopemap.engine.mapping.pose_interpolation import FrameCorrection, TrackedPose
 
 _MIN_SUPPORT = 2  # agreeing keyframes in either map
 # Maps drift independently: two loops agree within these, rad, share of the scene's depth, ln.

@@ -29,8 +29,8 @@ from scipy.spatial.transform import Rotation
 
 from scopemap.engine.geometry.least_squares import Options, Problem, cauchy, minimise
 from scopemap.engine.geometry.se3 import inverse, se3
+from scopemap.engine.mapping.frame_correction import TrackedPose
 from scopemap.engine.mapping.loop_closure import Loop
-from scopemap.engine.mapping.pose_interpolation import TrackedPose
 
 _UNKNOWNS = 7  # of a keyframe: rotation, position, ln scale
 # Standard deviations of an edge: rad, share of the scene's depth, ln. Only their ratio matters.

@@ -14,8 +14,8 @@ from scopemap.engine.frame import Frame, RowTable, rows_in_memory
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.mapping.backend import Backend
 from scopemap.engine.mapping.feature_tracks import KeyframeMatches
+from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
 from scopemap.engine.mapping.map_merging import Part
-from scopemap.engine.mapping.pose_interpolation import FrameCorrection, KeyframeStep, TrackedPose
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.features import FeatureDetector
 from scopemap.engine.tracking.track import Track
