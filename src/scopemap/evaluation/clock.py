@@ -24,7 +24,8 @@ _STEP_S = 0.005
 # Fewer frames that have a true pose at every offset tried would be fitted by chance.
 _LEAST_FRAMES = 10
 # An offset is told apart from the best one where the error is so much larger: a share of it, or of the path's spread.
-_RISE, _RISE_OF_SPREAD = 0.1, 1e-3
+_RISE = 0.1
+_RISE_OF_SPREAD = 1e-3
 # Told to no better than this to either side, an offset would be any.
 _MOST_DOUBT_S = 0.1
 # True poses farther apart than so many usual steps have none between them.

@@ -19,8 +19,10 @@ from scopemap.engine.errors import InputError
 _MOST_MEGAPIXELS = 64.0
 _VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_PNG, _MOST_MISSING_BYTES = b"\x89PNG\r\n\x1a\n", 16 << 20
-_WIDTH, _HEIGHT = 256, 257  # TIFF 6.0, section 8
+_PNG = b"\x89PNG\r\n\x1a\n"
+_MOST_MISSING_BYTES = 16 << 20
+_WIDTH = 256  # TIFF 6.0, section 8
+_HEIGHT = 257
 
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:

@@ -22,12 +22,16 @@ LEAST_DIFFERENCE = 0.5
 
 # Means of so many blocks along the shorter side hold little of a sensor's noise: below these differences (mean, 99th
 # percentile), grey levels, the camera and the tissue are at rest. The least of 497 clinical frames were 0.37 and 1.3.
-_BLOCKS, _REST, _MOST_NOISE = 32, (0.33, 1.2), 8.0
+_BLOCKS = 32
+_REST = (0.33, 1.2)
+_MOST_NOISE = 8.0
 # Black borders are the same in all frames: they are not compared.
 _BLACK_LEVEL = 16
-_COMPARED_SIDE_PX, _RESTING_SIDE_PX = 160, 256  # at least; every n-th pixel of larger pictures is compared
+_COMPARED_SIDE_PX = 160  # at least
+_RESTING_SIDE_PX = 256  # every n-th pixel of larger pictures is compared
 # Rounding of stamps to milliseconds must not skip a frame; the tolerance is at most a share of a frame.
-_SLACK_S, _SLACK_SHARE = 1e-3, 0.25
+_SLACK_S = 1e-3
+_SLACK_SHARE = 0.25
 
 
 @dataclass(frozen=True)

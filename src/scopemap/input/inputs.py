@@ -111,7 +111,8 @@ def _remote_file(system: Any, facts: dict[str, Any]) -> RemoteFile:
     return RemoteFile(system.unstrip_protocol(facts["name"]), facts.get("size"), version)
 
 
-LIST, TABLE = ".txt", ".csv"
+LIST = ".txt"
+TABLE = ".csv"
 _COLUMN = "input"
 _FILES = ("camera", "config")
 _MOST_BYTES = 64 << 20

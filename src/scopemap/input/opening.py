@@ -37,10 +37,12 @@ _IMAGES = "images"
 VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".wmv", ".webm", ".ts", ".mts", ".m2ts")
 _MOST_NAMED = 5
 _USUAL_FOV_DEG = 70.0
-_SMALLEST_SIDE_PX, _LARGEST_SIDE_PX = 32, 32_000  # OpenCV's `remap` ends at 32767
+_SMALLEST_SIDE_PX = 32  # OpenCV's `remap` ends at 32767
+_LARGEST_SIDE_PX = 32_000
 _LEAST_SEEN_SHARE = 0.05
 _SEARCH_DEPTH = 5
-_DEEPEST_CLOSED, _MOST_FOLDERS = 4, 500
+_DEEPEST_CLOSED = 4
+_MOST_FOLDERS = 500
 
 
 @cache

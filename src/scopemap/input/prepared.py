@@ -26,8 +26,10 @@ UNKNOWN_MAKE = ("video", "images", "dicom")
 OF_UNKNOWN_VIEWS = (*UNKNOWN_MAKE, "rosbag", "live")
 """Readers for which `input.stereo` may name the stereo packing; other data sets define their view."""
 
-_SAMPLES, _SAMPLED_EVERY = 8, 10
-_FEWEST_SAMPLES, _SAMPLES_BYTES = 2, 100_000_000
+_SAMPLES = 8
+_SAMPLED_EVERY = 10
+_FEWEST_SAMPLES = 2
+_SAMPLES_BYTES = 100_000_000
 # Attributes and methods of a source that are the same for one view of it.
 _KEPT = (
     *("name", "width", "height", "pixel_aspect", "count", "numbers", "stamped", "rate_hz", "notes", "warnings"),

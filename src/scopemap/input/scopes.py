@@ -28,7 +28,8 @@ class LensPrior(NamedTuple):
 ANY_LENS = LensPrior(0.55, float("inf"), tuple(KINDS), "")
 """Nothing is expected; the focal length is that with which a trial of lenses begins."""
 
-_FISHEYES, _EVERY = ("orthographic fisheye", "equidistant fisheye"), tuple(KINDS)
+_FISHEYES = ("orthographic fisheye", "equidistant fisheye")
+_EVERY = tuple(KINDS)
 _COLONOSCOPE = "C3VD's calibration, 126 deg"
 _TELESCOPE = "rigid telescopes of 2.7 mm, 80 deg"
 SCOPES: dict[str, LensPrior] = {

@@ -22,14 +22,16 @@ from scopemap.input.source import Source, SourceFrame
 # Some headers give the unit of their clock for the rate.
 _HIGHEST_RATE_HZ = 1000.0
 # Headers round durations and count pictures that are never shown: less than this is not a video that breaks off.
-_MISSING_SHARE, _MISSING_FRAMES = 0.02, 2
+_MISSING_SHARE = 0.02
+_MISSING_FRAMES = 2
 _MOST_CODED_PIXELS = 2**31 - 1
 # A frame out of so many is looked at where a video can only be read in order.
 _SAMPLED_EVERY = 10
 # FFmpeg draws text files as a terminal would show them.
 _TEXT_CODECS = ("ansi", "bintext", "idf", "xbin")
 # A recording may pause, a time lapse be slow; a stamp that runs ahead by more is of another clock.
-_LONGEST_GAP_S, _LONGEST_GAP_FRAMES = 60.0, 10
+_LONGEST_GAP_S = 60.0
+_LONGEST_GAP_FRAMES = 10
 # AVI and WMV keep the stamps of reordered frames slightly out of order; a clock that goes back by more began again.
 _DISORDER_S = 1.0
 

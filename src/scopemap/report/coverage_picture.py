@@ -14,7 +14,8 @@ COLOURS = {"seen": "#2a9d8f", "from afar or obliquely only": "#e9c46a", "probabl
 """Of the classes 1, 2 and 3; seen is the paler the fewer frames see it."""
 OUTSIDE = "#bebebe"  # of a surface, where it was not examined
 _PALEST = 0.45
-_BOX, _SIZE = (60.0, 46.0, 820.0, 360.0), (900, 500)
+_BOX = (60.0, 46.0, 820.0, 360.0)
+_SIZE = (900, 500)
 
 
 def draw_coverage(

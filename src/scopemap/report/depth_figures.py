@@ -17,7 +17,10 @@ from scopemap.report.sheet import Sheet, picture_grid
 from scopemap.result.depth_maps import DepthReader, write_picture
 
 _CELL_PX = (300, 250)
-_LEGEND_PX, _STEP_PX, _LAST_PX, _MOST_NUMBERS = 36, 54, 74, 5
+_LEGEND_PX = 36
+_STEP_PX = 54
+_LAST_PX = 74
+_MOST_NUMBERS = 5
 
 
 def colour_depth(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndarray:

@@ -16,7 +16,9 @@ from scopemap.report.sheet import Sheet
 from scopemap.report.shown_mesh import simplified
 from scopemap.result.run_folder import RunFolder
 
-_FRAMES, _FRAMES_PER_S, _PITCH_RAD = 180, 24, -0.35
+_FRAMES = 180
+_FRAMES_PER_S = 24
+_PITCH_RAD = -0.35
 _QUALITY_BITS = 4_000_000
 
 

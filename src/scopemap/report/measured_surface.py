@@ -12,7 +12,8 @@ from scopemap.engine.errors import reporting
 from scopemap.report.shown_mesh import LARGEST_LEVEL, levels_of, simplified
 from scopemap.result.run_folder import RunFolder
 
-MOST_FACES, FACES_OF_OTHERS = 100_000, 20_000
+MOST_FACES = 100_000
+FACES_OF_OTHERS = 20_000
 DEPTH_WIDTH_PX = 160
 _ASSUMED_FOCAL_ERROR = 0.15
 """Of a focal length by an assumed field of view: 70 degrees stand for 60 to 83."""

@@ -25,7 +25,8 @@ from scopemap.result.checksums import SUMS, write_checksums
 from scopemap.result.json_numbers import without_nan
 from scopemap.result.run_folder import RunFolder
 
-PAGE, PICTURE = "report.html", "summary.png"
+PAGE = "report.html"
+PICTURE = "summary.png"
 _SCRIPTS = (
     *("matrices", "surface_view", "frame_panels", "curves", "words", "atlas"),
     *("measuring", "measure_by_hand", "page", "gestures"),

@@ -39,7 +39,8 @@ from scopemap.result.verdict import (
 )
 
 _MOST_MAPS = 8
-MEASUREMENTS, COVERAGE = "measurements.json", "coverage"
+MEASUREMENTS = "measurements.json"
+COVERAGE = "coverage"
 _MOST_BYTES = 7_500_000
 """Of pictures, before base64, which makes them a third longer."""
 _LOOKED_AT = 25

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
 
 # Time per frame after the last one (adjustment, fusion, writing) over that until then: typical of the default preset,
 # and of one that adjusts nothing.
-_SHARE_AFTERWARDS, _SHARE_UNADJUSTED = 0.5, 0.05
+_SHARE_AFTERWARDS = 0.5
+_SHARE_UNADJUSTED = 0.05
 
 
 def of_all(total: int | None) -> str:

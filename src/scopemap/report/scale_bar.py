@@ -8,7 +8,9 @@ import numpy as np
 
 from scopemap.report.sheet import Sheet
 
-_SHARE, _MARGIN_PX, _TEXT_PX = 0.25, 8, 13
+_SHARE = 0.25
+_MARGIN_PX = 8
+_TEXT_PX = 13
 
 
 def draw_scale_bar(picture: np.ndarray, px_per_mm: float, words: str = "") -> None:

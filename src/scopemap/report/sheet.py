@@ -13,10 +13,13 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-INK, SOFT, FAINT = "#17202b", "#566373", "#dfe4ea"
+INK = "#17202b"
+SOFT = "#566373"
+FAINT = "#dfe4ea"
 _SUBPIXEL_BITS = 4
 _JPEG_QUALITY = 88
-_GAP_PX, _TITLE_PX = 8, 14
+_GAP_PX = 8
+_TITLE_PX = 14
 _TICKS = 5
 _LETTER_SHARE = 0.52  # mean width of a letter over the size of the font
 

@@ -30,7 +30,10 @@ from scopemap.result.run_folder import RunFolder
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.result.verdict import Result, Verdict, scale_is_known, verdict
 
-_CELL_PX, _GAP_PX, _HEAD_PX, _LABEL_PX = 384, 12, 104, 26
+_CELL_PX = 384
+_GAP_PX = 12
+_HEAD_PX = 104
+_LABEL_PX = 26
 _COLUMNS = 4
 _MOST_REASONS = 2
 _TONES = {"good": "#17794a", "doubtful": "#a35a00", "bad": "#b3261e"}

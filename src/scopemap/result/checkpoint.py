@@ -32,7 +32,8 @@ create table if not exists facts (name text primary key, value text not null);
 create table if not exists states (name text primary key, tree text not null);
 create table if not exists blobs (hash blob, part integer, bytes blob not null, primary key (hash, part));
 """
-_DIGESTS, _SUM = "digests", "sum"
+_DIGESTS = "digests"
+_SUM = "sum"
 _PART_BYTES = 64 << 20  # SQLite's blobs end at 1 GB
 _OWN = "scopemap."
 _OUTSIDE: dict[str, Any] = {"outside": True}

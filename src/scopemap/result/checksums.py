@@ -13,7 +13,8 @@ from scopemap.engine.errors import reporting
 
 SUMS = "SHA256SUMS"
 NEEDED = ("camera.yaml", "config.toml", "frames.csv", "mesh.ply", "trajectory.tum", "provenance.json")
-_MOST_INPUT_BYTES, _MOST_INPUT_FILES = 256 << 20, 20_000
+_MOST_INPUT_BYTES = 256 << 20
+_MOST_INPUT_FILES = 20_000
 
 
 def write_checksums(folder: Path, *, only: Collection[str] = (), without: Collection[str] = ()) -> None:

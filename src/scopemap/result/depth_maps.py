@@ -19,7 +19,8 @@ DEPTH_SCALE_MM = 0.01
 _LARGEST_UNIT = 65534
 _PREVIEW_SHARES = (0.01, 0.99)  # of all known depth, at the ends of the colours
 # Standard deviations in 8 bits: shares of depth from 0.1 % to 180 % in steps of 3 %; 0 = unknown.
-_LEAST_SIGMA, _SIGMA_STEP = 0.001, 1.03
+_LEAST_SIGMA = 0.001
+_SIGMA_STEP = 1.03
 
 
 class DepthWriter:

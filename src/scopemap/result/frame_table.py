@@ -16,7 +16,10 @@ from scopemap.engine.frame import RowTable
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY, SKIPPED, STATUSES, TRACKED, Trajectory
 
-LOST, ELSEWHERE, NOT_USED, ROTATED = -1, -2, -3, -4
+LOST = -1
+ELSEWHERE = -2
+NOT_USED = -3
+ROTATED = -4
 """Place of a frame in no submap of the result: lost; in a submap too small to be saved; skipped; lost but for its
 rotation."""
 

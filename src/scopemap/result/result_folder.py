@@ -31,7 +31,8 @@ STORED = "stored_frames"
 NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT, f"{CHECKPOINT}-journal")
 """Files and folders there that a run needs to go on, and that go with the folder."""
 
-_REPLACED, _MOVING = "replaced", "moving"
+_REPLACED = "replaced"
+_MOVING = "moving"
 _OWN_FILES = (
     *("trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv"),
     *("config.toml", "provenance.json", "report.html", "summary.png", "SHA256SUMS"),

@@ -20,13 +20,16 @@ Level = Literal["good", "doubtful", "bad", "note", "info"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
 
 LEAST_FRAMES = 10
-GOOD_SHARE, LEAST_SHARE = 0.8, 0.3
+GOOD_SHARE = 0.8
+LEAST_SHARE = 0.3
 """Share of the frames that are in the result, or in submaps that stand for their part of the video."""
 LEAST_SEGMENT_S = 3.0
 """Least length of a submap that stands for its part of the video."""
-GOOD_COVERAGE, LEAST_COVERAGE = 0.8, 0.5
+GOOD_COVERAGE = 0.8
+LEAST_COVERAGE = 0.5
 """Mean share of what the frames see that the surface covers."""
-GOOD_DISAGREEMENT, MOST_DISAGREEMENT = 0.05, 0.15
+GOOD_DISAGREEMENT = 0.05
+MOST_DISAGREEMENT = 0.15
 """Median relative difference between the surface's depth and the frames' depth."""
 MOST_MOVING = 0.5
 """Share of the frames in which tissue moves on its own."""

@@ -19,7 +19,8 @@ from scopemap.result.result_folder import STORED, UNFINISHED
 from scopemap.runner.provenance import package_versions
 
 # A checkpoint is due after so many seconds, and so long after the last one that they take a 50th of the time.
-_LEAST_S, _SHARE = 10.0, 0.02
+_LEAST_S = 10.0
+_SHARE = 0.02
 _RUN = ("frames", "checked", "kept_maps", "writers")
 _SHOWN_DIFFERENCES = 4
 

@@ -21,11 +21,16 @@ _MB = 1_000_000
 # Python with its libraries, the embedded network, kernels; with kernels that are compiled.
 _BASE_BYTES = 480 * _MB
 # Of the working size: in all stages, and for each frame that a stage is ahead of the next; of the input's pictures.
-_PIXEL_BYTES, _AHEAD_PIXEL_BYTES, _SOURCE_PIXEL_BYTES = 1_700, 100, 30
-_FRAME_BYTES, _OBSERVATION_BYTES, _BLOCK_BYTES = 5_000, 1_100, 45_000
+_PIXEL_BYTES = 1_700
+_AHEAD_PIXEL_BYTES = 100
+_SOURCE_PIXEL_BYTES = 30
+_FRAME_BYTES = 5_000
+_OBSERVATION_BYTES = 1_100
+_BLOCK_BYTES = 45_000
 _AHEAD = (2, 1)
 _UNMEASURED = ("depth-anything", "depth-pro", "raft", "lpips")
-_LEAST_OBSERVATIONS, _LEAST_BLOCKS = 50_000, 1_000
+_LEAST_OBSERVATIONS = 50_000
+_LEAST_BLOCKS = 1_000
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,13 @@ from scopemap.input.sequence import Sequence
 # size; of the perceptual distance and of the other stages, for each million pixels.
 _FLOW_S = {"raft-small": (7.5, 2.0), "raft-large": (26.0, 10.5)}
 _DEPTH_S = {"depth-anything": 2.2, "depth-pro": 200.0}
-_PERCEPTUAL_S, _STAGES_S = {"lpips": 0.8}, 2.3
+_PERCEPTUAL_S = {"lpips": 0.8}
+_STAGES_S = 2.3
 # GB: of Python with PyTorch and kernels, of the other stages for each million pixels, of the networks of depth, and of
 # the correlations of one flow for each square of a million pixels: 4 bytes a pair, and a third for its pyramid.
-_START_GB, _STAGES_GB, _FLOW_GB = 1.3, 0.75, 4 * 4 / 3 / 64**2 * 1e3
+_START_GB = 1.3
+_STAGES_GB = 0.75
+_FLOW_GB = 4 * 4 / 3 / 64**2 * 1e3
 _DEPTH_GB = {"depth-anything": 0.4, "depth-pro": 6.0}
 
 

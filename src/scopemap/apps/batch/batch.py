@@ -33,7 +33,10 @@ from scopemap.result.verdict import frames_in_result, verdict
 from scopemap.runner.processes import Outcome, ProcessLimits, run_in_processes
 from scopemap.runner.with_report import reconstruct_with_report
 
-INDEX, TABLE, RECORDS, LOGS = "index.html", "batch.csv", "records", "logs"
+INDEX = "index.html"
+TABLE = "batch.csv"
+RECORDS = "records"
+LOGS = "logs"
 _FETCHED = ".fetched"
 _LONGEST_NAME = 80
 _SECONDS_BETWEEN_TABLES = 10.0

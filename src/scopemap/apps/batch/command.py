@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from scopemap.input.inputs import NamedInput
     from scopemap.report.batch_page import BatchRow
 
-_SECONDS_BETWEEN_LINES, _MOST_NAMED = 60.0, 8
+_SECONDS_BETWEEN_LINES = 60.0
+_MOST_NAMED = 8
 _COLUMNS = ("name", "preset", "config", "dataset", "camera", "fov", "frames", "size")
 
 

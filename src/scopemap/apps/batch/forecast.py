@@ -18,9 +18,11 @@ from scopemap.input.inputs import RemoteFile
 from scopemap.runner.processes import ProcessLimits, run_in_processes
 from scopemap.runner.with_report import reconstruct_with_report
 
-_FEWEST, _MOST = 12, 60  # frames of the second that is run
+_FEWEST = 12  # frames of the second that is run
+_MOST = 60
 _ENDLESS = 1 << 40
-_REPORTING, _PER_FRAME = "writing the report", "depth*/*"
+_REPORTING = "writing the report"
+_PER_FRAME = "depth*/*"
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,8 @@ from scopemap.apps.batch.engines import WorkerNeeds
 from scopemap.engine.errors import InputError, reporting
 from scopemap.runner.processes import NEW, THREADS, Outcome, ProcessLimits, attempt, threads_of_each
 
-_LONGEST_START_S, _LONGEST_CONNECT_S = 300.0, 10.0
+_LONGEST_START_S = 300.0
+_LONGEST_CONNECT_S = 10.0
 _MOST_FAILED_STARTS = 3
 _OBJECTS_BYTES = 100 << 20  # videos and results go by files
 

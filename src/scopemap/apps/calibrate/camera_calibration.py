@@ -34,7 +34,8 @@ _WORTH_IT = 0.02
 _LEAST_AGREEING = 0.5
 _MOST_OUTLIERS = 1 / 3
 # Corners farther off than 5 standard deviations do not fit; by chance so is one in 300,000.
-_STRAY_SIGMAS, _STRAY_PX = 5.0, 0.25
+_STRAY_SIGMAS = 5.0
+_STRAY_PX = 0.25
 _FEWEST_CORNERS = 6
 
 
@@ -221,7 +222,8 @@ def _rms(residual_px: np.ndarray) -> float:
 
 FEWEST_VIEWS = 8
 _FEW_VIEWS = 12
-_TILTED_DEG, _TILTED_VIEWS = 15.0, 3
+_TILTED_DEG = 15.0
+_TILTED_VIEWS = 3
 _LITTLE_COVERED = 0.5
 _LARGE_RMS_PX = 1.0
 _UNSURE_FOCAL = 0.01

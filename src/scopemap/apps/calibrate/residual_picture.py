@@ -13,7 +13,8 @@ from scopemap.engine.errors import InputError
 from scopemap.report.sheet import INK, Plot, Sheet
 
 _SHEET_PX = (1100, 500)
-_RESIDUALS_PX, _ERRORS_PX = (45.0, 70.0, 560.0, 400.0), (665.0, 70.0, 415.0, 370.0)  # left, top, width, height
+_RESIDUALS_PX = (45.0, 70.0, 560.0, 400.0)  # left, top, width, height
+_ERRORS_PX = (665.0, 70.0, 415.0, 370.0)
 _MOST_NUMBERS = 14
 # The longer residuals are drawn this share of the picture's width long.
 _DRAWN_SHARE = 0.04

@@ -17,13 +17,16 @@ from scopemap.input.source import Source
 DICTIONARIES = tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
 """Names of the sets of markers that OpenCV has."""
 
-_FEWEST, _MOST = 3, 100  # a side, inner corners or squares
+_FEWEST = 3  # a side, inner corners or squares
+_MOST = 100
 _FEWEST_CORNERS = 8
 # A target is first looked for in an image of this size: the search takes seconds in a large one without a target.
 _SEARCH_SIDE_PX = 800
 # Corners are refined in a window of so many px, or this share of the image, but at most this share of a square: farther
 # off, the lens bends the edges.
-_REACH_PX, _REACH_SHARE, _REACH_SQUARES = 8, 1 / 160, 0.4
+_REACH_PX = 8
+_REACH_SHARE = 1 / 160
+_REACH_SQUARES = 0.4
 _REFINED = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
 
 
@@ -165,9 +168,11 @@ _FARTHEST_EDGE_PX = 20
 _MOST_VIEWS = 40
 _CELLS_ACROSS = 16
 # Edges so much wider than in the sharper quarter of the views are blurred.
-_BLURRED, _BLURRED_PX = 1.7, 0.5
+_BLURRED = 1.7
+_BLURRED_PX = 0.5
 # Views this close in position, size and tilt, with this few new cells, show the same.
-_SAME, _NEW_CELLS = 0.05, 2
+_SAME = 0.05
+_NEW_CELLS = 2
 _FARTHEST = 0.5
 
 Listener = Callable[[int, int | None], None]

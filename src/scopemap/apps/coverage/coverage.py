@@ -31,15 +31,20 @@ from scopemap.result.verdict import verdict
 HIDDEN_AREA = {"lumen": 1.3, "cavity": 1.0}
 BLIND = 0.3
 """Share not seen of a bin from which it belongs to a blind spot; the regression is cautious about single faces."""
-ODDS, SEGMENT_ODDS = {"lumen": 1.5, "cavity": 5.3}, {"lumen": 2.0, "cavity": 6.0}
+ODDS = {"lumen": 1.5, "cavity": 5.3}
+SEGMENT_ODDS = {"lumen": 2.0, "cavity": 6.0}
 """Factors of the odds of a share at the ends of its interval: of the whole, and of one segment."""
 _NOTHING_HIDDEN = 0.1
 """By so much the low end of a segment is lower still: where wall is seen from afar only, nothing may be hidden."""
-SEEN, SEEN_BADLY, NOT_SEEN = 1, 2, 3
+SEEN = 1
+SEEN_BADLY = 2
+NOT_SEEN = 3
 """Classes of the map: seen; from afar or obliquely only; probably not seen. 0 is outside of what was examined."""
-_GOOD_COSINE, _GOOD_RADII = 0.5, 2.0
+_GOOD_COSINE = 0.5
+_GOOD_RADII = 2.0
 _SMOOTHING_BINS = 0.7
-_SEGMENT_RADII, _SEGMENT_DEG = 2.0, 20.0
+_SEGMENT_RADII = 2.0
+_SEGMENT_DEG = 20.0
 _LEAST_SPOT_RADII = 0.25  # square root of the smallest area listed
 _SHOWN = 10
 _ALL_ROUND = 0.35  # length of the mean direction below which a blind spot is all round

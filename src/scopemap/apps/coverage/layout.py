@@ -17,8 +17,10 @@ from scopemap.result.run_folder import RunFolder
 CLOCK_BINS = 36
 LUMEN_RADII = 3.0
 """Length of the examined part, over its radius, from which a space is a lumen."""
-_RING_DEG, _RINGS = 4.0, 45
-_HALF, _END_RADII = 0.5, 0.25
+_RING_DEG = 4.0
+_RINGS = 45
+_HALF = 0.5
+_END_RADII = 0.25
 _FARTHEST_SEEN = 0.95  # share of what was seen in a clock direction of a cavity, up to whose angle it was examined
 
 

@@ -30,7 +30,8 @@ from scopemap.runner.reconstructor import Reconstructor
 _MOST_MAPS = 8  # whose depth is kept, as many as the session keeps surfaces of
 _APART_S = 0.25  # frames that are kept, at first: writing the depth of one takes 9 ms
 _EVERY_S = 5.0  # between maps
-_LONGEST_S, _NICE = 120.0, 10  # for one map, and its priority: idle time on a busy machine, but not none
+_LONGEST_S = 120.0  # for one map, and its priority: idle time on a busy machine, but not none
+_NICE = 10
 _FETCHED_S = 1.0  # until the page has fetched the last one
 
 

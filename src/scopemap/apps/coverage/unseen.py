@@ -20,8 +20,10 @@ from scopemap.result.run_folder import RunFolder
 
 MOST_FRAMES = 200
 _SAME_DEPTH = 0.05
-_JUMP_RAD, _JUMPS = 1 / 32, (0.01, 2.0)
-_MOST_RADII, _SMOOTHING_STEPS = 8.0, 30
+_JUMP_RAD = 1 / 32
+_JUMPS = (0.01, 2.0)
+_MOST_RADII = 8.0
+_SMOOTHING_STEPS = 30
 # Of a constant, the cosine, the logarithm of the jump, the surface's presence, the distance in radii, and of wall that
 # is seen in a cavity, where folds hide less.
 WEIGHTS = np.array([2.165, -5.401, 0.102, -0.571, -0.147, -1.902])

@@ -33,7 +33,9 @@ from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Observer, Progress
 
-CLIP, CAMERA, TRUTH = "colon.mp4", "camera.yaml", "pose.txt"
+CLIP = "colon.mp4"
+CAMERA = "camera.yaml"
+TRUTH = "pose.txt"
 FRAMES = 60
 """Frames of the packaged clip."""
 

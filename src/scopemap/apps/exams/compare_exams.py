@@ -34,7 +34,8 @@ from scopemap.result.run_folder import RunFolder
 from scopemap.runner.reread_frames import reread_frames
 
 _LEAST_PAIRS = 30  # in the view of a keyframe
-_OUTLIERS, _FITS = 2.5, 8  # pairs farther apart than so many medians are left out, so many times
+_OUTLIERS = 2.5  # pairs farther apart than so many medians are left out, so many times
+_FITS = 8
 _HIDDEN = 0.15  # of depth: farther apart the surfaces are not the same wall
 _AROUND_SHARE = 0.1  # of the picture's width: standard deviation of what is around a place
 _CONSISTENCY_PX = 1.0  # of flow there and back
@@ -44,8 +45,10 @@ _FARTHEST = 1.5  # of the median depth: farther away depth and colours tell litt
 _ON_SURFACE = 0.02  # of depth: a vertex is not hidden
 _LEAST_VIEWS = 4
 _LEAST_SPREADS = 0.002, 0.005  # of ln depth and redness, in most places: rounding
-_LEAST_SIGMAS, _LEAST_AREA_SHARE = 8.0, 0.01  # of a change; its area, of the squared median depth
-_SHOWN_VIEWS, _SAME_VIEW = 8, 0.8  # how far apart they are: distance over depth, and angle between the views
+_LEAST_SIGMAS = 8.0  # of a change
+_LEAST_AREA_SHARE = 0.01  # its area, of the squared median depth
+_SHOWN_VIEWS = 8  # how far apart they are: distance over depth, and angle between the views
+_SAME_VIEW = 0.8
 _APART = 0.08  # of depth, from the other surface: only one of them saw it
 
 

@@ -19,8 +19,13 @@ from scopemap.report.batch_page import write_at_once
 from scopemap.report.sheet import picture_grid, rgb_of
 from scopemap.result.run_folder import RunFolder
 
-PAGE, TABLE, CHANGES, VIEWS = "compare.html", "changes.json", "changes.png", "views.png"
-_CELL_PX, _RING, _MOST = (420, 330), "#ffd000", 12
+PAGE = "compare.html"
+TABLE = "changes.json"
+CHANGES = "changes.png"
+VIEWS = "views.png"
+_CELL_PX = (420, 330)
+_RING = "#ffd000"
+_MOST = 12
 _STYLE = "body{font:15px/1.4 system-ui,sans-serif;margin:16px;max-width:920px}img{max-width:100%}td,th{padding:2px 9px}"
 _LEGEND = "Above 0 the wall is nearer to the camera, and redder, in the second. Sigmas say how sure a change is."
 _NO_DEVICE = "Research software, not a medical device."

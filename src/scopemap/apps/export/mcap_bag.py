@@ -20,7 +20,8 @@ from scopemap.input.trajectory.trajectory import MM_PER_UNIT
 from scopemap.runner.exported_run import ExportedRun
 
 _NS_PER_S = 10**9
-_WORLD, _CAMERA = "world", "camera"
+_WORLD = "world"
+_CAMERA = "camera"
 _JPEG_QUALITY = 95
 
 _NUMBER: dict[str, Any] = {"type": "number"}

@@ -16,13 +16,23 @@ from scopemap.apps.inspect.letters import BESIDE_PX, LetterFinder
 from scopemap.engine.masking.masker import hull_of_largest
 from scopemap.engine.masking.overlays import OverlayFinder
 
-_MARGIN_SHARE, _NEAR_PX, _BLACK_PX = 0.02, 3, 9
-_JOIN_SHARE, _LEAST_BOX_PX = 0.02, 3
-_LEAST_TIMES, _LEAST_TIMES_SHARE = 12, 0.05
+_MARGIN_SHARE = 0.02
+_NEAR_PX = 3
+_BLACK_PX = 9
+_JOIN_SHARE = 0.02
+_LEAST_BOX_PX = 3
+_LEAST_TIMES = 12
+_LEAST_TIMES_SHARE = 0.05
 # A static edge is this much stronger, on average, than the image beside it.
-_RIDGE, _RIDGE_LEVELS, _BESIDE_PX = 1.6, 4.0, 9
-_LEAST_SIDE, _LARGEST_SHARE, _COVERED = 0.08, 0.45, 0.85
-_LEAST_CHANGE, _LEAST_PICTURES, _MOST_LINES = 2.0, 12, 12
+_RIDGE = 1.6
+_RIDGE_LEVELS = 4.0
+_BESIDE_PX = 9
+_LEAST_SIDE = 0.08
+_LARGEST_SHARE = 0.45
+_COVERED = 0.85
+_LEAST_CHANGE = 2.0
+_LEAST_PICTURES = 12
+_MOST_LINES = 12
 _MOVED_SHARE = 0.004
 
 

@@ -17,15 +17,25 @@ from scopemap.input.video_format.stereo_packing import Packing
 
 _BLACK_LEVEL = 16.0
 # Shares of the video's usual sharpness: of a blurred frame, of a soft one. No texture: sharpness of the usual frame.
-_BLURRED_SHARE, _SOFT_SHARE, _NO_TEXTURE = 0.35, 0.6, 0.008
+_BLURRED_SHARE = 0.35
+_SOFT_SHARE = 0.6
+_NO_TEXTURE = 0.008
 # Mean red over the stronger of green and blue, of tissue in white light.
-_LEAST_REDNESS, _MOSTLY = 1.1, 0.9
-_UNEVEN, _UNEVEN_SHARE, _HOLE = 0.2, 0.05, 1.5
-_LENGTH_SHARE, _LENGTH_S = 0.05, 1.0
-_FAST_HZ, _SLOW_MOTION = 45.0, 0.004
+_LEAST_REDNESS = 1.1
+_MOSTLY = 0.9
+_UNEVEN = 0.2
+_UNEVEN_SHARE = 0.05
+_HOLE = 1.5
+_LENGTH_SHARE = 0.05
+_LENGTH_S = 1.0
+_FAST_HZ = 45.0
+_SLOW_MOTION = 0.004
 _FAST = 0.05  # motion per frame, share of the width
-_UNLIKE, _CUT, _LIKE = 0.6, 0.2, 0.7  # correlation with the frame before
-_SOME, _MANY = 0.05, 0.25  # shares of the frames
+_UNLIKE = 0.6  # correlation with the frame before
+_CUT = 0.2
+_LIKE = 0.7
+_SOME = 0.05  # shares of the frames
+_MANY = 0.25
 _EXPOSURES = (
     ("clipped", 0.1, "over-exposed"),
     ("dark", 0.5, "under-exposed"),

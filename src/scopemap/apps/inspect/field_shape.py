@@ -22,17 +22,25 @@ _WORDS: dict[Shape, str] = {
     "cut corners": "a rectangle with cut corners",
     "rounded corners": "a rectangle with rounded corners",
 }
-_FULL_SHARE, _BAR_SHARE, _EDGE_PX = 0.995, 0.01, 2
+_FULL_SHARE = 0.995
+_BAR_SHARE = 0.01
+_EDGE_PX = 2
 # Shares of a circle's radius: deviation of its outline, and least part of the outline.
-_ROUND_TOLERANCE, _LEAST_ARC = 0.02, 0.3
-_LEAST_CORNER, _LEAST_CORNER_PX, _INSIDE_PX = 0.03, 6, 2
+_ROUND_TOLERANCE = 0.02
+_LEAST_ARC = 0.3
+_LEAST_CORNER = 0.03
+_LEAST_CORNER_PX = 6
+_INSIDE_PX = 2
 # Height of an arc over its chord: a quarter of a circle has 0.2, what is left of it at the size of a pixel 0.07; an arc
 # around the picture's middle the chord over four diagonals or more, and a straight cut less than half of that.
-_LEAST_BULGE, _DIAGONALS = 0.04, 8
-_WINDOW, _MOST_WINDOWS = 25, 400
+_LEAST_BULGE = 0.04
+_DIAGONALS = 8
+_WINDOW = 25
+_MOST_WINDOWS = 400
 # Pixels lit less often are coding artefacts beside a bright rim.
 _LIT_SHARE = 0.1
-_MOVED, _FAR = 0.006, 0.04
+_MOVED = 0.006
+_FAR = 0.04
 
 
 @dataclass(frozen=True)

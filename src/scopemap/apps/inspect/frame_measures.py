@@ -14,7 +14,8 @@ from scopemap.engine.tracking.sharpness import sharpness
 from scopemap.input.frame_choice import LEAST_DIFFERENCE, mean_difference
 from scopemap.report.frame_pictures import shrunk
 
-_SMALL_PX, _FLOW_PX = 320, 160
+_SMALL_PX = 320
+_FLOW_PX = 160
 _MASK = MaskSettings()
 # A frame with a smaller lit share is blank: text on black shows no tissue.
 _LEAST_LIT = 0.05

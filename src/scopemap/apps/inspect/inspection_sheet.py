@@ -16,10 +16,19 @@ Box = tuple[float, float, float, float]
 """Left, top, width and height, px."""
 
 MASK_NAME = "mask.png"
-_SHOWN, _SHOWN_PX = 4, 640
-_WIDTH_PX, _LEFT_PX, _HEAD_PX, _LINE_PX, _BAND_PX, _GAP_PX = 1300, 110, 50, 85, 20, 14
-_LINE_COLOUR, _SHOWN_COLOUR = "#404040", "#9ecae1"
-_FIELD_COLOUR, _OVERLAY_COLOUR, _INSET_COLOUR = "#00e5ff", "#ffea00", "#ff00ff"
+_SHOWN = 4
+_SHOWN_PX = 640
+_WIDTH_PX = 1300
+_LEFT_PX = 110
+_HEAD_PX = 50
+_LINE_PX = 85
+_BAND_PX = 20
+_GAP_PX = 14
+_LINE_COLOUR = "#404040"
+_SHOWN_COLOUR = "#9ecae1"
+_FIELD_COLOUR = "#00e5ff"
+_OVERLAY_COLOUR = "#ffea00"
+_INSET_COLOUR = "#ff00ff"
 _MASK_TINT = np.array([0.0, 90.0, 255.0])
 _LINES = (("sharpness", "sharpness", 1), ("brightness", "brightness", 1), ("motion", "motion, % of width", 100))
 _BANDS = {

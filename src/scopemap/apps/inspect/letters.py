@@ -8,17 +8,31 @@ from scipy.ndimage import maximum
 
 # What belongs to an overlay is this near to what the finder sees of it, px of the picture that it sees; and known after
 # so many frames.
-BESIDE_PX, _LEAST_TIMES = (8, 4), 12
+BESIDE_PX = (8, 4)
+_LEAST_TIMES = 12
 # A stroke differs from what is around it, at one of these scales, by so many levels, somewhere by so many. It stays,
 # better than an instrument at rest: its own spread is at most a share of that, and the noise of coding.
-_SCALES_PX, _STROKE_LEVELS, _PEAK_LEVELS, _SPREAD_SHARE, _CODING_LEVELS = (1.5, 3.0, 6.0, 12.0), 15.0, 25.0, 0.15, 3.0
+_SCALES_PX = (1.5, 3.0, 6.0, 12.0)
+_STROKE_LEVELS = 15.0
+_PEAK_LEVELS = 25.0
+_SPREAD_SHARE = 0.15
+_CODING_LEVELS = 3.0
 # Heights over the scale, px; width over height, and the least median of it: stripes are slender.
-_HEIGHTS, _LEAST_PX, _WIDEST, _LEAST_MEDIAN_WIDTH = (2.0, 8.0), 3, 4.0, 0.2
+_HEIGHTS = (2.0, 8.0)
+_LEAST_PX = 3
+_WIDEST = 4.0
+_LEAST_MEDIAN_WIDTH = 0.2
 # Letters of a line: heights and contrasts over one's own; how far feet are apart and gaps are wide, over one's height;
 # how much they overlap, over their width.
-_HEIGHTS_ALIKE, _CONTRAST_ALIKE, _FOOT, _GAP, _OVERLAP = (0.6, 1.6), 0.6, 0.1, 5.0, 0.3
+_HEIGHTS_ALIKE = (0.6, 1.6)
+_CONTRAST_ALIKE = 0.6
+_FOOT = 0.1
+_GAP = 5.0
+_OVERLAP = 0.3
 # The letters that make a text; more where they are so small that they merge and that noise looks like them.
-_LEAST_LETTERS, _SMALL_PX, _LEAST_SMALL = 3, 6, 5
+_LEAST_LETTERS = 3
+_SMALL_PX = 6
+_LEAST_SMALL = 5
 
 
 class LetterFinder:

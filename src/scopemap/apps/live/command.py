@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     from scopemap.engine.odometry import Step
     from scopemap.runner.reconstructor import Reconstructor
 
-_SHOWN_EVERY_S, _LINE_EVERY_S = 0.5, 10.0
-_SURFACE_EVERY_S, _SENT_FACES = 5.0, 20_000
+_SHOWN_EVERY_S = 0.5
+_LINE_EVERY_S = 10.0
+_SURFACE_EVERY_S = 5.0
+_SENT_FACES = 20_000
 
 
 def live(

@@ -29,11 +29,14 @@ from scopemap.runner.reread_frames import reread_frames
 _CANDIDATES = 8  # keyframes whose matches are verified
 _STRONGEST = 128  # descriptors by which they are ranked
 # Of the best keyframe, where chance gives up to 26 on phantoms, and of another one whose matches are used.
-_LEAST_INLIERS, _LEAST_SUPPORT = 30, 10
-_AGREE_DEPTH, _AGREE_RAD = 0.1, 0.1  # of the poses by two keyframes
+_LEAST_INLIERS = 30
+_LEAST_SUPPORT = 10
+_AGREE_DEPTH = 0.1  # of the poses by two keyframes
+_AGREE_RAD = 0.1
 _LEAST_SPREAD = 0.08  # standard deviation of the inliers, over the picture's width and height
 _DEPTH_SIGMA = 0.05
-_FLOW_KEYFRAMES, _FLOW_ROUNDS = 3, 2  # keyframes whose corners flow finds; how often, each time from a better pose
+_FLOW_KEYFRAMES = 3  # keyframes whose corners flow finds
+_FLOW_ROUNDS = 2  # how often, each time from a better pose
 NOT_FOUND = "not found"
 
 

@@ -37,12 +37,19 @@ _FIGURES = {
 
 It is by phantoms (docs/measure.md): local errors of depth, and that lesions are not round.
 """
-_LOWER, _HIGHER = 0.1, 0.7
+_LOWER = 0.1
+_HIGHER = 0.7
 """A height is too large by no more than this share of the diameter, too small by no more than that: depth is smooth."""
-_OUTLINE_PX, _LEAST_FACING = 0.5, 0.1
-_EDGE_PX, _LEAST_PX, _MOST_FRAMES = 2, 60, 60
-_IN_FRONT, _LEAST_LEFT, _MOST_DIFFERENCE = 0.1, 0.8, np.log(1.5)
-_OUTLINE_BGR, _OUTLINE_POINTS = (0, 255, 255), 60
+_OUTLINE_PX = 0.5
+_LEAST_FACING = 0.1
+_EDGE_PX = 2
+_LEAST_PX = 60
+_MOST_FRAMES = 60
+_IN_FRONT = 0.1
+_LEAST_LEFT = 0.8
+_MOST_DIFFERENCE = np.log(1.5)
+_OUTLINE_BGR = (0, 255, 255)
+_OUTLINE_POINTS = 60
 
 
 @dataclass(frozen=True)

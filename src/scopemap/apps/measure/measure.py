@@ -20,7 +20,8 @@ from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside,
 from scopemap.report.measured_surface import measure_errors, measured_depth, measured_mesh
 from scopemap.runner.exported_run import ExportedRun, read_exported
 
-_REFERENCE_SHARE, _MOST_SIGMA = 0.3, 0.05
+_REFERENCE_SHARE = 0.3
+_MOST_SIGMA = 0.05
 """Share of the depth's standard deviation at a reference that does not cancel in lengths beside it, and its most.
 
 As a share of the depth, by phantoms (docs/measure.md): the surface is the mean of many views.

@@ -29,10 +29,14 @@ from scopemap.result.run_folder import RunFolder
 from scopemap.runner.reread_frames import reread_frames
 
 _SMOOTH_S = 0.2  # standard deviation of the path's filter
-_LEAST_SIDE_PX, _FOOT_PX, _TEXT_PX = 360, 54, 15
-_SLOWEST_HZ, _FASTEST_HZ = 1, 60
+_LEAST_SIDE_PX = 360
+_FOOT_PX = 54
+_TEXT_PX = 15
+_SLOWEST_HZ = 1
+_FASTEST_HZ = 60
 _EMPTY = "#3a424c"
-_CLOCK_SHARE, _LEAST_ALONG = 0.45, 0.5
+_CLOCK_SHARE = 0.45
+_LEAST_ALONG = 0.5
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ _CHANNEL_WEIGHTS = np.array([0.5, 0.5, 0.0], dtype=np.float32)
 _DARKEST = 1e-3
 # Lamp emission and lens vignetting together fall with about the first power of the angle's cosine.
 _LAMP_COSINE_POWER = 1.0
-_DARK_LEVEL, _SATURATED_LEVEL = 12, 250
+_DARK_LEVEL = 12
+_SATURATED_LEVEL = 250
 _HIGHLIGHT_RATIO = 2.0
 _HIGHLIGHT_WHITENESS = 0.6
 # Shares of the image width: smoothing window, largest hole that is filled.

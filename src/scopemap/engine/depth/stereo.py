@@ -13,7 +13,9 @@ from scopemap.engine.frame import Frame
 # Longest side at which views are matched, px: SGBM's time grows with its cube.
 _LONGEST_SIDE_PX = 800
 # Blurred by so much first: a sensor's noise hides the mild texture of tissue.
-_BLOCK_PX, _BLUR_PX, _SPECKLE_PIXELS = 7, 0.8, 400
+_BLOCK_PX = 7
+_BLUR_PX = 0.8
+_SPECKLE_PIXELS = 400
 # Largest disparity, share of the width: for most endoscopes tissue that is nearer than two to three baselines.
 _MOST_SHARE = 0.25
 # Disparity is good to a fifth of a pixel or so: depth beyond this one is worth nothing.

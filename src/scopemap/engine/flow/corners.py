@@ -21,12 +21,15 @@ _CELL_PX = 12
 _CONSISTENCY_PX = 1.0
 # Of the corners that flow between small images must match, now and on average over some frames: where flow matches few,
 # that between the whole images gives keyframes more in common.
-_SMALL_COVERAGE, _FRAMES_BEFORE = 0.5, 10
+_SMALL_COVERAGE = 0.5
+_FRAMES_BEFORE = 10
 _EXPECTED_PX = 8  # between the pixels of a flow that is only a start
 _START_COVERAGE = 0.3  # of the corners that must be matched for the flow to be the next frame's start
 # Refinement.
-_SURROUND_PX, _DARKEST = 8.0, 8.0  # of the local mean and contrast; grey levels added to the mean
-_CONTRAST, _LEAST_CONTRAST = 50.0, 0.02  # grey levels of one local standard deviation; smaller contrast is noise
+_SURROUND_PX = 8.0  # of the local mean and contrast
+_DARKEST = 8.0  # grey levels added to the mean
+_CONTRAST = 50.0  # grey levels of one local standard deviation
+_LEAST_CONTRAST = 0.02  # smaller contrast is noise
 _LOW_RESOLUTION = 4  # at which the surround is computed: what it leaves out is as smooth
 _LEAST_EIGENVALUE = 1e-4
 _MAX_STEP_PX = 1.5  # from where flow has it

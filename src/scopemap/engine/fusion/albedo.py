@@ -21,7 +21,9 @@ from numba import njit, prange
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.fusion.tsdf import BLOCK, MeasuredSurface, TsdfCamera, VoxelBlocks, measure_surface
 
-_COSINE_POWER, _DISTANCE_POWER, _AXIS_POWER = 0.1, 0.8, 0.8
+_COSINE_POWER = 0.1
+_DISTANCE_POWER = 0.8
+_AXIS_POWER = 0.8
 _LEAST_LOG_COSINE = np.float32(np.log(0.1))
 _SMOOTH_SHARE = 1 / 30  # of the picture's width: cosines are averaged so far, predicted normals are noisy
 _STEEPEST = 10.0  # tangent of the incidence up to which neighbouring pixels of a rendering are one surface

@@ -14,7 +14,8 @@ from scopemap.engine.fusion.watertight import watertight
 from scopemap.engine.geometry.rendering import vertex_colours
 
 # Taubin, SIGGRAPH 1995: steps that shrink and steps that grow, 1 / 0.5 - 1 / 0.52 = 0.08, hardly change the volume.
-_SHRINK, _GROW = 0.5, 0.52
+_SHRINK = 0.5
+_GROW = 0.52
 _LARGEST_PERIMETER_VOXELS = 20.0  # of a hole that is closed
 # Cosine between a loop's own normal and the surface's beside it: -1 around a hole in a plane, 1 around an island, 0 at
 # the end of a tube, which leads to what no frame saw.

@@ -20,7 +20,8 @@ from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.frame import REGIONS, Frame, Rows
 
 # ln of millimetres in 16 bits: 0.0001 mm (standard deviations are small) to 34 m in steps of 0.03 %; 0 = unknown.
-_LOG_STEP, _MIN_MM = 3e-4, 1e-4
+_LOG_STEP = 3e-4
+_MIN_MM = 1e-4
 _MAX_CODE = 65535
 _CHECKED_AT_ONCE = 1 << 20
 _MOST_SPREAD = 16  # frames of a submap at which its surface is rendered again

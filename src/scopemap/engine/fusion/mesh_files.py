@@ -18,7 +18,9 @@ T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
 # trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
 _PLY_AXES = "unit: mm; axes: OpenCV (x right, y down, z forward)"
 _WRITTEN_COLOURS = "_COLOR_0"
-_FLOAT, _JSON, _BIN = 5126, 0x4E4F534A, 0x004E4942  # glTF 2.0, sections 3.6.2.2 and 4.4.3
+_FLOAT = 5126  # glTF 2.0, sections 3.6.2.2 and 4.4.3
+_JSON = 0x4E4F534A
+_BIN = 0x004E4942
 
 
 def save_mesh(

@@ -21,7 +21,8 @@ _SOME = (slice(_STEP_PX // 2, None, _STEP_PX),) * 2
 _SEEN = np.dtype([("key", np.int64), ("seen", np.int64), ("moving", np.int64)])
 _EDGE_SHARE = 0.13
 _MOST_ROWS = 1_000_000
-_LEAST_FRAMES, _LEAST_SHARE = 3, 0.05  # in which a block moves
+_LEAST_FRAMES = 3  # in which a block moves
+_LEAST_SHARE = 0.05
 _WINDOW_S = 0.5  # standard deviation of the weights
 _CORNERS = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
 _AROUND = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)

@@ -44,7 +44,9 @@ _VOXELS_PER_MAX_DEPTH = 200
 _MASKED_WEIGHT = 0.1
 # Weight of its colour, the one around it: it counts where no frame saw the tissue. Width of what is around over the
 # picture's, and the step of the pixels looked at.
-_MASKED_COLOUR, _SURROUNDINGS, _EVERY_PX = 0.01, 1 / 12, 4
+_MASKED_COLOUR = 0.01
+_SURROUNDINGS = 1 / 12
+_EVERY_PX = 4
 # Share of the picture up to which a highlight is that small.
 _LARGEST_MASKED = 0.02
 # No endoscope resolves less; memory would be spent on noise.

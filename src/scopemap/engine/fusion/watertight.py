@@ -22,10 +22,12 @@ from scopemap.engine.geometry.rendering import vertex_colours
 _MOST_CELLS = 160  # along the longest side of the mesh
 _MARGIN_CELLS = 10
 # The distance is known so far from the surface, in cells, and is the mean over the planes of so many vertices.
-_BAND_CELLS, _PLANES = 2, 4
+_BAND_CELLS = 2
+_PLANES = 4
 SEEN_CELLS = 1.5  # vertices farther from the mesh than this were not seen
 _LEVELS = (8, 4, 2, 1)  # cell sizes over the finest; each level starts from the one before
-_SWEEPS, _OVER_RELAXATION = 40, 1.7
+_SWEEPS = 40
+_OVER_RELAXATION = 1.7
 # Length of the mean normal above which a surface faces one way: that of a cavity as deep as its radius.
 _ONE_WAY = 1 / 3
 _SMALLEST_CELLS = 1e-3  # no vertex on a grid corner, where its edge would be ambiguous

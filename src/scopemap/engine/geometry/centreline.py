@@ -16,7 +16,8 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 _MOST_CELLS = 60_000  # of the graph; larger spaces are thinned
-_NEAR_WALL_COST, _NEAR_WALL_SHARE = 50.0, 0.25  # of a step at the wall; share of the radius over which it falls off
+_NEAR_WALL_COST = 50.0  # of a step at the wall
+_NEAR_WALL_SHARE = 0.25  # share of the radius over which it falls off
 
 
 @dataclass(frozen=True)

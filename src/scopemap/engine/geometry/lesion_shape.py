@@ -11,15 +11,23 @@ from scipy.spatial.distance import pdist, squareform
 
 from scopemap.engine.cameras.camera import PinholeCamera
 
-_SMOOTH_PX, _RIM_PX, _RIM_SHARE = 1.0, 2.5, 0.5
+_SMOOTH_PX = 1.0
+_RIM_PX = 2.5
+_RIM_SHARE = 0.5
 _RING = (0.15, 0.6)  # the wall beside a lesion: from so far outside its outline to so far, over its radius
-_GAP_PX, _LEAST_RING_PX, _OUTLIER = 2.0, 30, 2.5
-_LEAST_KNOWN, _LEAST_PX = 0.7, 12
+_GAP_PX = 2.0
+_LEAST_RING_PX = 30
+_OUTLIER = 2.5
+_LEAST_KNOWN = 0.7
+_LEAST_PX = 12
 # Standard deviations, as shares, by phantoms: of a lesion's diameter by that across the line of sight; of it by depth,
 # and what that grows by with the depth between its ends over what is across.
-_ROUND_ERROR, _DEPTH_ERROR, _SLANT_ERROR = 0.1, 0.06, 0.2
+_ROUND_ERROR = 0.1
+_DEPTH_ERROR = 0.06
+_SLANT_ERROR = 0.2
 # Correction of ln diameter in a slanted view, by phantoms: the far rim is occluded; what protrudes shows its side.
-_OCCLUSION, _PROTRUSION = 0.1, 0.5
+_OCCLUSION = 0.1
+_PROTRUSION = 0.5
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ import numpy as np
 
 _WINDOW_PX = 7
 _SAMPLE = _WINDOW_PX**2 / (_WINDOW_PX**2 - 1)  # of a sample's covariance
-_C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2  # Wang, section III.B
+_C1 = (0.01 * 255) ** 2  # Wang, section III.B
+_C2 = (0.03 * 255) ** 2
 
 
 def structural_similarity(grey_a: np.ndarray, grey_b: np.ndarray) -> np.ndarray:

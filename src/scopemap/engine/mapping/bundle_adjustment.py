@@ -50,7 +50,8 @@ CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 _POINT_STEPS = 5  # of the points alone, after the keyframes
-_ADDED_WITH, _ADDED_ITERATIONS = 2, 6  # keyframes before a new one that move with it, and steps of each search
+_ADDED_WITH = 2  # keyframes before a new one that move with it, and steps of each search
+_ADDED_ITERATIONS = 6
 WINDOW = 300
 """Most keyframes that are adjusted at once."""
 RIGID_SIGMA_PX = 0.4

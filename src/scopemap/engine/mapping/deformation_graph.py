@@ -22,9 +22,11 @@ from scopemap.engine.geometry.se3 import hat, inverse, se3_exp, so3_log
 _NEIGHBOURS = 6  # of a node
 _FARTHEST_SHARE = 97  # percent of the points, nearest to their median, among which nodes are
 # A curve repeats itself where a sinusoid of at least so many periods explains so much of its variance.
-_LEAST_PERIODS, _PERIODIC_SHARE = 1.5, 0.8
+_LEAST_PERIODS = 1.5
+_PERIODIC_SHARE = 0.8
 _RATES = 200
-_REWEIGHTINGS, _LEAST_GAP_S = 5, 1e-3
+_REWEIGHTINGS = 5
+_LEAST_GAP_S = 1e-3
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,8 @@ _MIN_POINTS = 10
 # The first and the last level are these percentiles of the points' ln depths.
 _LEVEL_PERCENTILES = (1, 99)
 # Disagreement of depth, ln, that a right adjustment may leave: errors of networks themselves; and its growth by noise.
-_DEPTH_ERROR, _MAX_DEPTH_FACTOR = 0.05, 1.1
+_DEPTH_ERROR = 0.05
+_MAX_DEPTH_FACTOR = 1.1
 _GRID_PX = 8  # between the pixels whose depth is compared between keyframes
 
 

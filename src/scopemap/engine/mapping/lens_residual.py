@@ -25,11 +25,13 @@ _RESIDUAL_SIGMA = np.array([0.3, 0.2, 0.2])  # prior standard deviations of ln f
 _RESIDUAL_DEPTH = 3.0  # factor of the estimated depth's deviation there: errors of a network bend the lens, too
 _SIGNIFICANT = 5.0  # standard deviations: a right lens of a real clip had 3.4, the least noticed wrong one 6.7
 _FOCAL_SIGMA = 0.05  # of ln f, above which the views say too little of the lens to confirm it
-_MOST_SURFACE, _MOST_PATH = 0.035, 0.03
+_MOST_SURFACE = 0.035
+_MOST_PATH = 0.03
 """Changes of surface and path above which the views contradict the lens: the 5 % and 3 % above which the table of
 verdicts calls a result wrong, less the 1.5 % by which surfaces are off with a right lens."""
 _LEAST_POINTS = 10  # of a keyframe whose shape is compared
-_ITERATIONS, _MIN_DECREASE = 40, 1e-4  # a wrong lens may be far away
+_ITERATIONS = 40  # a wrong lens may be far away
+_MIN_DECREASE = 1e-4
 
 
 class LensResidual(NamedTuple):

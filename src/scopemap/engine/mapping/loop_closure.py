@@ -28,18 +28,24 @@ _STRONGEST_VALUES = 8192  # of the descriptors of the strongest features, by whi
 _CANDIDATES = 3
 _STATIC_PX = 2.0
 # With a camera at rest every keyframe would close loops to the same few ones; the adjustment's cost is their square.
-_MIN_INTERVAL, _MAX_LOOPS = 5, 20  # keyframes between two loops to the same keyframe, loops to one keyframe
+_MIN_INTERVAL = 5  # keyframes between two loops to the same keyframe, loops to one keyframe
+_MAX_LOOPS = 20
 MOST_RECENT = 8
 """Keyframes just before a new one: flow leads to them, and loops are sought to those before them."""
 _MAX_PAIRS = 60  # features of a loop
 MOST_SEARCHED = 400
 """Keyframes with features; above, every second one is forgotten, so that memory and time of a search are bounded."""
-_TRIED_BETWEEN, _MOST_TRIED = 20, 1000  # pairs of keyframes that are verified at the end: of two maps, of all maps
+_TRIED_BETWEEN = 20  # pairs of keyframes that are verified at the end: of two maps, of all maps
+_MOST_TRIED = 1000
 LOOP = np.dtype([("past", np.int64), ("new", np.int64), ("T_new_past", np.float64, (4, 4)), ("log_ratio", np.float64)])
 """A loop without its features."""
-_WIDTH, _HEIGHT, _STEP = 160, 128, 2  # px of the small picture, and between the pixels that are compared
-_FINE_PX, _COARSE_PX = 0.75, 2.5  # standard deviations of the Gaussians between which the detail lies
-_DARKEST, _LEAST_CONTRAST = 8.0, 0.01  # grey levels added before the logarithm; ln, below which detail is noise
+_WIDTH = 160  # px of the small picture, and between the pixels that are compared
+_HEIGHT = 128
+_STEP = 2
+_FINE_PX = 0.75  # standard deviations of the Gaussians between which the detail lies
+_COARSE_PX = 2.5
+_DARKEST = 8.0  # grey levels added before the logarithm
+_LEAST_CONTRAST = 0.01  # ln, below which detail is noise
 _MIN_PIXELS = 100
 # In an examination of which the truth is known: 97 of 100 right loops are above, and 8 of 100 wrong ones.
 _MIN_CORRELATION = 0.12

@@ -38,7 +38,8 @@ _MAX_LOG_SCALE = 1.0  # between maps of one video
 _MIN_COMMON = 20
 
 # Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
-_MAX_ERROR_FACTOR, _NOISE_PX = 1.5, 0.05
+_MAX_ERROR_FACTOR = 1.5
+_NOISE_PX = 0.05
 # Keyframes of either map with loops to the other, where errors between maps are larger than within or untested.
 _MIN_LOOPED = 4
 # Learned features are matched to about a pixel: errors between maps of one place were up to 0.96 px, of two from 1.38.

@@ -37,13 +37,16 @@ from scopemap.engine.notices import Notice
 
 # Displacements in px per unit of ln depth that are aimed at: the median of all pixels, and that of the farthest fifth.
 # Less is noise, more is hard to match.
-_PARALLAX_PX, _FAR_PARALLAX_PX = (10.0, 20.0), (12.0,)
+_PARALLAX_PX = (10.0, 20.0)
+_FAR_PARALLAX_PX = (12.0,)
 _MIN_PARALLAX_PX = 1.5
 _FAR_PERCENTILE = 80
 # Frames before and after a keyframe among which its neighbours are sought, and the step of the pixels that tell.
-_SEARCHED_FRAMES, _SAMPLED_EVERY = 150, 8
+_SEARCHED_FRAMES = 150
+_SAMPLED_EVERY = 8
 # Standard deviations of flow along one axis, and of predicted ln depth.
-_FLOW_SIGMA_PX, PRIOR_SIGMA = 0.3, 0.3
+_FLOW_SIGMA_PX = 0.3
+PRIOR_SIGMA = 0.3
 # Above this median standard deviation tissue moves or poses are wrong: the predicted depth is better.
 MAX_SIGMA = 0.08
 _MAX_LOG_FACTOR = 0.5
@@ -53,7 +56,10 @@ _PROPAGATED_EVERY = 2  # pixels of a row and a column are compared with keyframe
 _CACHED_VIEWS = 24
 # Standard deviations of Gaussian windows, px: of local contrast, of the disagreement's mean, of the result, and of
 # the result where little is measured.
-_CONTRAST_PX, _DISAGREEMENT_PX, _SMOOTHING_PX, _WIDE_PX = 6.0, 6.0, 2.0, 16.0
+_CONTRAST_PX = 6.0
+_DISAGREEMENT_PX = 6.0
+_SMOOTHING_PX = 2.0
+_WIDE_PX = 16.0
 
 
 class StereoView(NamedTuple):

@@ -33,20 +33,29 @@ from scopemap.engine.mapping.deformation_graph import (
 from scopemap.engine.mapping.left_out import part_of, placed
 from scopemap.engine.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, solve
 
-LEAST_KEYFRAMES, MOST_KEYFRAMES = 6, 300
+LEAST_KEYFRAMES = 6
+MOST_KEYFRAMES = 300
 """With fewer keyframes no curve is known; with more, time and memory of the adjustment would grow too much."""
 RIGID_CORE_PX = 0.4
 """Robust standard deviation of a rigid solution below which most of the tissue is at rest."""
 _NODES = 60
 # Nodes that find the curves, of up to so many keyframes and of many, and the least hat functions of each.
-_CURVE_NODES, _FEW_KEYFRAMES, _LEAST_CURVE_NODES, _LEAST_HATS = 15, 60, 10, 30
+_CURVE_NODES = 15
+_FEW_KEYFRAMES = 60
+_LEAST_CURVE_NODES = 10
+_LEAST_HATS = 30
 _THINNED = 3  # one of so many points finds the curve
 # Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
-_FREE, _ONE_CURVE, _TRACKED_SHARE = MotionPrior(0.1, 0.03, 0.03), MotionPrior(0.2, 0.1, 0.03), 0.05
-_CELL_PX, _EVERY = 16, 5  # cells of the picture, and which share of them is left out
+_FREE = MotionPrior(0.1, 0.03, 0.03)
+_ONE_CURVE = MotionPrior(0.2, 0.1, 0.03)
+_TRACKED_SHARE = 0.05
+_CELL_PX = 16  # cells of the picture, and which share of them is left out
+_EVERY = 5
 # Left-out errors: that count as wrong, and beyond which an error counts no more, px.
-_WRONG_PX, _FALSE_PX = 2.0, 10.0
-_LEAST_FACTOR, _LEAST_FALL = 1.5, 0.05
+_WRONG_PX = 2.0
+_FALSE_PX = 10.0
+_LEAST_FACTOR = 1.5
+_LEAST_FALL = 0.05
 _LEAST_LEFT_OUT = 100  # observations
 # Beside a core at rest a node moves where the share of wrong observations exceeds that of most nodes by so much.
 _MOVING_SHARE = 0.02

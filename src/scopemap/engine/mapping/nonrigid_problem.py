@@ -32,7 +32,9 @@ from scopemap.engine.mapping.bundle_problem import BundleProblem, Reprojection, 
 
 _RIDGE = 1e-9  # of the diagonal
 # Of nodes that move step by step only the curve is needed, which is found long before them.
-_MAX_ITERATIONS, _FOR_CURVE, _MIN_DECREASE = 20, 6, 1e-3
+_MAX_ITERATIONS = 20
+_FOR_CURVE = 6
+_MIN_DECREASE = 1e-3
 _CURVE_SIGMA = 0.3  # prior standard deviation of a curve, whose largest value is 1
 
 

@@ -41,7 +41,8 @@ _KNOWN_SIGMA = 0.2  # standard deviation of ln depth below which a left-out poin
 _LEAST_POINTS = 50  # with fewer such points nothing is compared: the camera hardly moved
 _LEAST_OF_KEYFRAME = 5
 # Two shapes meet. Real clips: the same valley .96 to 1.00 and .003 to .07; another one at most .84, and .07 to .39.
-_LEAST_CORRELATION, _MOST_DIFFERENCE = 0.9, 0.1
+_LEAST_CORRELATION = 0.9
+_MOST_DIFFERENCE = 0.1
 # Errors of left-out tracks over those of the other shape. In the right valley of a laparoscopy .75; where both are
 # wrong, since tissue moves, .93 to 1.1.
 _CLEARLY_LESS = 0.85

@@ -46,7 +46,9 @@ _MAX_LOOP_ERROR = 3.0  # root mean square, in standard deviations, of an accepte
 _MAX_DRIFT_SHARE = 0.5
 # Standard deviations, ln: of the network's scale at a keyframe, many of which err alike, of the drift from one keyframe
 # to the next, and of the change of that drift.
-_NETWORK_SIGMA, _DRIFT_SIGMA, _CHANGE_SIGMA = 0.2, 0.02, 0.002
+_NETWORK_SIGMA = 0.2
+_DRIFT_SIGMA = 0.02
+_CHANGE_SIGMA = 0.002
 
 
 class PathWithoutDrift(NamedTuple):

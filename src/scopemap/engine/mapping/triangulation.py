@@ -15,7 +15,8 @@ VIEW_SIGMA = 0.03
 
 _MAX_FLOW_PX = 20.0
 _MAX_PROPAGATED = 0.25  # larger differences between a frame's depth and its keyframe's are an occlusion
-_CAUCHY, _ITERATIONS = 2.0, 4
+_CAUCHY = 2.0
+_ITERATIONS = 4
 _LEAST_MM = 1e-3
 _OUTSIDE_PX = -1e4
 

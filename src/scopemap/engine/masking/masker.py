@@ -27,10 +27,13 @@ _CALM_WIDTH_PX = 5
 _MIN_FIELD_SHARE = 0.05
 # Instruments: a region counts where this share of the picture is likelier than `_SEED`, and reaches as far as pixels
 # are likelier than `_REACH`, or than `_HELD` near instruments of the frame before.
-_SEED, _REACH, _HELD = 0.5, 0.04, 0.02
+_SEED = 0.5
+_REACH = 0.04
+_HELD = 0.02
 _LEAST_SHARE = 0.0004
 # How near that is, and how wide the blurred rim is, as shares of the picture's longer side.
-_NEAR_SHARE, _RIM_SHARE = 0.02, 0.008
+_NEAR_SHARE = 0.02
+_RIM_SHARE = 0.008
 
 
 class FieldOfView:

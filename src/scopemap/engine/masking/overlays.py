@@ -10,14 +10,32 @@ import numpy as np
 # The green channel: red tissue is dark there, so both white and black text have contrast.
 _CHANNEL = 1
 # Camera motion is detected in a small copy without its local mean, divided into parts; grey levels of 255.
-_SMALL_SIDE_PX, _LOCAL_PX, _PARTS = 60, 9, (8, 6)
-_TEXTURE, _ALIKE, _MIN_PARTS, _MOVED_SHARE = 1.0, 0.94, 12, 0.7
-_MIN_COUNT, _MEMORY, _LOOK_EVERY = 12, 40, 4
+_SMALL_SIDE_PX = 60
+_LOCAL_PX = 9
+_PARTS = (8, 6)
+_TEXTURE = 1.0
+_ALIKE = 0.94
+_MIN_PARTS = 12
+_MOVED_SHARE = 0.7
+_MIN_COUNT = 12
+_MEMORY = 40
+_LOOK_EVERY = 4
 # Edge threshold, grey levels; share of an edge that may change on average and in one image (video coding changes it).
-_EDGE, _STILL_SHARE, _NOW_SHARE = 40, 0.1, 0.25
-_RIM_PX, _CLOSING_PX, _GROW_PX, _MIN_PX, _MAX_SHARE = 2, 5, 2, 6, 0.25
+_EDGE = 40
+_STILL_SHARE = 0.1
+_NOW_SHARE = 0.25
+_RIM_PX = 2
+_CLOSING_PX = 5
+_GROW_PX = 2
+_MIN_PX = 6
+_MAX_SHARE = 0.25
 # The surroundings of a static edge must change (grey levels after noise removal) or be uniform, nearly all of them.
-_CALM_PX, _NEAR_PX, _FAR_PX, _CHANGED, _PLAIN, _AROUND_SHARE = 5, 4, 8, 1.5, 2.0, 0.7
+_CALM_PX = 5
+_NEAR_PX = 4
+_FAR_PX = 8
+_CHANGED = 1.5
+_PLAIN = 2.0
+_AROUND_SHARE = 0.7
 # An overlay has disappeared where this share of its edge pixels differs (half of them belong to the surroundings).
 _GONE_SHARE = 0.25
 

@@ -27,7 +27,10 @@ _MAX_FEATURES = 1000  # twice those of SIFT: where tissue is bare, the weaker ha
 _RADIUS_PX = 2  # of the surroundings of which a keypoint has the highest score
 _TEMPERATURE = 0.1  # of the soft argmax
 # Local brightness that pictures are brought to, its width as a share of the picture's, and what is added to the dark.
-_EVEN_LEVEL, _EVEN_SHARE, _DARKEST, _LOW_RESOLUTION = 110.0, 1 / 16, 8.0, 4
+_EVEN_LEVEL = 110.0
+_EVEN_SHARE = 1 / 16
+_DARKEST = 8.0
+_LOW_RESOLUTION = 4
 _MOST_KEPT = 32  # the keyframes in which a lost camera is searched among them
 
 

@@ -9,11 +9,14 @@ import numpy as np
 
 from scopemap.engine.geometry.local_contrast import local_mean
 
-_FINE, _COARSE = 1 / 320, 4 / 320  # of the picture's width: standard deviations of the two blurs
+_FINE = 1 / 320  # of the picture's width: standard deviations of the two blurs
+_COARSE = 4 / 320
 _FRAMES = 30
 # Quality is measured in a small copy, against the upper quartile of so many frames: unlike their median, it is still
 # that of clear ones where fluid stays for seconds.
-_SMALL_PX, _NEIGHBOURS, _CLEAR_PERCENTILE = 320, 100, 75
+_SMALL_PX = 320
+_NEIGHBOURS = 100
+_CLEAR_PERCENTILE = 75
 LEAST_QUALITY = 0.01
 
 

@@ -13,7 +13,8 @@ from scopemap.engine.tracking.causes import LossCause
 
 Status = Literal["initial", "ok", "lost"]
 
-_DARK_LEVEL, _BRIGHT_LEVEL = 40, 200  # of the brightest channel, in an image with few usable pixels
+_DARK_LEVEL = 40  # of the brightest channel, in an image with few usable pixels
+_BRIGHT_LEVEL = 200
 MOVING_SIGMAS = 2.0
 """Standard deviations of noise beyond which tissue moves on its own."""
 

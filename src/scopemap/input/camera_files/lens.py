@@ -33,7 +33,8 @@ _RADIAL_LISTS = ("RadialDistortion", "radial", "radial_distortion_coefficients",
 _TANGENTIAL_LISTS = (
     "TangentialDistortion", "tangential", "tangential_distortion_coefficients", "tangential_coefficients",
 )  # fmt: skip
-_RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4", "k5", "k6"), ("p1", "p2")
+_RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
+_TANGENTIAL = ("p1", "p2")
 _MODELS = ("camera_model", "distortion_model", "lens_model", "model", "model_type", "distortion_type", "type")
 _FLAGS = ("fisheye_model", "fisheye", "is_fisheye")
 _UNREAD = re.compile(r"(?<!un)dist(?!anc|rib)|coef|radial|tangential", re.IGNORECASE)
@@ -44,7 +45,8 @@ _BESIDE = re.compile(
 )
 _LONGEST_QUOTE = 40
 _WITH_THIN_PRISM = (12, 14)
-_MOST_TRIED, _DEEPEST = 100, 3
+_MOST_TRIED = 100
+_DEEPEST = 3
 
 
 def model_in(levels: Sequence[Fields]) -> str:

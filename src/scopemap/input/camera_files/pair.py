@@ -17,11 +17,14 @@ NEEDS_PAIR = (
     "depth from two views (--stereo use) needs the calibration of the pair: --camera FILE with both cameras and how "
     "they lie to each other (K1, D1, K2, D2, R, T of OpenCV's stereo calibration or SCARED, or Kalibr's camchain)"
 )
-_SCARED, _EXTRINSICS = "camera-calibration", ("extrinsics.yml", "extrinsics.yaml", "extrinsics.xml")
+_SCARED = "camera-calibration"
+_EXTRINSICS = ("extrinsics.yml", "extrinsics.yaml", "extrinsics.xml")
 _OF_ONE = re.compile(r"(K|M|D|camera_?matrix_?|dist_?(?:coeffs?_?)?)([12]|[LR])", re.IGNORECASE)
 _KALIBR = "T_cn_cnm1"
 # Of a baseline, mm, as files have it that state no unit: more is taken as mm, less as m; between them it is neither.
-_LEAST_MM, _MOST_M, _LEAST_M = 0.5, 0.1, 3e-4
+_LEAST_MM = 0.5
+_MOST_M = 0.1
+_LEAST_M = 3e-4
 
 
 def read_pair(file: Path | str, image_size: Size, fit: str = "exact") -> StereoPair:

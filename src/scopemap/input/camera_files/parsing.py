@@ -21,7 +21,8 @@ from scopemap.engine.errors import CalibrationError
 
 MOST_TERMS = 20
 _MAX_BYTES = 1 << 20
-_MAX_DEPTH, _MAX_EVENTS = 24, 100_000
+_MAX_DEPTH = 24
+_MAX_EVENTS = 100_000
 _MAX_NUMBERS = 1000
 _LONGEST_QUOTE = 40
 # ORB-SLAM writes `Camera.fx` or `Camera1.fx` for fx.

@@ -15,7 +15,8 @@ from scopemap.input.camera_files.parsing import MOST_TERMS, Fields, xml_root
 _MATRIX_SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 _LINE_COUNTS = (4, 8, 9, 12)
 # A skew is passed over up to the first share of the focal length, with a note up to the second.
-_SLIGHT_SKEW, _MOST_SKEW = 1e-3, 1e-2
+_SLIGHT_SKEW = 1e-3
+_MOST_SKEW = 1e-2
 _CALIBU_PINHOLE = "calibu_fu_fv_u0_v0"
 _CALIBU_PARAMETERS = {_CALIBU_PINHOLE: 4, f"{_CALIBU_PINHOLE}_k1_k2": 6, f"{_CALIBU_PINHOLE}_kb4": 8}
 _STEREO_LEFT = "StereoLeft"

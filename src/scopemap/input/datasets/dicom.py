@@ -26,12 +26,15 @@ from scopemap.input.images import image_files, numeric_order
 from scopemap.input.source import Source, SourceFrame
 from scopemap.input.video import VideoFile
 
-_IMPLICIT, _EXPLICIT = "1.2.840.10008.1.2", "1.2.840.10008.1.2.1"
-_PIXEL_DATA, _UNDEFINED = struct.pack("<HH", 0x7FE0, 0x0010), 0xFFFFFFFF
+_IMPLICIT = "1.2.840.10008.1.2"
+_EXPLICIT = "1.2.840.10008.1.2.1"
+_PIXEL_DATA = struct.pack("<HH", 0x7FE0, 0x0010)
+_UNDEFINED = 0xFFFFFFFF
 _PARTIAL = "YBR_PARTIAL_420"
 _MOST_IMAGE_BYTES = 256 << 20
 _RATES = ("CineRate", "RecommendedDisplayFrameRate")
-_SLOWEST_HZ, _FASTEST_HZ = 1e-3, 1e5
+_SLOWEST_HZ = 1e-3
+_FASTEST_HZ = 1e5
 _TAGS = (
     *("Rows", "Columns", "NumberOfFrames", "SamplesPerPixel", "PhotometricInterpretation", "PlanarConfiguration"),
     *("BitsAllocated", "BitsStored", "PixelRepresentation", "PixelAspectRatio", "BurnedInAnnotation"),
@@ -39,7 +42,9 @@ _TAGS = (
     *("FrameTime", "FrameTimeVector", "CineRate", "RecommendedDisplayFrameRate", "InstanceNumber", "SeriesInstanceUID"),
     *(f"{c}PaletteColorLookupTable{part}" for c in ("Red", "Green", "Blue") for part in ("Data", "Descriptor")),
 )
-_PREAMBLE, _MAGIC, _META_BYTES = 128, b"DICM", 512
+_PREAMBLE = 128
+_MAGIC = b"DICM"
+_META_BYTES = 512
 # The SOP class of a directory of a medium (PS3.3, F), as an element of the file's own header.
 _DIRECTORY = b"\x02\x00\x02\x00UI\x14\x001.2.840.10008.1.3.10"
 

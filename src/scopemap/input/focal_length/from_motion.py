@@ -27,12 +27,15 @@ from scopemap.input.focal_length.windows import MAX_FRAMES, Window, frames_of_wi
 from scopemap.input.scopes import ANY_LENS, KINDS, SCOPES
 from scopemap.input.sequence import Sequence
 
-_LOG_DEPTH_SIGMA, _DISTORTION_SIGMA, _LOG_FOCAL_SIGMA = 1.0, 0.3, 1.0
+_LOG_DEPTH_SIGMA = 1.0
+_DISTORTION_SIGMA = 0.3
+_LOG_FOCAL_SIGMA = 1.0
 _NO_DISTORTION_SIGMA = 1e-4
 _START_FOV_DEG = (60.0, 105.0)
 _BLOCKS = 4  # columns and rows of the image within which errors are correlated
 # Iterations, and smallest relative decrease: first of all starts, then of the best one with distortion.
-_FIRST, _THEN = (15, 1e-3), (30, 1e-4)
+_FIRST = (15, 1e-3)
+_THEN = (30, 1e-4)
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,17 @@ from scopemap.engine.geometry.least_squares import RAYLEIGH_TO_SIGMA
 _MIN_SIGMA_PX = 0.03
 _CAUCHY2 = 2.0**2  # squared residual, in variances, that gets half the weight
 _BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
-_LEAST_Z, _LEAST_SLOPE = 1e-3, 0.1
-_STEPS, _FARTHEST = 6, 10.0  # of Newton's method that bends a lens; half widths, beyond which it would diverge
+_LEAST_Z = 1e-3
+_LEAST_SLOPE = 0.1
+_STEPS = 6  # of Newton's method that bends a lens
+_FARTHEST = 10.0  # half widths, beyond which it would diverge
 # Focal length, depth and motion share a long valley of the cost: more damping would end the search on its way.
-_LEAST_DAMPING, _MORE, _LESS = 1e-5, 10.0, 0.3
+_LEAST_DAMPING = 1e-5
+_MORE = 10.0
+_LESS = 0.3
 _SMALL_RAD = 1e-6
-_RIDGE, _TINY = 1e-9, 1e-300  # of the diagonal; where that is zero
+_RIDGE = 1e-9  # of the diagonal
+_TINY = 1e-300  # where that is zero
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
 
 

@@ -25,14 +25,18 @@ from scopemap.input.sequence import Sequence
 MAX_FRAMES = 120
 """Number of frames at the start of a sequence that are used."""
 
-_EVERY, _MIN_KEPT = 4, 30  # of these frames every fourth is used, of a short sequence more of them
-_HOST_EVERY, _MAX_GAP = 5, 15  # used frames from one host to the next, and to its last partner at most
+_EVERY = 4  # of these frames every fourth is used, of a short sequence more of them
+_MIN_KEPT = 30
+_HOST_EVERY = 5  # used frames from one host to the next, and to its last partner at most
+_MAX_GAP = 15
 _MAX_PARTNERS = 6
 _CELL_PX = 16
 _CONSISTENCY_PX = 1.0
 _MIN_SHARE = 0.35  # of a host's corners that a partner observes
 _MIN_CORNERS = 40
-_PATCH_PX, _LEVELS, _LEAST_EIGENVALUE = 21, 3, 1e-4
+_PATCH_PX = 21
+_LEVELS = 3
+_LEAST_EIGENVALUE = 1e-4
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
 
 

@@ -26,9 +26,11 @@ LEAST_CORRELATION_USUAL_SHAPE = 0.64
 """The same for pictures that have the shape of one view."""
 
 # Width over height of one view as it is displayed; beyond it the view was squeezed, or it is none.
-_NARROWEST, _WIDEST = 0.95, 2.0
+_NARROWEST = 0.95
+_WIDEST = 2.0
 # Pictures of one view are neither so wide nor so high.
-_LEAST_ASPECT_BESIDE, _MOST_ASPECT_ABOVE = 2.2, 1 / 1.4
+_LEAST_ASPECT_BESIDE = 2.2
+_MOST_ASPECT_ABOVE = 1 / 1.4
 _WIDTH_PX = 160
 _MOST_SHIFT_SHARE = 0.16
 _BLACK_LEVEL = 16
@@ -38,12 +40,17 @@ _LEAST_LEAD = 0.25
 # Grey levels of detail: less is what coding makes of an even slope.
 _LEAST_DEVIATION = 2.0
 _LEAST_PICTURES_SHARE = 0.25
-_SATURATED_LEVEL, _MOST_SATURATED_SHARE = 250, 0.1
+_SATURATED_LEVEL = 250
+_MOST_SATURATED_SHARE = 0.1
 # Detail beyond so many standard deviations counts as that many.
 _MOST_DEVIATIONS = 2.5
-_TILES, _LEAST_TILES, _LEAST_TILES_SHARE = 3, 3, 0.5
+_TILES = 3
+_LEAST_TILES = 3
+_LEAST_TILES_SHARE = 0.5
 # A pixel whose grey level changes by less over this many pictures or more is written over them.
-_STILL_LEVELS, _LEAST_STILL_PICTURES, _MOST_STILL_SHARE = 3, 3, 0.5
+_STILL_LEVELS = 3
+_LEAST_STILL_PICTURES = 3
+_MOST_STILL_SHARE = 0.5
 
 
 @dataclass(frozen=True)

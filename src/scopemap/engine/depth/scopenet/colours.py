@@ -11,7 +11,8 @@ import numpy as np
 from scopemap.engine.depth.scopenet.planes import LINEAR
 
 # Linear red from which on it counts less, and from which on it does not count: sRGB levels 188 and 237.
-_SATURATES, _SATURATED = 0.5, 0.85
+_SATURATES = 0.5
+_SATURATED = 0.85
 _DARKEST = 1e-3
 _LINEAR = LINEAR.astype(np.float32)
 
