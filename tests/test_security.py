@@ -32,7 +32,7 @@ PERMISSIVE = {
 }
 OF_EXTRAS = PERMISSIVE | {"MPL-2.0", "LicenseRef-NVIDIA-Proprietary"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = [name for name in PROJECT["optional-dependencies"] if name != "dev"] + ["bench", "baselines"]
+EXTRAS = [name for name in PROJECT["optional-dependencies"] if name not in ("dev", "test")] + ["bench", "baselines"]
 
 
 def _parts(licence: str) -> set[str]:
