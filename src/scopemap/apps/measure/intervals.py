@@ -17,10 +17,6 @@ SIGMAS = 1.96
 """Ends of a 95 % interval of a normal distribution, standard deviations."""
 
 
-def _none() -> np.ndarray:
-    return np.zeros((0, 2))
-
-
 @dataclass(frozen=True)
 class LogChanges:
     """Changes of ln of a figure as each source stands at its lower and at its upper end.
@@ -30,7 +26,7 @@ class LogChanges:
     """
 
     shared: np.ndarray = field(default_factory=lambda: np.zeros((3, 2)))
-    own: np.ndarray = field(default_factory=_none)
+    own: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
     @classmethod
     def of_scale(cls, sigma: float) -> LogChanges:

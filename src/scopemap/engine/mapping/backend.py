@@ -161,8 +161,8 @@ class Backend:
         """Return the correction of all frames of a map and of the maps merged with it, after the last keyframe.
 
         tracked : poses as tracked by number of the frame; needed for several maps. among : numbers of the maps that may
-        be merged; None: all. The correction changes nothing where a rigid scene does not explain the observations, or
-        where the depths of keyframes agree less than before. Raises ValueError where the map has no keyframe.
+        be merged; None: all. Where it is refused, keyframes stay as tracked, and only their steps are spread over the
+        frames that lead to them. Raises ValueError where the map has no keyframe.
         """
         if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")

@@ -24,7 +24,10 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.mapping.bundle_problem import Points
 
-ROWS, COLUMNS, LEVELS = _SHAPE = 6, 7, 4
+ROWS = 6
+COLUMNS = 7
+LEVELS = 4
+_SHAPE = (ROWS, COLUMNS, LEVELS)
 MAX_LOG_FACTOR = 0.7
 """Bound of |ln factor|: larger errors of points are not errors of depth."""
 

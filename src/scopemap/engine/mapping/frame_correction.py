@@ -63,7 +63,7 @@ class FrameCorrection:
     tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
     T_world_world_before, log_scale_before : the same for the frames that lead to the keyframe, which its `KeyframeStep`
     parts from it; None: there is none. sigma_px : robust standard deviation of the reprojection errors; NaN without
-    observations. refused : why nothing is changed, None where it is. loops : number of accepted loop closures.
+    observations. refused : why keyframes stay as tracked, None where it is. loops : number of accepted loop closures.
     loop_frames : the two frames of each. depth_fields : (K,) further factors of each pixel's depth; (): none.
     S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
     number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens_residual :
