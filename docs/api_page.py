@@ -34,8 +34,8 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "The result": (
         "A finished run is read from its folder. Its `frames` is the table of `frames.csv`: "
-        '`RunFolder("result").frames["status"]` is a column.',
-        ("Reconstruction", "RunFolder", "Trajectory", "read_trajectory", "evaluate_poses"),
+        '`Result("result").frames["status"]` is a column.',
+        ("Result", "Trajectory", "read_trajectory", "evaluate_poses"),
     ),
     "Frames": ("", ("Frame",)),
     "Errors": ("", ("ScopemapError",)),

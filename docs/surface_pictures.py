@@ -28,13 +28,13 @@ from scopemap.report.mesh_figures import (
     outside_views,
 )
 from scopemap.report.sheet import picture_grid
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.runner.reread_frames import open_truth
 
 MOST_BYTES = 200_000
 
 
-def draw_surface(run: RunFolder, frame: Frame, pose: np.ndarray, rendering: Rendering, file: Path) -> None:
+def draw_surface(run: Result, frame: Frame, pose: np.ndarray, rendering: Rendering, file: Path) -> None:
     """Draw a frame, the surface from there, its confidence (blue 0, yellow 1), and the surface with the path outside.
 
     pose : (4, 4) of the frame, world mm. rendering : of the mesh from there, in the frame's light.
@@ -56,7 +56,7 @@ def draw_surface(run: RunFolder, frame: Frame, pose: np.ndarray, rendering: Rend
 
 def draw_run(folder: Path, file: Path, number: int | None = None) -> None:
     """Draw a run at a frame, by default the middle one of those tracked."""
-    run = RunFolder(folder)
+    run = Result(folder)
     tracked = run.frames.rows[run.frames.tracked]
     row = tracked[len(tracked) // 2] if number is None else tracked[tracked["index"] == number][0]
     sequence = open_truth(folder, Path(run.provenance["input"]))

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap import Reconstruction, RunFolder, open_sequence, reconstruct
+from scopemap import Result, open_sequence, reconstruct
 from scopemap_bench import PhantomSpec, write_phantom
 
 
-def main(result: RunFolder | Reconstruction, video: Path) -> None:
+def main(result: Result, video: Path) -> None:
     found = result.coverage()
     print(found)
     for spot in found.spots:
@@ -40,7 +40,7 @@ def main(result: RunFolder | Reconstruction, video: Path) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) == 3:
-        main(RunFolder(sys.argv[1]), Path(sys.argv[2]))
+        main(Result(sys.argv[1]), Path(sys.argv[2]))
     else:
         with tempfile.TemporaryDirectory() as temporary:
             phantom, run = Path(temporary) / "phantom", Path(temporary) / "run"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from scopemap.report.frame_pictures import FramePictures
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import ELSEWHERE, NOT_USED, ROTATED, FrameTable
 from scopemap.result.frame_table import LOST as LOST_FRAME
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 IN_RESULT, IN_FIRST_MAP, FRAMES = 14, 7, 24
@@ -62,7 +63,7 @@ def pose_of(index: int) -> np.ndarray:
     return se3(so3_exp(np.array([0.0, 0.01 * index, 0.0])), np.array([0.01 * index**2, 0.0, float(index)]))
 
 
-def drawn_result(name: str = "video.mp4", **facts: Any) -> Reconstruction:
+def drawn_result(name: str = "video.mp4", **facts: Any) -> Result:
     """The run in memory; `facts` replace those of its provenance."""
     provenance = {
         "input": name,
@@ -79,9 +80,17 @@ def drawn_result(name: str = "video.mp4", **facts: Any) -> Reconstruction:
     } | facts
     # The pictures are drawn without a lamp.
     config, mesh, second = Config.load(settings={"fusion.colours": "raw"}), tube(), range(IN_RESULT + LOST, FRAMES)
-    other = Reconstruction(CAMERA, FrameTable.of(_row(index, 1) for index in second), mesh, config, provenance)
+    other = Result.in_memory(CAMERA, FrameTable.of(_row(index, 1) for index in second), mesh, config, provenance)
     frames = FrameTable.of(_row(index, 0) for index in range(FRAMES))
-    return Reconstruction(CAMERA, frames, mesh, config, provenance, others=[other])
+    return changed(Result.in_memory(CAMERA, frames, mesh, config, provenance), others=[other])
+
+
+def changed(result: Result, **parts: Any) -> Result:
+    """The result with parts replaced, by their names."""
+    found = copy(result)
+    for name, part in parts.items():
+        setattr(found, name, part)
+    return found
 
 
 def placed_frames(place: list[int], **columns: list[Any]) -> FrameTable:
@@ -117,7 +126,7 @@ def draw_run(
         kept.observe(Shown(frame))
     if pictures:
         kept.save(folder)
-    replace(drawn_result(name, **facts), states=states).save(folder)
+    changed(drawn_result(name, **facts), states=states).save(folder)
     return folder
 
 

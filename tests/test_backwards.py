@@ -9,7 +9,7 @@ import pytest
 from result_files import frame_rows
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
-from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap import open_sequence, reconstruct
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.tracking.causes import LossCause
@@ -17,6 +17,7 @@ from scopemap.engine.tracking.keyframe_alignment import Keyframe, KeyframeAligne
 from scopemap.engine.tracking.rtdl import Alignment
 from scopemap.engine.tracking.track import Track, TrackingLoss
 from scopemap.engine.tracking.tracker import Tracker
+from scopemap.result.result import Result
 
 FRAMES, LOST = 16, range(6, 9)
 LIGHT = {
@@ -32,7 +33,7 @@ def phantom(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny(tmp_path_factory.mktemp("backwards") / "phantom", frames=FRAMES)
 
 
-def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0), **changes: object) -> Reconstruction:
+def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0), **changes: object) -> Result:
     """Run while every pose of the frames `LOST`, and of that with which a map begins then, is refused the first time.
 
     twice : frames of which every pose is refused later, too.
@@ -57,12 +58,12 @@ def _run(phantom: Path, monkeypatch: pytest.MonkeyPatch, twice: range = range(0)
     return reconstruct(open_sequence(phantom), with_true_depth(phantom, **LIGHT | changes))
 
 
-def _rows(result: Reconstruction, folder: Path) -> list[dict[str, str]]:
+def _rows(result: Result, folder: Path) -> list[dict[str, str]]:
     result.save(folder)
     return frame_rows(folder)
 
 
-def _off(result: Reconstruction, phantom: Path, frames: range) -> tuple[float, float]:
+def _off(result: Result, phantom: Path, frames: range) -> tuple[float, float]:
     true, found = true_poses(phantom, frames[0]), result.trajectory.T_world_camera
     off = [inverse(true[k]) @ inverse(found[frames[0]]) @ found[k] for k in frames]
     turn = max(float(rotation_angle_rad(T[:3, :3])) for T in off)

@@ -17,7 +17,7 @@ from scopemap.engine.tracking.pyramid import build_pyramid
 from scopemap.engine.tracking.track import FrameTracker
 from scopemap.evaluation.poses import evaluate_poses
 from scopemap.input.opening import open_sequence
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.methods.baselines import SETTINGS, StandingStill, create_endo_depth_and_motion
@@ -34,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny(tmp_path_factory.mktemp("phantom"))
 
 
-def _run(folder: Path, tracker: FrameTracker) -> Reconstruction:
+def _run(folder: Path, tracker: FrameTracker) -> Result:
     return reconstruct(open_sequence(folder), with_true_depth(folder, **PLAIN), tracker=tracker)
 
 

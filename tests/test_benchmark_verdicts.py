@@ -16,7 +16,7 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Truth
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.input.camera_files.writing import write_calibration
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.evaluation.partial_truth import drift, pairs_in_order
 from scopemap_bench.scripts import measuring, verdicts
@@ -140,7 +140,7 @@ def test_a_part_of_the_table_is_run(
 
 
 def test_pairs_of_pixels_in_order(run: Path, tmp_path: Path) -> None:
-    folder, file = RunFolder(run), tmp_path / "pairs.csv"
+    folder, file = Result(run), tmp_path / "pairs.csv"
     depth_mm = folder.depth.read(0)
     assert depth_mm is not None
     height, width = depth_mm.shape

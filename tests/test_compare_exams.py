@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import Shown, drawn_result
+from drawn_run import Shown, changed, drawn_result
 from front_door import call, refused
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, pose, see
 
@@ -21,7 +20,7 @@ from scopemap.engine.geometry.se3 import so3_exp
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import FrameTable
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 CAMERA_FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 ANOTHER_WORLD = Similarity(1.3, so3_exp(np.array([0.2, -0.5, 0.9])), np.array([30.0, -8.0, 4.0]))
@@ -58,7 +57,7 @@ def examined(folder: Path, poses: list[np.ndarray], mesh: trimesh.Trimesh, world
     kept.save(folder)
     mesh.vertices = world.transform_points(np.asarray(mesh.vertices))
     facts = drawn_result(camera=CAMERA_FACTS | {"source": "calibration file camera.yaml"})
-    replace(facts, camera=CAMERA, source_camera=CAMERA, mesh=mesh, others=[], frames=FrameTable.of(iter(rows))).save(
+    changed(facts, camera=CAMERA, source_camera=CAMERA, mesh=mesh, others=[], frames=FrameTable.of(iter(rows))).save(
         folder
     )
     return folder
@@ -102,7 +101,7 @@ def test_a_spot_and_a_bump_are_the_changes(found: ExamComparison) -> None:
 
 
 def test_the_vertices_say_where_it_changed(runs: tuple[Path, Path], found: ExamComparison) -> None:
-    xy = np.asarray(RunFolder(runs[0]).mesh.vertices)[:, :2]
+    xy = np.asarray(Result(runs[0]).mesh.vertices)[:, :2]
     apart = np.min([np.linalg.norm(xy - middle, axis=1) for middle in (SPOT_MM, BUMP_MM)], axis=0)
     assert (found.compared[apart < 0.4 * RADIUS_MM] == 2).all()
     assert (found.compared[apart > 2 * RADIUS_MM] < 2).all()

@@ -6,14 +6,13 @@ import csv
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import CAMERA, drawn_result, tube
+from drawn_run import CAMERA, changed, drawn_result, tube
 from front_door import call, refused
 from test_true_surface import write_coverage
 
@@ -28,7 +27,7 @@ from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import FrameTable
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap_bench.scripts import coverage as scoring
 
 HOLE_AT, HOLE_CLOCK, HOLE_MM = 40.0, 3.0, 12.0
@@ -44,7 +43,7 @@ def write_run(folder: Path, mesh: trimesh.Trimesh, positions_mm: np.ndarray, **f
         rows.append({"index": index, "time_s": index / 10, "map": 0, "status": "ok", "T_world_camera": T})
     config = Config.load(settings={"fusion.voxel_mm": 0.8})
     facts = {"frames": len(rows)} | facts
-    replace(drawn_result(**facts), frames=FrameTable.of(rows), mesh=mesh, config=config, others=[]).save(folder)
+    changed(drawn_result(**facts), frames=FrameTable.of(rows), mesh=mesh, config=config, others=[]).save(folder)
     return folder
 
 
@@ -115,7 +114,7 @@ def test_the_map_has_the_hole_and_its_table(holed: Path, tmp_path: Path) -> None
 
 
 def test_the_views_of_a_wall_are_those_of_geometry(whole: Path) -> None:
-    run = RunFolder(whole)
+    run = Result(whole)
     views = views_of(run, run.mesh)
     middle = run.mesh.triangles_center
     ring = np.flatnonzero((np.abs(middle[:, 2] - 50) < 3) & (np.abs(middle[:, 0]) > 8))

@@ -13,7 +13,7 @@ from drawn_run import draw_run
 from front_door import refused
 
 from scopemap.engine.errors import InputError
-from scopemap.result.run_folder import read_mesh
+from scopemap.engine.fusion.mesh_files import read_mesh
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from tiny_phantom import FRAMES, only_images, write_tiny
 
-from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap import open_sequence, reconstruct
 from scopemap.apps.run.command import summary_lines
 from scopemap.engine.config import Config
 from scopemap.engine.frame import Frame
@@ -20,6 +20,7 @@ from scopemap.engine.notices import scale_words
 from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import write_previews
 from scopemap.result.depth_maps import DepthReader, DepthWriter
+from scopemap.result.result import Result
 
 UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
 
@@ -36,7 +37,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def result(images: Sequence, out: Path) -> Reconstruction:
+def result(images: Sequence, out: Path) -> Result:
     return reconstruct(images, Config.load(settings={"input.focal": "assume"}), out=out)
 
 
@@ -87,7 +88,7 @@ def test_previews_have_one_range_and_legend_for_all_frames_and_unknown_is_black(
     np.testing.assert_allclose(depth_mm[10:].min(), np.nanmin(_frame(images, 1, 40.0).depth_mm), atol=0.01)
 
 
-def test_a_scale_that_is_a_guess_is_said_everywhere(result: Reconstruction, out: Path) -> None:
+def test_a_scale_that_is_a_guess_is_said_everywhere(result: Result, out: Path) -> None:
     assert result.provenance["scale"] == {
         "known": False,
         "measured": False,
@@ -124,7 +125,7 @@ def test_what_is_anchored_is_known(images: Sequence, settings: dict[str, object]
     )
 
 
-def test_depth_of_a_run_of_unknown_scale_is_not_measured(images: Sequence, result: Reconstruction, out: Path) -> None:
+def test_depth_of_a_run_of_unknown_scale_is_not_measured(images: Sequence, result: Result, out: Path) -> None:
     settings = {"input.focal": "assume", "fusion.enabled": False, "depth.backend": f"files:{out / 'depth'}"}
     facts = reconstruct(images, Config.load(settings=settings)).provenance["scale"]
     assert facts == {"known": False, "measured": False, "stated": False, "source": "measured depth of unknown unit"}

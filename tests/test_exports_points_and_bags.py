@@ -24,7 +24,7 @@ from scopemap.apps.export.image_layouts import write_endonerf
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.geometry.rendering import render_mesh
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
 
@@ -45,7 +45,7 @@ def columns_of(file: Path) -> np.ndarray:
 
 
 def test_point_cloud(run: Path, tmp_path: Path) -> None:
-    mesh = RunFolder(run).mesh
+    mesh = Result(run).mesh
     mesh.vertex_attributes["sigma_mm"] = np.full(len(mesh.vertices), 2.0, np.float32)
     save_mesh(mesh, run / "mesh.ply")
     for kind in ("ply", "pointcloud"):
@@ -195,10 +195,9 @@ def test_endonerf(run: Path, tmp_path: Path) -> None:
 
 
 def test_endonerf_has_its_principal_point_in_the_middle(run: Path, tmp_path: Path) -> None:
-    from scopemap.runner.exported_run import read_exported
 
     lens = PinholeCamera(60.0, 48.0, 36.5, 29.0, 80, 64)
-    exported = read_exported(run)
+    exported = Result(run)
     exported.camera = lens
     write_endonerf(exported, tmp_path / "out")
     # What the run's picture shows at (u, v) is where a camera with one focal length, centred, has it.

@@ -13,7 +13,7 @@ from front_door import call, refused
 from scopemap.apps.view.fly_through import _centreline, _place_and_clock, smoothed_poses
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.report.films import write_turntable
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 
 def pictures_of(film: Path) -> list[np.ndarray]:
@@ -57,7 +57,7 @@ def test_a_painting_shines_through_half_with_a_legend(colours: str, tmp_path: Pa
 
 
 def test_the_clock_is_that_of_the_tube_and_the_place_grows_along_it(tmp_path: Path) -> None:
-    line, first = _centreline(RunFolder(draw_run(tmp_path / "run"))) or pytest.fail("it is a tube")
+    line, first = _centreline(Result(draw_run(tmp_path / "run"))) or pytest.fail("it is a tube")
     (near, hours), (far, _) = (_place_and_clock(line, first, se3(np.eye(3), np.array([0, 0, z]))) for z in (20.0, 40.0))
     assert far - near == pytest.approx(20, abs=2 * line.step_mm)
     # The first camera is upright, and looks along the tube: y is down.

@@ -19,7 +19,7 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.lesion_shape import LesionView, extents, view_shape
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import transform
-from scopemap.runner.exported_run import read_exported
+from scopemap.result.result import Result
 
 WALL_MM, RADIUS_MM = 40.0, 5.0
 WIDE = PinholeCamera(200.0, 200.0, 119.5, 95.5, 240, 192)
@@ -128,14 +128,14 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 def test_a_reference_beside_the_lesion_errs_less_than_its_frame(unknown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.apps.measure.measure._depth_errors", lambda *of: np.full(2, 0.1))
-    scale = known_scale(read_exported(unknown), Known(0, np.array([[10.0, 20], [10, 44]]), 5.0))
+    scale = known_scale(Result(unknown), Known(0, np.array([[10.0, 20], [10, 44]]), 5.0))
     of_frame, of_views = (np.log(changes.factors[1]) / SIGMAS for changes in (scale.changes, scale.from_views))
     picking = np.sqrt(2) / 24
     assert 0.99 * np.hypot(picking, 0.3 * 0.1 / np.sqrt(2)) < of_views < 0.07 < of_frame
 
 
 def test_a_mask_is_carried_to_the_other_frames(known: Path) -> None:
-    run = read_exported(known)
+    run = Result(known)
     carried = carried_masks(run, 2, patch(2))
     assert len(carried) >= 8
     for index in (0, 5, 8):
@@ -152,7 +152,7 @@ def test_frames_to_which_a_part_is_carried_do_not_count(known: Path, monkeypatch
 
 
 def test_what_is_in_front_ends_a_mask(known: Path) -> None:
-    run = read_exported(known)
+    run = Result(known)
     file = known / "depth" / "000005.png"
     kept = file.read_bytes()
     near = np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)) // 3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +12,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import CAMERA, drawn_result, tube
+from drawn_run import CAMERA, changed, drawn_result, tube
 from test_coverage import ALONG_THE_TUBE, without
 
 from scopemap.apps.coverage import live_map
@@ -24,7 +24,7 @@ from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import se3
 from scopemap.result.depth_maps import DepthReader, DepthWriter
 from scopemap.result.frame_table import FrameTable
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 
 NO_SURFACE = "the run so far has no surface"
 
@@ -49,9 +49,9 @@ class Drawn:
     def depth_writer(self, folder: Path) -> DepthWriter:
         return DepthWriter(folder)
 
-    def so_far(self, frames: FrameTable) -> tuple[Reconstruction, Volume | None]:
+    def so_far(self, frames: FrameTable) -> tuple[Result, Volume | None]:
         config = Config.load(settings={"fusion.voxel_mm": 0.8})
-        result = replace(drawn_result(), frames=frames, mesh=trimesh.Trimesh(), config=config, others=[])
+        result = changed(drawn_result(), frames=frames, mesh=trimesh.Trimesh(), config=config, others=[])
         return result, Volume(self.ahead_mm) if self.ahead_mm else None
 
 

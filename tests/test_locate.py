@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import Shown, drawn_result
+from drawn_run import Shown, changed, drawn_result
 from front_door import call, refused
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, pose, see
 
@@ -56,8 +56,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return FrameTable.of(row for row in rows if number == 0 or row["map"] == 1)
 
     facts = drawn_result(camera=CAMERA_FACTS | {"source": "calibration file camera.yaml"})
-    result = replace(facts, camera=CAMERA, source_camera=CAMERA, mesh=trimesh.Trimesh(), others=[])
-    replace(result, frames=table(0), others=[replace(result, frames=table(1))]).save(folder)
+    result = changed(facts, camera=CAMERA, source_camera=CAMERA, mesh=trimesh.Trimesh(), others=[])
+    changed(result, frames=table(0), others=[changed(result, frames=table(1))]).save(folder)
     return folder
 
 

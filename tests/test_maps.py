@@ -17,7 +17,7 @@ from front_door import said, warned
 from result_files import frame_rows
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
-from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap import open_sequence, reconstruct
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.config.mapping import MappingConstants
 from scopemap.engine.depth.mapis import Mapis
@@ -33,6 +33,7 @@ from scopemap.engine.tracking.relocalisation import Relocaliser
 from scopemap.engine.tracking.track import Track
 from scopemap.evaluation.poses import match, pose_report
 from scopemap.result.depth_maps import DepthReader
+from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.climb.submission import submission_problems, write_submission
 from scopemap_bench.datasets.c3vd import C3vdFolder
@@ -72,11 +73,11 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def result(spliced: Path, out: Path) -> Reconstruction:
+def result(spliced: Path, out: Path) -> Result:
     return reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT), out=out)
 
 
-def test_the_largest_submap_is_the_result_and_other_frames_are_lost_or_in_other_maps(result: Reconstruction) -> None:
+def test_the_largest_submap_is_the_result_and_other_frames_are_lost_or_in_other_maps(result: Result) -> None:
     rest = SECOND - LOST_BEFORE_NEW
     other = ["other-map"] * FIRST + ["lost"] * LOST_BEFORE_NEW
     assert result.frames["status"].tolist() == [*other, "initial", *["ok"] * (rest - 1)]
@@ -90,7 +91,7 @@ def test_the_largest_submap_is_the_result_and_other_frames_are_lost_or_in_other_
     assert any(text.startswith("2 submaps") for text in warned(result.provenance))
 
 
-def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstruction, spliced: Path) -> None:
+def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Result, spliced: Path) -> None:
     begin = FIRST + LOST_BEFORE_NEW
     poses = result.trajectory.T_world_camera
     assert np.isnan(poses[:begin]).all()
@@ -100,7 +101,7 @@ def test_the_kept_map_is_right_and_its_world_is_its_first_frame(result: Reconstr
     assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.5
 
 
-def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: Path, out: Path) -> None:
+def test_the_smaller_submap_is_saved_beside_it(result: Result, spliced: Path, out: Path) -> None:
     (other,) = result.others
     assert other.frames["index"].tolist() == list(range(FIRST))
     assert set(other.frames["map"].tolist()) == {1}
@@ -120,7 +121,7 @@ def test_the_smaller_submap_is_saved_beside_it(result: Reconstruction, spliced: 
     np.testing.assert_allclose(mesh.bounds, other.mesh.bounds, atol=1e-3)
 
 
-def test_each_submap_of_a_run_is_exported_to_climb(result: Reconstruction, out: Path, tmp_path: Path) -> None:
+def test_each_submap_of_a_run_is_exported_to_climb(result: Result, out: Path, tmp_path: Path) -> None:
     write_submission(out, tmp_path, "Seq_001_a")
     assert submission_problems(tmp_path) == []
     found = read_trajectory(tmp_path / "Seq_001_a" / "5")
@@ -142,7 +143,7 @@ def test_overwriting_removes_saved_submaps(spliced: Path, out: Path, tmp_path: P
     assert not (tmp_path / "out" / "maps").exists()
 
 
-def test_frames_that_are_fused_as_they_come_are_fused_by_map(spliced: Path, result: Reconstruction) -> None:
+def test_frames_that_are_fused_as_they_come_are_fused_by_map(spliced: Path, result: Result) -> None:
     at_once = {"mapping__method": "none", "fusion__voxel_mm": 1.0, "fusion__truncation_mm": 4.0}
     live = reconstruct(open_sequence(spliced), with_true_depth(spliced, **LIGHT, **at_once))
     assert live.frames["status"].tolist() == result.frames["status"].tolist()

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from spied_depth import SpyDepth, spied
 from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth, write_tiny
 
-from scopemap import Config, Reconstruction, open_sequence, reconstruct
+from scopemap import Config, Result, open_sequence, reconstruct
 from scopemap.engine.config import PRESETS
 from scopemap.engine.errors import WeightsError
 from scopemap.engine.frame import Frame
@@ -58,11 +58,11 @@ def _approach(folder: Path, step_mm: float) -> Path:
     return folder
 
 
-def _status(result: Reconstruction) -> list[str]:
+def _status(result: Result) -> list[str]:
     return result.trajectory.status.tolist()
 
 
-def _position_errors_mm(result: Reconstruction, folder: Path) -> np.ndarray:
+def _position_errors_mm(result: Result, folder: Path) -> np.ndarray:
     return np.linalg.norm(result.trajectory.positions_mm - true_poses(folder)[:, :3, 3], axis=1)
 
 

@@ -11,12 +11,13 @@ import pytest
 from front_door import said
 from tiny_phantom import true_poses, with_true_depth, write_tiny
 
-from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap import open_sequence, reconstruct
 from scopemap.engine.config import Config
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.odometry import Step
 from scopemap.engine.preprocessing import Estimators
 from scopemap.result.depth_maps import DepthReader
+from scopemap.result.result import Result
 from scopemap.runner.estimators import create_estimators
 
 LOST, FRAMES = 8, 14
@@ -45,8 +46,8 @@ class _Run:
     phantom: Path
     out: Path
     steps: list[Step]
-    adjusted: Reconstruction
-    tracked: Reconstruction
+    adjusted: Result
+    tracked: Result
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
     return _Run(phantom, folder / "out", steps, adjusted, tracked)
 
 
-def _rotation_errors_rad(result: Reconstruction, phantom: Path) -> np.ndarray:
+def _rotation_errors_rad(result: Result, phantom: Path) -> np.ndarray:
     poses, tracked = result.trajectory.T_world_camera, result.trajectory.tracked
     return rotation_angle_rad((inverse(poses[tracked]) @ true_poses(phantom)[tracked])[:, :3, :3])
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap_bench.scripts import real
 
 
@@ -20,18 +20,18 @@ def _pairs(*factors: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def test_a_depth_of_another_scale_is_right_in_one_scale(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(real, "depth_pairs", lambda run, truth: _pairs(2, 2, 2, 2, 2))
-    found = real.depth_figures(RunFolder(tmp_path), tmp_path, None)
+    found = real.depth_figures(Result(tmp_path), tmp_path, None)
     assert found["abs_rel"] == pytest.approx(0, abs=1e-9)
     assert found["one_scale"] == pytest.approx(0, abs=1e-9)
     assert found["correlation"] == pytest.approx(1)
     assert found["spread"] == pytest.approx(0, abs=1e-9)
     # In the scale of a path that says that the run's millimetres are right, it is twice as deep.
-    assert real.depth_figures(RunFolder(tmp_path), tmp_path, 1.0)["one_scale"] == pytest.approx(1)
+    assert real.depth_figures(Result(tmp_path), tmp_path, 1.0)["one_scale"] == pytest.approx(1)
 
 
 def test_a_scale_that_changes_from_frame_to_frame_is_seen(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(real, "depth_pairs", lambda run, truth: _pairs(0.9, 1.0, 1.1))
-    found = real.depth_figures(RunFolder(tmp_path), tmp_path, None)
+    found = real.depth_figures(Result(tmp_path), tmp_path, None)
     assert found["abs_rel"] == pytest.approx(0, abs=1e-9)
     assert found["spread"] == pytest.approx(np.std(np.log([0.9, 1.0, 1.1])))
     assert found["one_scale"] == pytest.approx(0.2 / 3)
@@ -40,7 +40,7 @@ def test_a_scale_that_changes_from_frame_to_frame_is_seen(monkeypatch: pytest.Mo
 def test_an_inside_out_depth_has_the_opposite_correlation(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     true_mm = np.exp(np.linspace(3, 4, 600)).reshape(20, 30)
     monkeypatch.setattr(real, "depth_pairs", lambda run, truth: [(np.exp(7) / true_mm, true_mm)])
-    assert real.depth_figures(RunFolder(tmp_path), tmp_path, None)["correlation"] == pytest.approx(-1)
+    assert real.depth_figures(Result(tmp_path), tmp_path, None)["correlation"] == pytest.approx(-1)
 
 
 @pytest.mark.real

@@ -12,11 +12,12 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from drawn_run import changed
 from front_door import said, warned
 from result_files import frame_rows
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
-from scopemap import Reconstruction, open_sequence, reconstruct
+from scopemap import Result, open_sequence, reconstruct
 from scopemap.engine.cameras.camera import source_pixel
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError
@@ -26,7 +27,6 @@ from scopemap.engine.odometry import Step
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.sequence import Sequence
 from scopemap.result.depth_maps import DEPTH_SCALE_MM, DepthReader, DepthWriter
-from scopemap.result.run_folder import RunFolder
 from scopemap.result.trajectories import read_trajectory
 from scopemap.result.verdict import verdict
 
@@ -41,7 +41,7 @@ STORED = 1.6e-4  # relative error of depth in the frame store
 class _Run:
     phantom: Path
     out: Path
-    result: Reconstruction
+    result: Result
     steps: list[Step]
 
 
@@ -80,7 +80,7 @@ def test_frames_table(run: _Run) -> None:
 
 
 def test_the_folder_is_read_back_and_its_table_written_the_same(run: _Run, tmp_path: Path) -> None:
-    folder = RunFolder(run.out).checked()
+    folder = Result(run.out).checked()
     folder.frames.write(tmp_path / "again.csv")
     assert (tmp_path / "again.csv").read_bytes() == (run.out / "frames.csv").read_bytes()
     np.testing.assert_allclose(folder.camera.matrix, run.result.camera.matrix)
@@ -177,14 +177,14 @@ def test_provenance(run: _Run) -> None:
 
 
 def test_the_verdict_is_a_field_and_that_of_the_report(run: _Run) -> None:
-    found, stated = verdict(RunFolder(run.out)), run.result.verdict
+    found, stated = verdict(Result(run.out)), run.result.verdict
     assert stated is not None
     assert stated == (found.level, tuple(reason.code for reason in found.reasons))
     facts = json.loads((run.out / "provenance.json").read_text())["verdict"]
     assert (facts["level"], facts["word"]) == (found.level, found.word)
     assert stated.level == "bad"
     assert {"code": "frames-too-few", "level": "bad"} in facts["reasons"]
-    assert replace(run.result, provenance={}).verdict is None
+    assert changed(run.result, provenance={}).verdict is None
 
 
 def test_a_result_in_memory_can_be_saved_later(run: _Run, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 from front_door import warned
 from tiny_phantom import write_tiny
 
-from scopemap import Config, CustomDepth, Reconstruction, Reconstructor, open_sequence, reconstruct
+from scopemap import Config, CustomDepth, Reconstructor, Result, open_sequence, reconstruct
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.frame import Frame
@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny(tmp_path_factory.mktemp("steps") / "phantom", frames=FRAMES)
 
 
-def _assert_equal(one: Reconstruction, other: Reconstruction) -> None:
+def _assert_equal(one: Result, other: Result) -> None:
     np.testing.assert_array_equal(one.trajectory.T_world_camera, other.trajectory.T_world_camera)
     np.testing.assert_array_equal(one.mesh.vertices, other.mesh.vertices)
     np.testing.assert_array_equal(one.mesh.faces, other.mesh.faces)

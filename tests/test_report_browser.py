@@ -22,7 +22,7 @@ from scopemap.apps.measure.measure import measure
 from scopemap.engine.errors import InputError
 from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.report.page import keep_measurements, serve_view, write_comparison, write_report
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -166,7 +166,7 @@ def test_a_lost_frame_says_so(browser: Any, report: Path) -> None:
 def test_a_frame_without_a_picture_shows_one_of_its_own_submap(browser: Any, tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
     for index in (IN_RESULT, *range(IN_RESULT - 2, IN_RESULT)):
-        RunFolder(folder).picture_file(index).unlink()  # then the nearest to the last of the result is of a lost frame
+        Result(folder).picture_file(index).unlink()  # then the nearest to the last of the result is of a lost frame
     opened = Opened(browser, write_report(folder)[0])
     opened.slide(IN_RESULT - 1)
     assert opened.text("#video-note") == f"of frame {IN_RESULT - 3}"

@@ -6,7 +6,6 @@ import json
 import os
 import re
 from base64 import b64decode
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, draw_run, drawn_result, pose_of, tube
+from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, changed, draw_run, drawn_result, pose_of, tube
 
 from scopemap.apps.run.command import _time_words
 from scopemap.report.frame_pictures import FramePictures
@@ -22,7 +21,7 @@ from scopemap.report.notebook import in_one_line
 from scopemap.report.page import page_html, write_comparison, write_report
 from scopemap.report.page_data import page_data, shown_meshes
 from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.verdict import frames_per_s
 
 
@@ -66,7 +65,7 @@ def test_every_frame_is_on_the_page_with_its_pose_and_place(page: str) -> None:
 def test_the_meshes_are_those_of_the_run(page: str, folder: Path) -> None:
     maps = shown(page)["maps"]
     assert [one["frames"] for one in maps] == [IN_RESULT, IN_FIRST_MAP]
-    mesh = RunFolder(folder).mesh
+    mesh = Result(folder).mesh
     low, high = np.array(maps[0]["low"]), np.array(maps[0]["high"])
     positions = low + numbers(maps[0]["positions"], "u2").reshape(-1, 3) / 65535 * (high - low)
     np.testing.assert_allclose(positions, mesh.vertices, atol=1e-3)
@@ -77,9 +76,9 @@ def test_the_meshes_are_those_of_the_run(page: str, folder: Path) -> None:
 
 def test_pictures_and_depth_are_those_of_the_frames(page: str, folder: Path) -> None:
     data = shown(page)
-    assert [picture["row"] for picture in data["pictures"]] == RunFolder(folder).pictured == list(range(FRAMES))
+    assert [picture["row"] for picture in data["pictures"]] == Result(folder).pictured == list(range(FRAMES))
     coded = cv2.imdecode(np.frombuffer(b64decode(data["pictures"][3]["depth"]), np.uint8), cv2.IMREAD_COLOR)
-    depth = RunFolder(folder).depth.read(3)
+    depth = Result(folder).depth.read(3)
     assert depth is not None
     assert coded is not None
     units = coded[..., 2].astype(np.float32) * 256 + coded[..., 1]
@@ -111,7 +110,7 @@ def test_frames_names_may_be_anything_that_files_names_are(tmp_path: Path, name:
     result = drawn_result()
     result.frames.rows["name"] = os.fsdecode(name)
     result.save(tmp_path)
-    frames = RunFolder(tmp_path).frames
+    frames = Result(tmp_path).frames
     assert frames["name"].tolist() == [kept_name] * FRAMES
     assert (frames.place == 0).sum() == IN_RESULT
 
@@ -121,17 +120,17 @@ def test_a_long_run_stays_small(tmp_path: Path) -> None:
     for index in range(450):
         pictures.put(index, noise, np.ones((256, 320), bool))
     pictures.save(tmp_path)
-    kept = RunFolder(tmp_path).pictured
+    kept = Result(tmp_path).pictured
     assert kept == list(range(0, 450, 8))
     fewer = FramePictures()
     fewer.put(3, noise, np.ones((256, 320), bool))
     fewer.save(tmp_path / "again")
     pictures.save(tmp_path / "again")
-    assert RunFolder(tmp_path / "again").pictured == kept
-    assert len(RunFolder(tmp_path).measures) == 450
-    run = RunFolder(draw_run(tmp_path / "run"))
+    assert Result(tmp_path / "again").pictured == kept
+    assert len(Result(tmp_path).measures) == 450
+    run = Result(draw_run(tmp_path / "run"))
     for index in range(FRAMES):  # the heaviest pictures that there are
-        run.picture_file(index).write_bytes(RunFolder(tmp_path).picture_file(0).read_bytes())
+        run.picture_file(index).write_bytes(Result(tmp_path).picture_file(0).read_bytes())
     share = page_data(run, shown_meshes(run, 1000), share=0.05)
     assert 0 < len(share["pictures"]) < FRAMES
     assert len(json.dumps(share["pictures"])) < 0.05 * 12e6
@@ -181,7 +180,7 @@ def test_truth_is_shown_where_it_is_known(tmp_path: Path) -> None:
         row[1, 3] += 0.3 * i**1.5
     # C3VD's form: one pose a line, column by column.
     (truth / "pose.txt").write_text("\n".join(" ".join(f"{v:.9f}" for v in row.T.ravel()) for row in rows))
-    run = RunFolder(draw_run(tmp_path / "run", name=str(truth)))
+    run = Result(draw_run(tmp_path / "run", name=str(truth)))
     found = page_data(run, shown_meshes(run, 1000))["truth"]
     assert found is not None
     assert numbers(found["positions"], "f4").size == 3 * IN_RESULT
@@ -206,7 +205,7 @@ def test_summary_picture_has_the_verdicts_colour_frames_and_the_mesh(page: str, 
     picture = cv2.imread(str(folder / "summary.png"))[..., ::-1].astype(int)
     assert picture.shape[1] == 1596
     assert np.abs(picture[2, 100] - (163, 90, 0)).max() < 3  # doubtful: 14 of 24 frames
-    frame = cv2.imread(str(RunFolder(folder).picture_file(0)))[..., ::-1].astype(int)
+    frame = cv2.imread(str(Result(folder).picture_file(0)))[..., ::-1].astype(int)
     corner = picture[104 + 26 : 104 + 26 + 307, 12 : 12 + 384]
     assert np.abs(corner.mean((0, 1)) - frame.mean((0, 1))).max() < 6
     mesh_row = picture[-400 - 410 : -410]
@@ -238,24 +237,24 @@ def test_prompt_and_report_tell_one_speed(folder: Path) -> None:
     result.provenance["resumed_after_frame"] = None
     assert frames_per_s(result) == 24 / 12
     assert _time_words(result) == "time: 20.0 s, 2.0 frames/s"
-    run = RunFolder(folder)
+    run = Result(folder)
     assert page_data(run, shown_meshes(run, 1000))["frames_per_s"] == frames_per_s(run)
     result.provenance["resumed_after_frame"] = int(result.frames["index"][11])
     assert frames_per_s(result) == 1.0
-    assert frames_per_s(replace(result, provenance={})) is None
+    assert frames_per_s(changed(result, provenance={})) is None
 
 
 def test_a_result_shows_itself_in_a_notebook_and_in_one_line(folder: Path) -> None:
     result = drawn_result(name="<b>video</b>.mp4")
     assert repr(result) == in_one_line(result)
     assert repr(result) == (
-        "<Reconstruction, doubtful: 14 of 24 frames in one map; beside it 1 submap (1 not usable); scale unknown; "
+        "<Result, doubtful: 14 of 24 frames in one map; beside it 1 submap (1 not usable); scale unknown; "
         "surface covers 94 % of its own pictures, not of the organ>"
     )
     assert "7 of 7 frames in one map" in repr(result.others[0])
     html = result._repr_html_()
-    assert "&lt;Reconstruction" in html
-    assert "<Reconstruction" not in html
+    assert "&lt;Result" in html
+    assert "<Result" not in html
     content = b64decode(re.findall(r"data:image/jpeg;base64,([^\"]+)", html)[0])
     inline = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).astype(int)
     written = cv2.imread(str(folder / "summary.png")).astype(int)

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import trimesh
-from drawn_run import CAMERA, GOOD_SURFACE, placed_frames, tube
+from drawn_run import CAMERA, GOOD_SURFACE, changed, placed_frames, tube
 
 from scopemap.engine.config import Config
 from scopemap.engine.notices import KINDS, Notice, fields_of_kind, notices_of
 from scopemap.result import verdict as rules
 from scopemap.result.frame_table import LOST, NOT_USED
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.result.verdict import verdict
 
@@ -25,16 +24,16 @@ DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "report.md"
 
 def run_of(
     place: list[int], *, mesh: trimesh.Trimesh | None = None, shares: list[float] | None = None, **facts: Any
-) -> Reconstruction:
+) -> Result:
     provenance = {
         "camera": {"source": "calibration file camera.yaml", "origin": "calibrated"},
         "surface": GOOD_SURFACE,
     } | facts
     columns = {} if shares is None else {"inlier_share": shares}
-    one = Reconstruction(
+    one = Result.in_memory(
         CAMERA, placed_frames(place, **columns), tube() if mesh is None else mesh, Config(), provenance
     )
-    return replace(one, others=[one] * max(*place, 0))
+    return changed(one, others=[one] * max(*place, 0))
 
 
 def surface(**figures: float) -> dict[str, float]:
@@ -108,8 +107,8 @@ def test_the_share_of_frames_in_the_result(inside: int, word: str) -> None:
 def test_submaps_of_three_seconds_that_are_usable_stand_for_their_part(apart: int, level: str, word: str) -> None:
     """At ten frames a second; 40 of 80 frames are in the result."""
     run = run_of([0] * 40 + [1] * apart + [LOST] * (40 - apart))
-    other = replace(run.others[0], provenance={"verdict": {"level": level}})
-    found = verdict(replace(run, others=[other]))
+    other = changed(run.others[0], provenance={"verdict": {"level": level}})
+    found = verdict(changed(run, others=[other]))
     assert found.word == word
     assert f"40 of 80 frames in one map; beside it 1 submap (1 {rules.WORDS[level]}); " in found.sentence
 
@@ -184,7 +183,7 @@ def test_where_the_motion_determines_the_shape_triangulation_need_not() -> None:
     assert verdict(run_of([0] * 60, **notices(few, decided))).word == "good"
 
 
-def run_of_submaps(*submaps: tuple[int, int, float]) -> Reconstruction:
+def run_of_submaps(*submaps: tuple[int, int, float]) -> Result:
     """A run of submaps: number of the map, its frames, and their inlier share; in the order of the frames."""
     place = [number for number, frames, _ in submaps for _ in range(frames)]
     return run_of(place, shares=[share for _, frames, share in submaps for _ in range(frames)])

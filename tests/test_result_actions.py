@@ -11,7 +11,7 @@ from drawn_run import draw_run, draw_run_of_frames, drawn_result
 from front_door import call
 from test_lesion import patch
 
-from scopemap import Reconstruction, RunFolder
+from scopemap import Result
 from scopemap.engine.errors import InputError, SettingsError
 
 REFERENCE = [(30.0, 20.0), (48.0, 20.0)]
@@ -19,11 +19,10 @@ REFERENCE = [(30.0, 20.0), (48.0, 20.0)]
 
 def test_sizes_are_those_of_the_command(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     run = draw_run(tmp_path / "run")
-    opened, in_memory = RunFolder(run), drawn_result().kept_in(run)
+    opened = Result(run)
     assert call("measure", run, "--frame", 2, "--points", "20,20 40,40", "--reference", "30,20 48,20", "--json") == 0
     said = json.loads(capfd.readouterr().out)
-    for result in (opened, in_memory):
-        assert [vars(one) for one in result.measure(2, [(20, 20), (40, 40)], REFERENCE)] == said
+    assert [vars(one) for one in opened.measure(2, [(20, 20), (40, 40)], REFERENCE)] == said
     found = opened.measure_lesion(patch(2), 2, reference=REFERENCE, reference_mm=8)
     assert [one.unit for one in found.measures] == ["mm", "mm", "mm", "mm2", "mm"]
     assert 2 in found.masks
@@ -35,23 +34,23 @@ def test_sizes_are_those_of_the_command(tmp_path: Path, capfd: pytest.CaptureFix
 
 def test_a_submap_answers_for_its_own_folder(tmp_path: Path) -> None:
     run = draw_run(tmp_path / "run")
-    [other] = drawn_result().kept_in(run).others
+    [other] = Result(run).others
     assert other.path == run / "maps" / "1"
     area = [(20, 20), (40, 20), (40, 40)]
-    of_folder = RunFolder(run / "maps" / "1").measure(20, area, REFERENCE)
+    of_folder = Result(run / "maps" / "1").measure(20, area, REFERENCE)
     assert other.measure(20, area, REFERENCE) == of_folder
     with pytest.raises(InputError, match="maps/1"):
-        RunFolder(run).measure(20, area, REFERENCE)
+        Result(run).measure(20, area, REFERENCE)
 
 
 def test_frames_are_located_by_a_folder_of_them(tmp_path: Path) -> None:
-    found = RunFolder(draw_run_of_frames(tmp_path)).locate(tmp_path / "frames")
+    found = Result(draw_run_of_frames(tmp_path)).locate(tmp_path / "frames")
     assert [one.index for one in found] == list(range(24))
 
 
 @pytest.mark.parametrize("name", ["coverage", "measure", "measure_lesion", "locate"])
 def test_a_result_in_memory_knows_no_depth(name: str) -> None:
     arguments = {"coverage": (), "measure": (0, REFERENCE), "measure_lesion": (REFERENCE, 0), "locate": ("a.mp4",)}
-    result: Reconstruction = drawn_result()
+    result: Result = drawn_result()
     with pytest.raises(InputError, match="in memory alone"):
         getattr(result, name)(*arguments[name])

@@ -14,7 +14,7 @@ import pytest
 from front_door import call, refused, warned
 from tiny_phantom import FRAMES, write_tiny
 
-from scopemap import Config, Reconstruction, open_sequence, reconstruct
+from scopemap import Config, Result, open_sequence, reconstruct
 from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.frame_store import StoredFile
 from scopemap.engine.odometry import Step
@@ -49,7 +49,7 @@ def whole(request: pytest.FixtureRequest, folder: Path, tmp_path_factory: pytest
     return request.param, out
 
 
-def _run(folder: Path, out: Path, preset: Any, **options: Any) -> Reconstruction:
+def _run(folder: Path, out: Path, preset: Any, **options: Any) -> Result:
     return reconstruct(open_sequence(folder), Config.load(preset), out=out, **options)
 
 

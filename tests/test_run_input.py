@@ -15,7 +15,7 @@ from tiny_phantom import only_images, write_tiny
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.rendering import render_mesh
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.run_input import find_input, stated_input
 from scopemap.runner.reread_frames import reread_frames
 
@@ -76,7 +76,7 @@ def test_a_run_states_its_input_by_three_paths_and_its_content(tmp_path: Path, m
     monkeypatch.chdir(tmp_path)
     config = Config.load("realtime", settings={"input.focal": "assume"})
     reconstruct(open_sequence("images"), config, out="out/run")
-    facts = RunFolder("out/run").provenance
+    facts = Result("out/run").provenance
     assert (facts["input"], facts["input_relative"]) == ("images", str(Path("../../images")))
     assert facts["input_absolute"] == str(tmp_path / "images")
     monkeypatch.chdir("/")
@@ -107,7 +107,7 @@ def test_the_pictures_of_a_run_serve_where_its_input_is_gone(tmp_path: Path) -> 
     expected = np.isfinite(drawn.depth_mm)
     expected[:, :4] = False
     np.testing.assert_array_equal(found[3].valid, expected)
-    RunFolder(run).picture_file(FRAMES - 1).unlink()
+    Result(run).picture_file(FRAMES - 1).unlink()
     with pytest.raises(InputError, match=r"frames/ has no picture of 1 of the 2 frames"):
         list(reread_frames(run, {3, FRAMES - 1}))
     facts = json.loads((run / "provenance.json").read_text())

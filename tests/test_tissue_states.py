@@ -17,13 +17,13 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.agreement import surface_agreement, vertex_sigmas
-from scopemap.engine.fusion.mesh_files import T_GLTF_WORLD, save_mesh_over_time
+from scopemap.engine.fusion.mesh_files import T_GLTF_WORLD, read_mesh, save_mesh_over_time
 from scopemap.engine.fusion.reference_state import SurfaceState, in_surface_state
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.engine.mapping.tissue_states import TISSUE_MOTION, TissueStates
 from scopemap.report.page_data import page_data, shown_meshes
-from scopemap.result.run_folder import RunFolder, read_mesh
+from scopemap.result.result import Result
 
 CAMERA = PinholeCamera(100.0, 100.0, 79.5, 63.5, 160, 128)
 Z_MM = 50.0
@@ -106,7 +106,7 @@ def test_the_surface_is_in_the_most_usual_state_or_that_of_a_second() -> None:
 
 def test_a_result_keeps_its_states(tmp_path: Path) -> None:
     states = wavering()
-    run = RunFolder(draw_run(tmp_path, states=states))
+    run = Result(draw_run(tmp_path, states=states))
     assert run.states is not None
     for name, values in vars(states).items():
         np.testing.assert_array_equal(getattr(run.states, name), values)
@@ -116,10 +116,10 @@ def test_a_result_keeps_its_states(tmp_path: Path) -> None:
     assert "changes" not in shown[1]
     (tmp_path / TISSUE_MOTION).write_bytes(b"damaged")
     with pytest.raises(InputError, match=TISSUE_MOTION):
-        assert RunFolder(tmp_path).states
+        assert Result(tmp_path).states
     np.savez(tmp_path / TISSUE_MOTION, **(vars(states) | {"modes": states.modes[:, 1:]}))
     with pytest.raises(InputError, match="damaged"):
-        assert RunFolder(tmp_path).states
+        assert Result(tmp_path).states
 
 
 def test_other_programs_read_the_surface_over_time(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_the_surface_of_each_frame_is_exported(tmp_path: Path) -> None:
     export_run(run, "surfaces", tmp_path / "out", unit="m", axes="ras")
     assert len(list((tmp_path / "out").iterdir())) == IN_RESULT
     read = read_mesh(tmp_path / "out" / "000005.ply")
-    wanted = states.moved(RunFolder(run).mesh, 5).vertices * [-0.001, -0.001, 0.001]
+    wanted = states.moved(Result(run).mesh, 5).vertices * [-0.001, -0.001, 0.001]
     assert np.asarray(read.vertices) == pytest.approx(wanted, abs=1e-6)
     with pytest.raises(InputError, match="at rest"):
         export_run(draw_run(tmp_path / "rigid"), "surfaces", tmp_path / "none")

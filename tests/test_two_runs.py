@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_run import IN_RESULT, drawn_result
+from drawn_run import IN_RESULT, changed, drawn_result
 from front_door import call, refused
 
 from scopemap.engine.geometry.align import Similarity
@@ -26,19 +25,19 @@ def write(folder: Path, *, wider: float = 1.0, frames: slice = slice(None), stra
     if straight:
         table.rows["T_world_camera"][:, :2, 3] *= np.where(np.isnan(table.rows["T_world_camera"][:, :2, 3]), 1, 0)
     mesh.vertices[:, :2] *= wider
-    replace(result, frames=table, mesh=mesh).save(folder)
+    changed(result, frames=table, mesh=mesh).save(folder)
     return folder
 
 
 def move(folder: Path, source: Path) -> Path:
     """The run in `source` in another world and scale."""
-    from scopemap.result.run_folder import RunFolder
+    from scopemap.result.result import Result
 
-    run, result = RunFolder(source), drawn_result()
+    run, result = Result(source), drawn_result()
     table, mesh = FrameTable(run.frames.rows.copy()), run.mesh.copy()
     table.rows["T_world_camera"] = OTHER_WORLD.transform_poses(table.rows["T_world_camera"])
     mesh.vertices = OTHER_WORLD.transform_points(np.asarray(mesh.vertices))
-    replace(result, frames=table, mesh=mesh).save(folder)
+    changed(result, frames=table, mesh=mesh).save(folder)
     return folder
 
 

@@ -7,7 +7,7 @@
 >>> result.mesh.export("surface.stl")
 >>> print(evaluate_poses(result.trajectory, read_trajectory("truth.txt"), "sim3")["ate_rmse_mm"])
 
-A result is opened again by `RunFolder("result")`; both say what was not seen, how large something is and where another
+A result is opened again by `Result("result")`. It says what was not seen, how large something is and where another
 video is (`result.coverage()`, `measure`, `measure_lesion`, `locate`). `Reconstructor` takes frames one at a time. The
 command line is `scopemap`; docs/ has the rest. Phantoms with exact truth: `from scopemap_bench import PhantomSpec,
 write_phantom`.
@@ -97,8 +97,7 @@ if TYPE_CHECKING:
     from scopemap.evaluation.poses import evaluate_poses
     from scopemap.input.opening import open_sequence
     from scopemap.input.trajectory.trajectory import Trajectory
-    from scopemap.result.reconstruction import Reconstruction
-    from scopemap.result.run_folder import RunFolder
+    from scopemap.result.result import Result
     from scopemap.result.trajectories import read_trajectory
     from scopemap.runner.reconstruct import reconstruct
     from scopemap.runner.reconstructor import Reconstructor
@@ -107,9 +106,8 @@ __all__ = [
     "Config",
     "CustomDepth",
     "Frame",
-    "Reconstruction",
     "Reconstructor",
-    "RunFolder",
+    "Result",
     "ScopemapError",
     "Trajectory",
     "__version__",
@@ -123,9 +121,8 @@ _HOMES = {
     "Config": "engine.config",
     "Frame": "engine.frame",
     "CustomDepth": "engine.depth.custom",
-    "Reconstruction": "result.reconstruction",
     "Reconstructor": "runner.reconstructor",
-    "RunFolder": "result.run_folder",
+    "Result": "result.result",
     "ScopemapError": "engine.errors",
     "Trajectory": "input.trajectory.trajectory",
     "evaluate_poses": "evaluation.poses",
@@ -144,9 +141,6 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'scopemap' has no attribute '{name}'")
     from importlib import import_module
-
-    if name in ("Reconstruction", "Reconstructor", "reconstruct"):
-        import_module("scopemap.report.notebook")  # results then show their verdict
 
     return getattr(import_module(f"scopemap.{_HOMES[name]}"), name)
 

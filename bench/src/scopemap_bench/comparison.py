@@ -19,6 +19,7 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import MaskSettings
 from scopemap.engine.errors import AlignmentError, InputError
 from scopemap.engine.frame import Frame, Truth
+from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.se3 import inverse, se3, transform
 from scopemap.engine.masking.masker import Masker
 from scopemap.evaluation.poses import match
@@ -26,7 +27,7 @@ from scopemap.input.sequence import Sequence as Frames
 from scopemap.input.trajectory.trajectory import Unit
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.reference import read_reference, reference_trajectory
-from scopemap.result.run_folder import RunFolder, read_mesh
+from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reread_frames import open_truth
 from scopemap_bench import pictures
@@ -304,7 +305,7 @@ def _frames(path: Path, truth: Path) -> Frames | None:
 def _timing(path: Path) -> dict[str, float]:
     """Return the times of a run's provenance; {} where there are none."""
     try:
-        seconds = RunFolder(path).provenance["seconds"].items()
+        seconds = Result(path).provenance["seconds"].items()
         return {f"seconds_{stage.replace(' ', '_')}": float(s) for stage, s in seconds}
     except (InputError, ValueError, KeyError, TypeError, AttributeError):
         return {}

@@ -13,6 +13,7 @@ from scopemap.engine.config import MaskSettings
 from scopemap.engine.errors import AlignmentError, InputError
 from scopemap.engine.flow.estimator import FlowEstimator, pair_flow
 from scopemap.engine.flow.flows import create_flow
+from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.align import AlignMode, Similarity
 from scopemap.engine.masking.masker import Masker
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
@@ -21,7 +22,6 @@ from scopemap.input.sequence import Sequence
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.reference import reference_trajectory
-from scopemap.result.run_folder import read_mesh
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reread_frames import is_camera_of, open_truth
 from scopemap_bench.climb.submission import with_score

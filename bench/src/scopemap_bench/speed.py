@@ -66,7 +66,7 @@ STAGES: dict[str, tuple[str, ...]] = {
         "engine.mapping.multiview_depth:propagate_depth",
     ),
     "fusion": ("engine.fusion.surface_fusion:TsdfVolume.integrate",),
-    "writing": ("result.depth_maps:DepthWriter.__call__", "result.reconstruction:Reconstruction.save"),
+    "writing": ("result.depth_maps:DepthWriter.__call__", "result.result:Result.save"),
 }
 """Functions, "module:name" in the package, whose processor time is a stage's; the rest is that of the run's parts."""
 

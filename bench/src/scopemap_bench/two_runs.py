@@ -21,7 +21,7 @@ from scopemap.input.trajectory.trajectory import path_length_mm
 from scopemap.report.mesh_figures import draw_trajectories
 from scopemap.report.page import PAGE, write_comparison
 from scopemap.report.sheet import picture_grid
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 _LEAST_COMMON = 3
 _MOST_VIEWS, _DRAWN = 16, 3
@@ -105,7 +105,7 @@ def compare_two(
     too, scale and place by their positions. Raises `InputError` where they are no finished runs, `AlignmentError` where
     they have fewer than three frames in common.
     """
-    runs = RunFolder(first).checked(), RunFolder(second).checked()
+    runs = Result(first).checked(), Result(second).checked()
     tables = [run.frames.only(run.frames.tracked) for run in runs]
     common, *rows = np.intersect1d(tables[0]["index"], tables[1]["index"], return_indices=True)
     if len(common) < _LEAST_COMMON:
@@ -150,7 +150,7 @@ def _similarity(first: np.ndarray, second: np.ndarray) -> Similarity:
     return Similarity(scale, R, to_mm.mean(0) - scale * from_mm.mean(0) @ R.T)
 
 
-def _views(runs: tuple[RunFolder, RunFolder], similarity: Similarity, poses: dict[int, np.ndarray]) -> list[_View]:
+def _views(runs: tuple[Result, Result], similarity: Similarity, poses: dict[int, np.ndarray]) -> list[_View]:
     """Return the views of both surfaces from poses in the second run's world; those with nothing in common are not."""
     meshes = [run.mesh for run in runs]
     if not all(len(mesh.faces) for mesh in meshes):
@@ -184,7 +184,7 @@ def _surface_figures(views: list[_View]) -> dict[str, float]:
     }
 
 
-def _same_input(first: RunFolder, second: RunFolder) -> bool | None:
+def _same_input(first: Result, second: Result) -> bool | None:
     """Return whether both have read the same; None where one does not say."""
     sums = [dict(run.provenance.get("input_content") or {}).get("sha256") for run in (first, second)]
     return None if None in sums else sums[0] == sums[1]
@@ -199,7 +199,7 @@ def _coloured(difference: np.ndarray) -> np.ndarray:
 
 def refuse_run_as_truth(truth: Path) -> None:
     """Raise `InputError` where what is named as the truth is a run."""
-    if RunFolder(truth).is_finished:
+    if Result(truth).is_finished:
         raise InputError(
             f"{truth} is a run, which is no truth: `scopemap compare A B` compares two runs with each other"
         )

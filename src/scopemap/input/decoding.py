@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.engine.errors import InputError
+from scopemap.engine.errors import InputError, reporting
 
 _MOST_MEGAPIXELS = 64.0
 _VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
@@ -54,6 +54,13 @@ def write_encoded(file: Path, image: np.ndarray) -> None:
     is_tiff = file.suffix.lower() in (".tif", ".tiff")
     options = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE] if is_tiff else []
     file.write_bytes(cv2.imencode(file.suffix, image, options)[1].tobytes())
+
+
+def write_image(file: Path, image: np.ndarray) -> None:
+    """Write an image (BGR) into a folder, which is made; raises `InputError` where that fails."""
+    with reporting(f"cannot write {file}"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_encoded(file, image)
 
 
 def first_bytes(file: Path, count: int) -> bytes:

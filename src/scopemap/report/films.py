@@ -14,7 +14,7 @@ from scopemap.report.mesh_figures import ESTIMATE_COLOUR, draw_path, mesh_pictur
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet
 from scopemap.report.shown_mesh import simplified
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 _FRAMES = 180
 _FRAMES_PER_S = 24
@@ -48,13 +48,13 @@ def write_turntable(folder: Path | str, file: Path, frames: int = _FRAMES) -> No
 
     Raises `InputError` where the folder holds no finished run or no surface, or the film cannot be written.
     """
-    run = RunFolder(folder).checked()
+    run = Result(folder).checked()
     if not len(run.mesh.faces):
         raise InputError(f"{folder}: the run has no surface to turn")
     write_film(file, _turning(run, frames), _FRAMES_PER_S)
 
 
-def _turning(run: RunFolder, frames: int) -> Iterator[np.ndarray]:
+def _turning(run: Result, frames: int) -> Iterator[np.ndarray]:
     """Yield the pictures of a surface that turns once."""
     mesh, poses = simplified(run.mesh, MOST_FACES), run.frames["T_world_camera"][run.frames.tracked]
     points = np.concatenate([np.asarray(mesh.bounds), poses[:, :3, 3]])

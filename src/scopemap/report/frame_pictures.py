@@ -16,7 +16,7 @@ import numpy as np
 from scopemap.engine.errors import reporting
 from scopemap.engine.frame import Rows
 from scopemap.engine.odometry import Step
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 FOLDER = "frames"
 _MOST = 64
@@ -81,7 +81,7 @@ class FramePictures:
         folder = run / FOLDER
         with reporting(f"cannot write to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
-            place = RunFolder(run)
+            place = Result(run)
             for index in place.pictured:
                 place.picture_file(index).unlink()
                 place.mask_file(index).unlink(missing_ok=True)

@@ -10,7 +10,7 @@ import trimesh
 
 from scopemap.engine.errors import reporting
 from scopemap.report.shown_mesh import LARGEST_LEVEL, levels_of, simplified
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 MOST_FACES = 100_000
 FACES_OF_OTHERS = 20_000
@@ -28,7 +28,7 @@ _OTHERS = {
 }
 
 
-def measured_mesh(run: RunFolder, frame: int) -> trimesh.Trimesh:
+def measured_mesh(run: Result, frame: int) -> trimesh.Trimesh:
     """Return the surface of a run, or of a submap in `maps/N`, as `report.html` shows it at a frame, of few triangles.
 
     A vertex is off by a part of the shown triangles' size, which is far below the errors of depth.
@@ -39,7 +39,7 @@ def measured_mesh(run: RunFolder, frame: int) -> trimesh.Trimesh:
     return shown if run.states is None else run.states.moved(shown, frame)
 
 
-def measured_depth(run: RunFolder, frame: int) -> np.ndarray | None:
+def measured_depth(run: Result, frame: int) -> np.ndarray | None:
     """Return a frame's depth as the page holds it: every n-th pixel, at most 160 in a row.
 
     (h, w, 3) uint8: the upper and lower byte of the depth in the run's unit, 0 = unknown, and the level of its standard
@@ -53,7 +53,7 @@ def measured_depth(run: RunFolder, frame: int) -> np.ndarray | None:
     return np.asarray(cv2.resize(coded, size, interpolation=cv2.INTER_NEAREST))
 
 
-def measure_errors(run: RunFolder) -> dict[str, Any]:
+def measure_errors(run: Result) -> dict[str, Any]:
     """Return standard deviations, shares of focal length, scale and depth, and of a pixel; and what else is needed.
 
     Raises `InputError` where provenance.json does not say what it should of camera and scale.

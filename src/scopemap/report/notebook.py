@@ -1,77 +1,28 @@
-"""How a `Reconstruction` shows itself: in one line with its verdict, and in a notebook by its summary picture.
-
-A run in a notebook shows how far it is in a line below the cell.
-"""
+"""How a `Result` shows itself: in one line with its verdict, and in a notebook by its summary picture."""
 
 from __future__ import annotations
 
 import html
-import sys
-import time
 from base64 import b64encode
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from io import BytesIO
 
-from scopemap.engine.odometry import Step
 from scopemap.report.page_data import shown_meshes
-from scopemap.report.run_state import RunState
 from scopemap.report.summary_picture import summary_picture
-from scopemap.result.reconstruction import VIEWS, Reconstruction
+from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
 
 _SHOWN_FACES = 100_000
-_SECONDS_BETWEEN = 0.5
-Progress = Callable[[str, int, int], None]
 
 
-def in_notebook() -> bool:
-    """Return whether this process runs the cells of a notebook."""
-    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
-    return shell is not None and hasattr(shell, "kernel")
-
-
-@contextmanager
-def notebook_progress(total: int | None) -> Iterator[tuple[Callable[[Step], None], Progress]]:
-    """Yield the observer and the progress of a run of `total` frames that show it in one line below a cell."""
-    from IPython.display import display
-
-    state, shown_s = RunState(total), time.perf_counter()
-    line = display({"text/plain": "preparing"}, raw=True, display_id=True)  # type: ignore[no-untyped-call]
-
-    def show(words: str) -> None:
-        line.update({"text/plain": words}, raw=True)
-
-    def observe(step: Step) -> None:
-        nonlocal shown_s
-        state.add(step)
-        if time.perf_counter() - shown_s > _SECONDS_BETWEEN:
-            shown_s = time.perf_counter()
-            show(state.line)
-
-    def progress(doing: str, done: int, frames: int) -> None:
-        nonlocal shown_s
-        words = state.words(doing, done, frames)
-        if not frames or done == frames or time.perf_counter() - shown_s > _SECONDS_BETWEEN:
-            shown_s = time.perf_counter()
-            show(words)
-
-    yield observe, progress
-    show(f"{state.done} frames done")
-
-
-def in_one_line(result: Reconstruction) -> str:
+def in_one_line(result: Result) -> str:
     """Return the verdict and the main facts."""
     found = verdict(result)
-    return f"<Reconstruction, {found.word}: {found.sentence}>"
+    return f"<Result, {found.word}: {found.sentence}>"
 
 
-def as_html(result: Reconstruction) -> str:
+def as_html(result: Result) -> str:
     """Return the summary picture."""
     file, words = BytesIO(), html.escape(in_one_line(result))
     summary_picture(result, shown_meshes(result, _SHOWN_FACES)).save(file, "JPEG", quality=88)
     picture = b64encode(file.getvalue()).decode()
     return f'<p>{words}</p><img alt="{words}" src="data:image/jpeg;base64,{picture}" style="max-width: 100%">'
-
-
-VIEWS.update(line=in_one_line, html=as_html)

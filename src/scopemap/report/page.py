@@ -23,7 +23,7 @@ from scopemap.report.shown_mesh import base64_of
 from scopemap.report.summary_picture import summary_picture
 from scopemap.result.checksums import SUMS, write_checksums
 from scopemap.result.json_numbers import without_nan
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 PAGE = "report.html"
 PICTURE = "summary.png"
@@ -42,7 +42,7 @@ def write_report(folder: Path | str) -> list[Path]:
 
     Raises `InputError` where it holds no finished run, or cannot be written.
     """
-    run = RunFolder(folder).checked()
+    run = Result(folder).checked()
     meshes = shown_meshes(run, MOST_FACES)
     page, picture = Path(folder) / PAGE, Path(folder) / PICTURE
     with reporting(f"cannot write {page}"):
@@ -62,7 +62,7 @@ def write_comparison(folders: Sequence[Path], names: Sequence[str], file: Path) 
     Raises `InputError` where a folder holds no finished run, or the file cannot be written.
     """
     share = 1 / len(folders)
-    runs = [RunFolder(folder).checked() for folder in folders]
+    runs = [Result(folder).checked() for folder in folders]
     data = [
         page_data(run, shown_meshes(run, int(share * MOST_FACES)), name=name, share=share)
         for run, name in zip(runs, names, strict=True)
@@ -77,7 +77,7 @@ def full_page(folder: Path | str) -> str:
 
     Raises `InputError` where the folder holds no finished run.
     """
-    run = RunFolder(folder).checked()
+    run = Result(folder).checked()
     return page_html([page_data(run, shown_meshes(run, None), share=float("inf"))], served=True)
 
 

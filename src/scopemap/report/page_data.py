@@ -25,12 +25,11 @@ from scopemap.report.video_parts import video_parts
 from scopemap.result.frame_table import NOT_USED
 from scopemap.result.losses import losses
 from scopemap.result.reference import read_reference
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.run_input import PLACES, places_of_input
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.result.verdict import (
     WORDS,
-    Result,
     frames_per_s,
     level_of_submap,
     scale_is_known,
@@ -70,7 +69,7 @@ def shown_meshes(run: Result, most_faces: int | None) -> list[trimesh.Trimesh]:
     return [simplified(submap.mesh, faces) for submap, faces in zip(submaps, most, strict=False)]
 
 
-def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", share: float = 1.0) -> dict[str, Any]:
+def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", share: float = 1.0) -> dict[str, Any]:
     """Return what the page shows of a run.
 
     meshes : from `shown_meshes`. name : by default that of the input. share : of the page's size that is the run's.
@@ -96,7 +95,7 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
         "sigma_shares": run.depth.sigma_shares.astype(np.float64).tolist(),
         # Runs that share a page have fewer triangles than `measure` measures on.
         "measuring": share >= 1,
-        "measurements": read_measurements(run.path),
+        "measurements": read_measurements(run.folder),
         "coverage": _coverage(run),
         "maps": _maps(run, meshes, camera, pictures),
         "losses": [
@@ -112,7 +111,7 @@ def page_data(run: RunFolder, meshes: list[trimesh.Trimesh], *, name: str = "", 
     }
 
 
-def _frames(run: RunFolder) -> dict[str, Any]:
+def _frames(run: Result) -> dict[str, Any]:
     """Return the columns of all frames; a pose is (3, 4), row by row, NaN where there is none."""
     frames, place = run.frames, run.frames.place
     poses = np.full((len(frames), 3, 4), np.nan)
@@ -152,9 +151,9 @@ def read_measurements(folder: Path) -> list[Any]:
         return []
 
 
-def _coverage(run: RunFolder) -> dict[str, Any] | None:
+def _coverage(run: Result) -> dict[str, Any] | None:
     """Return what `scopemap coverage` wrote beside the result, and its map as PNG; None: nothing, or it is damaged."""
-    folder = run.path / COVERAGE
+    folder = run.folder / COVERAGE
     try:
         found = _Covered.model_validate_json((folder / "coverage.json").read_bytes())
         picture = (folder / "map.png").read_bytes()
@@ -213,12 +212,12 @@ def checked_measurements(text: bytes) -> list[dict[str, Any]]:
         raise ValueError("it is no list of measurements") from None
 
 
-def _pose_of(submap: RunFolder) -> dict[int, np.ndarray]:
+def _pose_of(submap: Result) -> dict[int, np.ndarray]:
     frames = submap.frames.only(submap.frames.tracked)
     return dict(zip(frames["index"].tolist(), frames["T_world_camera"], strict=True))
 
 
-def _pictures(run: RunFolder) -> list[_Picture]:
+def _pictures(run: Result) -> list[_Picture]:
     rows = np.flatnonzero(run.frames.place != NOT_USED)
     used, found = dict(zip(run.frames["index"][rows].tolist(), rows.tolist(), strict=True)), []
     for index in run.pictured:
@@ -257,7 +256,7 @@ def _picture_data(picture: _Picture) -> dict[str, Any]:
 
 
 def _maps(
-    run: RunFolder, meshes: list[trimesh.Trimesh], camera: PinholeCamera, pictures: list[_Picture]
+    run: Result, meshes: list[trimesh.Trimesh], camera: PinholeCamera, pictures: list[_Picture]
 ) -> list[dict[str, Any]]:
     """Return the meshes of the maps, the result first, each with its place in time and what is said of its inliers."""
     found, submaps = [], submaps_in_time(run.frames)
@@ -279,11 +278,11 @@ def _maps(
     return found
 
 
-def _truth(run: RunFolder) -> dict[str, Any] | None:
+def _truth(run: Result) -> dict[str, Any] | None:
     """Return the true camera positions of the result's frames, moved and scaled onto it; None where none are known."""
     frames = run.frames.only(run.frames.tracked)
     try:
-        reference = next((read_reference(place) for place in places_of_input(run.path) if place.is_dir()), None)
+        reference = next((read_reference(place) for place in places_of_input(run.folder) if place.is_dir()), None)
         return None if reference is None else _aligned(reference, frames["index"], frames["T_world_camera"])
     except ScopemapError:  # no poses, or too few or too straight a path to be aligned
         return None

@@ -26,9 +26,9 @@ from scopemap.report.mesh_figures import (
 )
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import SOFT, Sheet, rgb_of
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.result.verdict import Result, Verdict, scale_is_known, verdict
+from scopemap.result.verdict import Verdict, scale_is_known, verdict
 
 _CELL_PX = 384
 _GAP_PX = 12
@@ -45,9 +45,8 @@ def summary_picture(run: Result, meshes: Sequence[trimesh.Trimesh]) -> Image.Ima
 
     meshes : of its maps, the result's first, world mm, or some with fewer faces; maps beyond them are not drawn.
     """
-    folder = run if isinstance(run, RunFolder) else None
-    frames = [] if folder is None else _spread(folder)
-    seen = [] if folder is None else [_frames_row(folder, frames), _depth_row(folder, frames)]
+    frames = _spread(run)
+    seen = [] if run.path is None else [_frames_row(run, frames), _depth_row(run, frames)]
     rows = [*seen, _mesh_row(run, meshes[0]), *_submap_rows(run, meshes)]
     rows = [row for row in rows if row]
     heights = [max(picture.shape[0] for picture in row.values()) + _LABEL_PX for row in rows]
@@ -74,14 +73,14 @@ def _write_head(sheet: Sheet, found: Verdict) -> None:
         sheet.text((330, 42 + 18 * place), line, 14, SOFT)
 
 
-def _spread(run: RunFolder) -> list[int]:
+def _spread(run: Result) -> list[int]:
     """Return the numbers of at most four frames of the result, spread over it, that have a picture."""
     inside = set(run.frames["index"][run.frames.tracked].tolist())
     known = [index for index in run.pictured if index in inside]
     return sorted({known[round(place)] for place in np.linspace(0, len(known) - 1, _COLUMNS)}) if known else []
 
 
-def _frames_row(run: RunFolder, frames: list[int]) -> dict[str, np.ndarray]:
+def _frames_row(run: Result, frames: list[int]) -> dict[str, np.ndarray]:
     pictures = {f"frame {index}": read_decoded(run.picture_file(index), cv2.IMREAD_COLOR) for index in frames}
     shown = {title: _fitted(picture[..., ::-1]) for title, picture in pictures.items() if picture is not None}
     for title, index in zip(pictures, frames, strict=True):
@@ -90,7 +89,7 @@ def _frames_row(run: RunFolder, frames: list[int]) -> dict[str, np.ndarray]:
     return shown
 
 
-def _scale_frame(run: RunFolder, index: int, picture: np.ndarray) -> None:
+def _scale_frame(run: Result, index: int, picture: np.ndarray) -> None:
     depth_mm = run.depth.read(index) if run.scale_known else None
     if depth_mm is not None:
         _scale_at_median(picture, run.camera, depth_mm)
@@ -103,7 +102,7 @@ def _scale_at_median(picture: np.ndarray, camera: PinholeCamera, depth_mm: np.nd
         draw_scale_bar(picture, camera.fx / median_mm * _CELL_PX / camera.width, f" at {median_mm:.3g} mm")
 
 
-def _depth_row(run: RunFolder, frames: list[int]) -> dict[str, np.ndarray]:
+def _depth_row(run: Result, frames: list[int]) -> dict[str, np.ndarray]:
     """Return the depths in turbo, red near, blue far, of one range."""
     kept = [index for index in frames if run.depth.has(index)]
     depths = [depth for index in kept if (depth := run.depth.read(index)) is not None]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scopemap.result.frame_table import NOT_USED
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 _LEAST_GAP_S = 0.5
 
@@ -37,7 +37,7 @@ class VideoPart:
     joined: tuple[Join, ...]
 
 
-def video_parts(run: RunFolder) -> list[VideoPart]:
+def video_parts(run: Result) -> list[VideoPart]:
     """Return the parts of a run in the order of the video."""
     spans = _spans(run.frames.place, run.frames["time_s"])
     part_of = np.full(len(run.frames), -1)

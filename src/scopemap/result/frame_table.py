@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.frame import RowTable
 from scopemap.engine.tracking.causes import LossCause
+from scopemap.input.frame_choice import SkippedFrame
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY, SKIPPED, STATUSES, TRACKED, Trajectory
 
 LOST = -1
@@ -99,6 +100,12 @@ class FrameTable:
         found: np.ndarray = self.rows[column]
         return found
 
+    def with_skipped(self, frames: Iterable[SkippedFrame]) -> FrameTable:
+        """Return the table with rows of frames that were read and not used."""
+        known = ("index", "time_s", "name", "reason")
+        skipped = [{name: getattr(one, name) for name in known} | {"status": SKIPPED} for one in frames]
+        return FrameTable(np.concatenate([self.rows, FrameTable.of(skipped).rows]))
+
     def only(self, chosen: np.ndarray) -> FrameTable:
         """Return the rows that `chosen` (bool mask or row numbers) picks."""
         return FrameTable(self.rows[chosen])
@@ -123,12 +130,16 @@ class FrameTable:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many frames there are, are tracked in this submap, lost, of these with a rotation, and tracked in another
+        """How many frames were used, are tracked in this submap, lost, of these with a rotation, and tracked in another
         submap.
         """
         rotated, elsewhere = (int(np.sum(self["status"] == name)) for name in (ROTATION_ONLY, OTHER_MAP))
         lost = {"lost": int(self.lost.sum()), "rotation_only": rotated}
-        return {"frames": len(self), "tracked": int(self.tracked.sum())} | lost | {"in_other_maps": elsewhere}
+        return (
+            {"frames": int(np.sum(self["status"] != SKIPPED)), "tracked": int(self.tracked.sum())}
+            | lost
+            | {"in_other_maps": elsewhere}
+        )
 
     @property
     def trajectory(self) -> Trajectory:

@@ -11,7 +11,7 @@ from typing import Any
 
 from scopemap.engine.errors import InputError
 from scopemap.result.checksums import input_checksum
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 _MOST_NEIGHBOURS = 10_000
 PLACES = ("input_absolute", "input_relative")
@@ -48,7 +48,7 @@ def find_input(run: Path, given: Path | None = None) -> Path:
             raise InputError(f"{given} is not what the run {run} read ({name}): its content is another")
         return given
     there = places_of_input(run)
-    for place in (*there, *_neighbours(whole.path, Path(name).name, content)):
+    for place in (*there, *_neighbours(whole.folder, Path(name).name, content)):
         if _is_same(place, content):
             return place
     if there:
@@ -60,13 +60,13 @@ def places_of_input(run: Path) -> list[Path]:
     """Return the places named by a run, or by the run of a submap, at which there is something."""
     whole = _whole(run)
     facts = whole.provenance
-    named = [whole.path / str(facts["input_relative"])] if "input_relative" in facts else []
+    named = [whole.folder / str(facts["input_relative"])] if "input_relative" in facts else []
     named += [Path(str(facts[key])) for key in ("input_absolute", "input") if facts.get(key)]
     return [Path(os.path.normpath(place)) for place in named if place.exists()]
 
 
-def _whole(run: Path) -> RunFolder:
-    return RunFolder(run.parent.parent if run.parent.name == "maps" else run)
+def _whole(run: Path) -> Result:
+    return Result(run.parent.parent if run.parent.name == "maps" else run)
 
 
 def _is_same(place: Path, content: dict[str, Any]) -> bool:

@@ -10,12 +10,9 @@ import numpy as np
 from scopemap.engine.notices import Notice, notices_of
 from scopemap.result.frame_table import ELSEWHERE, NOT_USED, FrameTable
 from scopemap.result.losses import in_words, losses
-from scopemap.result.reconstruction import Reconstruction
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.submap_summaries import doubt_words, submaps_in_time
 
-Result = Reconstruction | RunFolder
-"""A result in memory, or in its folder."""
 Level = Literal["good", "doubtful", "bad", "note", "info"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
 
@@ -81,7 +78,7 @@ def verdict(run: Result) -> Verdict:
     return Verdict(level, _advice(run, level), _sentence(run), reasons)
 
 
-def state_verdict(result: Reconstruction) -> None:
+def state_verdict(result: Result) -> None:
     """Put the verdicts on a result and its other submaps into their provenance; that on the result rests on theirs."""
     for part in reversed(result.submaps):
         part.provenance["verdict"] = verdict(part).facts

@@ -15,10 +15,10 @@ from scopemap.engine.tracking.track import FrameTracker
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import write_previews
-from scopemap.report.notebook import in_notebook, notebook_progress
+from scopemap.report.notebook_progress import in_notebook, notebook_progress
 from scopemap.result.checksums import write_checksums
 from scopemap.result.depth_maps import DepthWriter
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.result.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
 from scopemap.result.run_input import stated_input
 from scopemap.result.verdict import state_verdict
@@ -42,15 +42,15 @@ def reconstruct(
     observers: tuple[Observer, ...] = (),
     progress: Progress | None = None,
     tracker: FrameTracker | None = None,
-) -> Reconstruction:
+) -> Result:
     """Turn a sequence, or a video, into poses, depth and a surface.
 
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
     result; where that is damaged it begins anew, which a notice says. Observers that are methods of an object with an
     attribute `NOT_IN_CHECKPOINT` are resumed and saved with it.
 
-    The settings in the result are the resolved ones: the TSDF parameters are numbers.
-    Of several submaps the one with most frames is the result, and `others` holds the others.
+    The settings in the result are the resolved ones: the TSDF parameters are numbers. Of several submaps the one with
+    most frames is the result, and `others` holds the others. With `out` the result is read from that folder.
     Raises `InputError` where no frame could be tracked, and what the estimators raise for missing weights.
 
     Parameters
@@ -85,7 +85,7 @@ def _reconstruct(
     observers: tuple[Observer, ...],
     progress: Progress,
     tracker: FrameTracker | None,
-) -> Reconstruction:
+) -> Result:
     clock = Clock()
     plan = memory_plan(config, sequence)
     if out is not None:
@@ -126,7 +126,7 @@ def _reconstruct(
             for owner in _kept_with(observers):
                 owner.save(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
-    return result if out is None else result.kept_in(out)
+    return result if out is None else Result(out)
 
 
 def _kept_with(observers: tuple[Observer, ...]) -> tuple[Any, ...]:

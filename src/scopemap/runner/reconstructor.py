@@ -25,7 +25,7 @@ from scopemap.input.sequence import Sequence
 from scopemap.input.source import ASSUMED_RATE_HZ, Source
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import FrameTable
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.result.run_input import stated_input
 from scopemap.result.verdict import state_verdict
 from scopemap.runner.estimators import CustomEstimators, largest_depth_mm
@@ -128,14 +128,14 @@ class Reconstructor:
         """
         return self._pipeline.fusion.surface(self._run.kept_maps.map)
 
-    def so_far(self, frames: FrameTable) -> tuple[Reconstruction, TsdfVolume | None]:
+    def so_far(self, frames: FrameTable) -> tuple[Result, TsdfVolume | None]:
         """Return frames of the current map as a result without a surface, and a copy of the volume that extracts it.
 
         Copying takes far less time than extracting. None: nothing is fused at once, or not yet.
         """
         provenance = provenance_of(self._sequence, self._pipeline.estimators, {}, frames)
         volume = self._pipeline.fusion.copied(self._run.kept_maps.map)
-        return Reconstruction(self.camera, frames, trimesh.Trimesh(), self.config, provenance), volume
+        return Result.in_memory(self.camera, frames, trimesh.Trimesh(), self.config, provenance), volume
 
     def depth_writer(self, folder: Path) -> DepthWriter:
         """Return what writes the depth of frames to a result's folder, as `reconstruct` does."""
@@ -151,7 +151,7 @@ class Reconstructor:
         """Whether the scale is measured or anchored; False: millimetres are a guess."""
         return bool(scale_facts(self._pipeline.estimators)["known"])
 
-    def result(self) -> Reconstruction:
+    def result(self) -> Result:
         """Return poses, surface and the table of all frames, adjusted by the back end; the last call.
 
         `trajectory.T_world_camera` holds the poses (N, 4, 4), NaN where lost; `mesh` vertices, faces and colours;

@@ -20,7 +20,7 @@ from scopemap.input.prepared import OF_UNKNOWN_VIEWS
 from scopemap.input.sequence import Sequence
 from scopemap.input.trajectory.trajectory import SKIPPED
 from scopemap.report.frame_pictures import WHOLLY_USABLE, FramePictures
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.run_input import find_input
 
 _SAME_CAMERA_PX = 0.01
@@ -39,7 +39,7 @@ def open_truth(run: Path, truth: Path) -> Sequence:
     size = None if camera is None else (camera.width, camera.height)
     if settings.stereo != "auto" and open_source(truth).name not in OF_UNKNOWN_VIEWS:
         settings = settings.model_copy(update={"stereo": "auto"})  # a data set's reader chooses the view
-    kept = RunFolder(run).source_camera_file
+    kept = Result(run).source_camera_file
     try:
         sequence = open_sequence(truth, size=size, settings=settings)
     except CalibrationError:
@@ -69,7 +69,7 @@ def open_input(run: Path, given: Path | None = None) -> tuple[Sequence, Masker]:
     given : where it is now; else it is looked for. Raises `InputError` as `find_input`, and where it gives another
     camera.
     """
-    source, config = find_input(run, given), RunFolder(run).config
+    source, config = find_input(run, given), Result(run).config
     sequence = open_truth(run, source)
     if not is_camera_of(run, sequence):
         raise InputError(f"the input {source} of the run {run} gives another camera now")
@@ -93,10 +93,23 @@ def reread_frames(run: Path, indices: set[int], given: Path | None = None) -> It
             yield mask(frame)
 
 
+def tracked_frames(run: Result) -> Iterator[Frame]:
+    """Yield the tracked frames of a run, or of one of its submaps, in order, as `reread_frames` has them.
+
+    Raises `InputError` where the input is gone, or has not all of them any more.
+    """
+    missing = set(run.tracked["index"].tolist())
+    for frame in reread_frames(run.folder, missing.copy(), run.input_path):
+        missing.discard(frame.index)
+        yield frame
+    if missing:
+        raise InputError(f"the input of the run {run.path} has no frame {min(missing)} any more")
+
+
 def _kept_frames(run: Path, indices: set[int], fault: InputError) -> Iterator[Frame]:
     """Yield frames by the pictures that a run kept. Raises `fault` where these are smaller or of fewer frames."""
-    folder = RunFolder(run)
-    kept = RunFolder(run.parent.parent) if run.parent.name == "maps" else folder
+    folder = Result(run)
+    kept = Result(run.parent.parent) if run.parent.name == "maps" else folder
     if missing := len(indices - set(kept.pictured)):
         raise InputError(f"{fault}; frames/ has no picture of {missing} of the {len(indices)} frames") from None
     camera = folder.camera
@@ -114,7 +127,7 @@ def _kept_frames(run: Path, indices: set[int], fault: InputError) -> Iterator[Fr
 
 def keep_pictures_again(run: Path) -> None:
     """Write the pictures of a run that kept none, from its input. Raises `InputError` where that is not possible."""
-    frames, pictures = RunFolder(run).checked().frames, FramePictures(timed=False)
+    frames, pictures = Result(run).checked().frames, FramePictures(timed=False)
     indices, (sequence, mask) = set(frames["index"][frames["status"] != SKIPPED].tolist()), open_input(run)
     for frame in (mask(frame) for frame in sequence.frames() if frame.index in indices):
         pictures.put(frame.index, frame.rgb, frame.valid)
@@ -124,7 +137,7 @@ def keep_pictures_again(run: Path) -> None:
 def _camera_of(run: Path) -> PinholeCamera | None:
     """Return the working camera of a run, whose size its depth maps have; None where it is unknown."""
     try:
-        return RunFolder(run).camera
+        return Result(run).camera
     except InputError:
         return None
 

@@ -31,7 +31,7 @@ from scopemap.engine.pipeline import Pipeline
 from scopemap.engine.tracking.track import Track
 from scopemap.input.sequence import Sequence
 from scopemap.result.frame_table import FrameTable, GrowingFrameTable
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.runner.backwards import track_backwards
 from scopemap.runner.memory import MemoryPlan, trim_memory
 from scopemap.runner.provenance import Limits, motion_notices, notices_of_end, provenance_of
@@ -158,7 +158,7 @@ class Run:
                 return
             yield frame
 
-    def result(self, prepared: list[Notice]) -> Reconstruction:
+    def result(self, prepared: list[Notice]) -> Result:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
         result = _Finishing(self, self.frames.read(), prepared + self.plan.notices).result()
         last = self.frames.last_index if self.interrupted else None
@@ -178,7 +178,7 @@ class _Finishing:
     notices: list[Notice]
     _done: int = field(default=0, init=False)
 
-    def result(self) -> Reconstruction:
+    def result(self) -> Result:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
         frames, pipeline, clock = self.frames, self.run.pipeline, self.run.clock
         check_tracked(frames, self.run.sequence.path)
@@ -192,9 +192,10 @@ class _Finishing:
         for frame in pipeline.fusion.store.frames(apart):
             self._write(frame)  # as tracked
         results[0].provenance["notices"] += [notice.as_json() for notice in pipeline.notices + notices]
-        return replace(results[0], others=results[1:])
+        results[0].others = results[1:]
+        return results[0]
 
-    def _fused(self, number: int, submaps: list[Submap]) -> Reconstruction:
+    def _fused(self, number: int, submaps: list[Submap]) -> Result:
         """Correct, write and fuse the frames of a submap."""
         trim_memory()
         sequence, pipeline, submap = self.run.sequence, self.run.pipeline, submaps[number]
@@ -243,16 +244,13 @@ class _Finishing:
         provenance["surface"] = agreement
         provenance["loops"] = [] if submap.correction is None else submap.correction.loop_frames
         config = config.model_copy(update={"fusion": fused.settings})
-        source_camera, sigma_px = sequence.rectifier.source, sequence.focal_sigma_px
-        return Reconstruction(
+        return Result.in_memory(
             sequence.camera,
-            frames,
+            frames.with_skipped(sequence.skipped),
             with_normals_alone(fused.mesh),
             config,
             provenance,
-            source_camera,
-            sequence.skipped,
-            sigma_px,
+            source_camera=sequence.rectifier.source,
             states=states,
         )
 

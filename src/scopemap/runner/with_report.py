@@ -8,7 +8,7 @@ from scopemap.engine.config import Config
 from scopemap.input.sequence import Sequence
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import write_report
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.runner.memory import trim_memory
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Observer, Progress
@@ -22,7 +22,7 @@ def reconstruct_with_report(
     overwrite: bool = False,
     observers: tuple[Observer, ...] = (),
     progress: Progress = lambda doing, done, total: None,
-) -> Reconstruction:
+) -> Result:
     """Write the result of a sequence to a folder, with report.html and summary.png; as `reconstruct` otherwise."""
     seen = (FramePictures().observe, *observers)
     result = reconstruct(sequence, config, out=out, overwrite=overwrite, observers=seen, progress=progress)

@@ -21,7 +21,7 @@ Align = Literal["none", "origin", "se3", "sim3", "scale"]
 Unit = Literal["mm", "m"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
-RunFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
+ResultFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
 Input = Annotated[
     Path, typer.Argument(metavar="INPUT", help="A video file, a folder of images, the folder of a data set's sequence.")
 ]

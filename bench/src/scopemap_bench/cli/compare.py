@@ -40,7 +40,7 @@ def compare(
     Without a truth, the first of two runs is moved onto the second by the Sim(3) of the frames that both have.
     """
     from scopemap.report.page import PAGE, write_comparison
-    from scopemap.result.run_folder import RunFolder
+    from scopemap.result.result import Result
     from scopemap_bench.comparison import compare as compare_runs
     from scopemap_bench.comparison import write_results
     from scopemap_bench.plan import ProtocolPlan
@@ -50,7 +50,7 @@ def compare(
     given = [name.strip() for name in names.split(",")] if names else []
     if truth is not None:
         refuse_run_as_truth(truth)
-    elif len(paths) == 2 and all(RunFolder(path).is_finished for path in paths):
+    elif len(paths) == 2 and all(Result(path).is_finished for path in paths):
         if (align, unit, consistency, paper_units) != ("sim3", "mm", False, False):
             raise InputError("--align, --unit, --consistency and --paper-units need --truth: two runs alone have none")
         _compare_two(paths, given, out, as_json=as_json, quiet=quiet)
@@ -59,7 +59,7 @@ def compare(
     runs = compare_runs(paths, truth, protocol, names=given, unit=unit)
     results = [run.result for run in runs]
     files = [] if out is None else write_results(runs, out, title="Comparison", paper_units=paper_units)
-    finished = [run for run in runs if RunFolder(run.folder).is_finished]
+    finished = [run for run in runs if Result(run.folder).is_finished]
     if out is not None and finished:
         names_shown = [f"{run.result.method}, {run.result.sequence}" for run in finished]
         files.append(write_comparison([run.folder for run in finished], names_shown, out / PAGE))

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 
 from scopemap.engine.errors import InputError
+from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.input.trajectory.text import text_lines
 from scopemap.input.trajectory.trajectory import Trajectory
-from scopemap.result.run_folder import RunFolder, read_mesh
+from scopemap.result.result import Result
 from scopemap.result.trajectory_folders import read_run, submap_folders
 from scopemap_bench.climb.figures import climb_score
 from scopemap_bench.trajectories.climb import read_submap, write_submap
@@ -39,7 +40,7 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
     Raises `InputError` where `run` is no run's folder, and where one of the clip's runs is there already.
     """
     try:
-        facts = RunFolder(run).provenance
+        facts = Result(run).provenance
         times, clip = zip(RUNTIME_KEYS, _times_s(facts), strict=True), clip or Path(facts["input"]).stem
     except (InputError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"exporting {run}: it is not the folder of a finished run ({error})") from None
@@ -61,7 +62,7 @@ def with_score(figures: dict[str, float], run: Path, estimate: Trajectory, refer
     """
     try:
         file = run / "runtime.txt"
-        processing_s = _stated_s(file)[RUNTIME_KEYS[1]] if file.is_file() else _times_s(RunFolder(run).provenance)[1]
+        processing_s = _stated_s(file)[RUNTIME_KEYS[1]] if file.is_file() else _times_s(Result(run).provenance)[1]
     except (InputError, LookupError, ValueError, TypeError, AttributeError):
         return figures
     frames = np.concatenate([one.indices for one in (estimate, *estimate.others, reference)])

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.input.camera_files.reading import stated_calibration
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 _PAIR_PX = 2  # a pixel's depth is the median of those so near
 
 
-def pairs_in_order(run: RunFolder, file: Path) -> tuple[int, int]:
+def pairs_in_order(run: Result, file: Path) -> tuple[int, int]:
     """Return how many pairs of pixels a run's depth has in the right order, and of how many.
 
     A row of the CSV file is a pair: `frame`, and `x_near`, `y_near`, `x_far`, `y_far`, shares of the width and height
@@ -32,7 +32,7 @@ def pairs_in_order(run: RunFolder, file: Path) -> tuple[int, int]:
     return right, len(rows)
 
 
-def _depth_at(run: RunFolder, depth_mm: np.ndarray | None, x: float, y: float) -> float:
+def _depth_at(run: Result, depth_mm: np.ndarray | None, x: float, y: float) -> float:
     """Return the depth, mm, at a place of the video's frame, shares of width and height; NaN where it is unknown."""
     assert run.source_camera_file is not None
     if depth_mm is None:
@@ -46,7 +46,7 @@ def _depth_at(run: RunFolder, depth_mm: np.ndarray | None, x: float, y: float) -
     return float(np.nanmedian(near)) if np.isfinite(near).any() else float("nan")
 
 
-def drift(run: RunFolder) -> float:
+def drift(run: Result) -> float:
     """Return the largest distance between two positions of a camera at rest, as a share of the median depth."""
     inside = run.frames.place == 0
     positions_mm = run.frames["T_world_camera"][inside][:, :3, 3]

@@ -26,7 +26,7 @@ import numpy as np
 
 from scopemap.engine.geometry.align import align_trajectories
 from scopemap.result.frame_table import FrameTable
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.phantom.shading import develop, disturb
 from scopemap_bench.scripts import measuring
@@ -142,7 +142,7 @@ def print_kinds(plan: list[Shown], frames: FrameTable, skipped: np.ndarray) -> N
         measuring.print_row(kind, int(of.sum()), *counts)
 
 
-def print_submaps(plan: list[Shown], run: RunFolder, poses: list[np.ndarray]) -> None:
+def print_submaps(plan: list[Shown], run: Result, poses: list[np.ndarray]) -> None:
     """Print the submaps of 3 s and more against the truth."""
     measuring.print_head("submap", "frames", "mostly of", "frames of anything else", "ATE mm", "true size / its own")
     small = 0
@@ -165,7 +165,7 @@ def print_submaps(plan: list[Shown], run: RunFolder, poses: list[np.ndarray]) ->
     print(f"\n{small} further submaps of less than {_USABLE_S:g} s")
 
 
-def print_cost(plan: list[Shown], run: RunFolder, skipped: np.ndarray, peak_mb: float) -> None:
+def print_cost(plan: list[Shown], run: Result, skipped: np.ndarray, peak_mb: float) -> None:
     """Print segments found, speed, memory, and time per frame in the quarters."""
     frames, clear = run.frames, np.array([shown.kind == CLEAR for shown in plan])
     tracked = frames.place >= 0
@@ -197,7 +197,7 @@ def main() -> None:
         write_video(video, plan, colons)
         out = folder / f"run-{given.frames}"
         run_watched(video, colons[0] / "camera.yaml", out)
-        run = RunFolder(out).checked()
+        run = Result(out).checked()
         depths = {int(file.stem) for file in (out / "depth").glob("*.png")}
         unseen = np.array([index not in depths for index in run.frames["index"].tolist()]) & run.frames.lost
         print_kinds(plan, run.frames, unseen)

@@ -17,7 +17,7 @@ import numpy as np
 
 from scopemap.engine.notices import notices_of
 from scopemap.input.opening import open_sequence
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.clinical_phantoms import FRAMES, PHANTOMS, SEED
 from scopemap_bench.scripts.real import depth_figures
@@ -47,7 +47,7 @@ def write_picture(file: Path, source: Path, first: Path, last: Path) -> None:
     frame, true = next((frame, true) for frame, true in open_sequence(source) if frame.index == SHOWN)
     assert true is not None
     assert true.depth_mm is not None
-    depths = [np.nan_to_num(true.depth_mm), *(np.nan_to_num(RunFolder(run).depth.read(SHOWN)) for run in (first, last))]
+    depths = [np.nan_to_num(true.depth_mm), *(np.nan_to_num(Result(run).depth.read(SHOWN)) for run in (first, last))]
     row = np.hstack([cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), *map(in_colours, depths)])
     cv2.imwrite(str(file), row, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
@@ -63,7 +63,7 @@ def main() -> None:
         runs = {name: out / f"inside-out-{place}" for place, name in enumerate(ROWS)}
         for name, method in ROWS.items():
             run = measuring.run_once(source, runs[name], "--set", f"mapping.method={method}")
-            depth = depth_figures(RunFolder(run), source, None)
+            depth = depth_figures(Result(run), source, None)
             path = measuring.evaluated(run, "--truth", source, "--align", "sim3")
             said = [n.code for n in notices_of(measuring.provenance(run)) if n.code.startswith(("shape", "mapping"))]
             cells = [measuring.cell(depth, ".3f", "abs_rel", "correlation"), measuring.cell(path, ".3f", "ate_rmse_mm")]

@@ -27,7 +27,7 @@ import numpy as np
 
 from scopemap.input.opening import open_sequence
 from scopemap.input.trajectory.trajectory import ASSUMED_FRAMES_PER_S
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
 from scopemap_bench.evaluation.depth import DepthFit, compared_depths, depth_scale, evaluate_depth
 from scopemap_bench.evaluation.partial_truth import drift, pairs_in_order
@@ -75,7 +75,7 @@ def clips(data: Path) -> list[RealClip]:
     return found
 
 
-def depth_pairs(run: RunFolder, truth: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def depth_pairs(run: Result, truth: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield estimated and true depth (H, W), mm, of the result's frames that have both."""
     inside = set(run.frames["index"][run.frames.place == 0].tolist())
     for frame, true in open_sequence(truth):
@@ -85,7 +85,7 @@ def depth_pairs(run: RunFolder, truth: Path) -> Iterator[tuple[np.ndarray, np.nd
                 yield depth_mm, true.depth_mm
 
 
-def depth_figures(run: RunFolder, truth: Path, path_scale: float | None) -> dict[str, float]:
+def depth_figures(run: Result, truth: Path, path_scale: float | None) -> dict[str, float]:
     """Return the errors of a run's depth; {} without any."""
     pairs = list(depth_pairs(run, truth))
     if not pairs:
@@ -122,7 +122,7 @@ def measure(clip: RealClip, preset: str, out: Path, settings: list[str]) -> None
     cost = ""
     if elapsed_s > 1:
         cost = f"{1e3 * elapsed_s / measuring.provenance(run)['frames'] / np.median(flows_ms):.1f}"
-    folder, facts = RunFolder(run), measuring.provenance(run)
+    folder, facts = Result(run), measuring.provenance(run)
     path = at_rest = pairs = held_out = ""
     scale = None
     truth = clip.truth(out / "truth" / run.name)

@@ -30,7 +30,7 @@ from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.opening import open_sequence
 from scopemap.input.trajectory.trajectory import path_length_mm
 from scopemap.result.reference import read_reference
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory
 from scopemap.result.verdict import verdict
 from scopemap_bench.evaluation.partial_truth import drift, pairs_in_order
@@ -74,7 +74,7 @@ def surface_error(run: Path, truth: Path, scale: float | None) -> float:
 
     scale : of the path to the true one; None: the median ratio of the distances in each frame, where no path is known.
     """
-    folder, sequence, errors = RunFolder(run), open_sequence(truth), []
+    folder, sequence, errors = Result(run), open_sequence(truth), []
     camera, true_lens, file = folder.camera, sequence.source.camera, folder.source_camera_file
     assert true_lens is not None
     assert file is not None
@@ -103,7 +103,7 @@ def path_error(run: Path, case: Case, truth: Path) -> tuple[float, float | None]
     Infinite, with a scale of 1, where the path cannot be aligned.
     """
     if case.known.at_rest:
-        return drift(RunFolder(run)), None
+        return drift(Result(run)), None
     if not case.known.path:
         return UNKNOWN, None
     reference = read_reference(truth)
@@ -127,13 +127,13 @@ def outcome(case: Case, out: Path) -> Outcome:
         run = measuring.run_once(source, out / "runs" / case.name, *case.words)
     except subprocess.CalledProcessError:
         return Outcome(case, "no result")
-    said = verdict(RunFolder(run))
+    said = verdict(Result(run))
     reasons = ", ".join(reason.code for reason in said.reasons if reason.level in ("bad", "doubtful"))
     path, scale = path_error(run, case, source)
     surface = surface_error(run, source, scale) if case.known.depth else UNKNOWN
     pairs = UNKNOWN
     if case.known.pairs is not None:
-        right, count = pairs_in_order(RunFolder(run), case.known.pairs)
+        right, count = pairs_in_order(Result(run), case.known.pairs)
         pairs = right / count
     return Outcome(case, said.word, path, surface, reasons, pairs)
 

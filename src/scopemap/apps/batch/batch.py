@@ -28,7 +28,7 @@ from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence as Frames
 from scopemap.report.batch_page import BatchRow, write_at_once, write_batch_page, write_batch_table
 from scopemap.report.page import write_report
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.verdict import frames_in_result, verdict
 from scopemap.runner.processes import Outcome, ProcessLimits, run_in_processes
 from scopemap.runner.with_report import reconstruct_with_report
@@ -184,7 +184,7 @@ def _run(task: _Task) -> dict[str, Any]:
         reconstruct_with_report(frames, video.config, folder, overwrite=task.before is not None)
     else:  # the process ended while it wrote the report
         write_report(folder)
-    run = RunFolder(folder).checked()
+    run = Result(folder).checked()
     found, (tracked, of) = verdict(run), frames_in_result(run.frames)
     return {"verdict": found.word, "sentence": found.sentence, "tracked": tracked, "frames": of}
 

@@ -25,7 +25,7 @@ from scopemap.engine.errors import InputError, reporting
 from scopemap.report.coverage_picture import COLOURS, OUTSIDE, draw_coverage
 from scopemap.report.sheet import rgb_of
 from scopemap.result.frame_table import FrameTable
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
 
 HIDDEN_AREA = {"lumen": 1.3, "cavity": 1.0}
@@ -251,8 +251,8 @@ class _Faces(NamedTuple):
     hidden: np.ndarray
 
 
-def _checked(folder: Path) -> RunFolder:
-    run = RunFolder(folder).checked()
+def _checked(folder: Path) -> Result:
+    run = Result(folder).checked()
     if not len(run.mesh.faces):
         raise InputError(f"the run {folder} has no surface")
     if not any(map(run.depth.has, run.frames["index"][run.frames.tracked].tolist())):

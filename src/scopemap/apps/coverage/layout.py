@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.watertight import SEEN_CELLS, ClosedSpace, closed_space
 from scopemap.engine.geometry.centreline import Centreline, centreline, clock
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 CLOCK_BINS = 36
 LUMEN_RADII = 3.0
@@ -114,7 +114,7 @@ class ExaminedSpace:
     first: int
 
 
-def examined_space(run: RunFolder) -> ExaminedSpace:
+def examined_space(run: Result) -> ExaminedSpace:
     """Return what of the space of a run was examined; raises `InputError` where nothing was seen enough."""
     space = closed_space(run.mesh, run.config.fusion.voxel_mm or 0.0)
     surface = trimesh.Trimesh(*space.surface(), process=False)

@@ -8,7 +8,6 @@ import shutil
 import threading
 import time
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from scopemap.engine.fusion.surface_fusion import TsdfVolume
 from scopemap.engine.odometry import Step
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import FrameTable
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.result.verdict import LEAST_FRAMES
 from scopemap.runner.processes import ProcessLimits, run_in_processes
 from scopemap.runner.reconstructor import Reconstructor
@@ -165,7 +164,7 @@ class _Task(NamedTuple):
 
     folder: Path
     of: str
-    so_far: tuple[Reconstruction, TsdfVolume | None] | None = None
+    so_far: tuple[Result, TsdfVolume | None] | None = None
 
 
 def _made(task: _Task) -> ShownMap:
@@ -174,8 +173,9 @@ def _made(task: _Task) -> ShownMap:
         os.nice(max(0, _NICE - os.nice(0)))
     if task.so_far is not None:
         result, volume = task.so_far
-        mesh = result.mesh if volume is None else finished(volume.extract_mesh(), result.config.fusion)
-        replace(result, mesh=mesh).save(task.folder)
+        if volume is not None:
+            result.mesh = finished(volume.extract_mesh(), result.config.fusion)
+        result.save(task.folder)
     found = coverage(task.folder)
     with TemporaryDirectory() as folder:
         file = Path(folder) / "map.png"

@@ -16,7 +16,7 @@ from scipy.special import expit
 
 from scopemap.apps.coverage.layout import Layout
 from scopemap.engine.geometry.se3 import inverse, transform
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 MOST_FRAMES = 200
 _SAME_DEPTH = 0.05
@@ -44,7 +44,7 @@ class Views:
     share: np.ndarray
 
 
-def views_of(run: RunFolder, surface: trimesh.Trimesh) -> Views:
+def views_of(run: Result, surface: trimesh.Trimesh) -> Views:
     """Return how the tracked frames of a run whose depth it kept, at most 200 of them, see a surface, world mm."""
     centres, normals, camera = surface.triangles_center, surface.face_normals, run.camera
     cosine, share = np.zeros((2, len(centres)))

@@ -27,7 +27,7 @@ from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.mesh_figures import draw_trajectories, inside_view, mesh_picture, outside_views
 from scopemap.report.page import write_report
 from scopemap.report.sheet import picture_grid
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.result.result_folder import check_result_folder
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reconstruct import reconstruct
@@ -48,7 +48,7 @@ class Demonstration:
 
     clip: Path
     sequence: Sequence
-    result: Reconstruction
+    result: Result
     raw_mm: dict[int, np.ndarray]
     refined_mm: dict[int, np.ndarray]
 

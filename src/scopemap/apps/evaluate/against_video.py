@@ -31,7 +31,7 @@ from scopemap.engine.models import weights
 from scopemap.engine.models.device import missing_packages
 from scopemap.engine.notices import notices_of
 from scopemap.report.depth_figures import draw_renderings
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.runner.reread_frames import open_input
 
 _HELD_OUT_EVERY = 10
@@ -89,7 +89,7 @@ class RunFrames:
     """
 
     def __init__(self, run: Path, source: Path | None = None) -> None:
-        folder = RunFolder(run)
+        folder = Result(run)
         fusion = folder.config.fusion
         if fusion.voxel_mm is None or not fusion.enabled:
             raise InputError(f"the run {run} has no surface that could be compared with its video")

@@ -11,7 +11,7 @@ from scopemap.apps.view.fly_through import Painting
 from scopemap.apps.view.paintings import painted
 from scopemap.report.coverage_picture import OUTSIDE
 from scopemap.report.sheet import rgb_of
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 _COMPARED = {"not compared": OUTSIDE, "as it was": "#2a9d8f", "changed": "#9b2226"}
 
@@ -19,4 +19,4 @@ _COMPARED = {"not compared": OUTSIDE, "as it was": "#2a9d8f", "changed": "#9b222
 def change_painting(first: Path, found: ExamComparison) -> Painting:
     """Return the surface of the first of two examinations by where the second differs from it."""
     colours = np.array([rgb_of(colour) for colour in _COMPARED.values()], np.uint8)
-    return Painting(painted(RunFolder(first).mesh, colours[found.compared]), _COMPARED)
+    return Painting(painted(Result(first).mesh, colours[found.compared]), _COMPARED)

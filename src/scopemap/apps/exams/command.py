@@ -33,13 +33,13 @@ def compare_exams(
     from scopemap.apps.exams.compare_exams import compare_exams as compare
     from scopemap.apps.exams.exams_page import PAGE, facts_of, summary, write_comparison
     from scopemap.apps.view.fly_through import write_fly_through
-    from scopemap.result.run_folder import RunFolder
+    from scopemap.result.result import Result
 
     found = compare(first, second, source, second_input)
     write_comparison(found, first, second, out)
     if video is not None:
         write_fly_through(first, video, source, change_painting(first, found))
-    run = RunFolder(first)
+    run = Result(first)
     if as_json:
         print_json(facts_of(found, "mm" if run.scale_known else "unit"))
     elif not quiet:

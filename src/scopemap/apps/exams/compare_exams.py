@@ -30,7 +30,7 @@ from scopemap.engine.geometry.local_contrast import local_mean
 from scopemap.engine.geometry.rendering import Rendering, render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.warp import pull
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.runner.reread_frames import reread_frames
 
 _LEAST_PAIRS = 30  # in the view of a keyframe
@@ -104,7 +104,7 @@ class _Exam:
     """A result: poses of its keyframes, of the frames that it kept a picture of, and its surface."""
 
     def __init__(self, folder: Path) -> None:
-        self.run = RunFolder(folder).checked()
+        self.run = Result(folder).checked()
         if not self.run.depth.present:
             raise InputError(f"the run {folder} kept no depth maps")
         if not len(self.run.mesh.faces):

@@ -17,7 +17,7 @@ from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.input.decoding import read_decoded
 from scopemap.report.batch_page import write_at_once
 from scopemap.report.sheet import picture_grid, rgb_of
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 PAGE = "compare.html"
 TABLE = "changes.json"
@@ -59,7 +59,7 @@ def write_comparison(found: ExamComparison, first: Path, second: Path, out: Path
 
     Raises `InputError` where a file cannot be written.
     """
-    runs = RunFolder(first), RunFolder(second)
+    runs = Result(first), Result(second)
     unit = "mm" if runs[0].scale_known else "unit"
     with reporting(f"cannot write to {out}"):
         out.mkdir(parents=True, exist_ok=True)
@@ -102,9 +102,7 @@ def _row(change: Change, number: int, unit: str) -> str:
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in (*cells, f"{change.sigmas:.0f}")) + "</tr>"
 
 
-def _both(
-    runs: tuple[RunFolder, RunFolder], found: ExamComparison, change: Change, number: int
-) -> dict[str, np.ndarray]:
+def _both(runs: tuple[Result, Result], found: ExamComparison, change: Change, number: int) -> dict[str, np.ndarray]:
     """Return the pictures of both that show a change, with a ring around it."""
     places = change.place_mm, found.S_first_second.inverse().transform_points(change.place_mm)
     names = (f"{number}: {change.what}\nfirst, frame", "\nsecond, frame")
@@ -114,7 +112,7 @@ def _both(
     }
 
 
-def _ringed(run: RunFolder, index: int, place: np.ndarray) -> np.ndarray:
+def _ringed(run: Result, index: int, place: np.ndarray) -> np.ndarray:
     rgb = _picture(run, index)
     row = np.flatnonzero(run.frames["index"] == index)
     if len(row):
@@ -125,7 +123,7 @@ def _ringed(run: RunFolder, index: int, place: np.ndarray) -> np.ndarray:
     return rgb
 
 
-def _picture(run: RunFolder, index: int) -> np.ndarray:
+def _picture(run: Result, index: int) -> np.ndarray:
     """Return the small picture of a frame, (h, w, 3) uint8; white where there is none."""
     bgr = read_decoded(run.picture_file(index)) if index >= 0 else None
     return np.full((64, 80, 3), 255, np.uint8) if bgr is None else np.ascontiguousarray(bgr[..., ::-1])

@@ -13,20 +13,20 @@ from typing import Any
 from scopemap.apps.export.surfaces import Axes, stl_bytes
 from scopemap.engine.errors import SettingsError
 from scopemap.input.trajectory.trajectory import Unit
-from scopemap.runner.exported_run import ExportedRun
+from scopemap.result.result import Result
 
 _ENCAPSULATED_STL = "1.2.840.10008.5.1.4.1.1.104.3"
 _NOBODY = "no name, number or date was copied from the input; research software, not a medical device"
 
 
-def write_dicom_stl(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> None:
+def write_dicom_stl(run: Result, file: Path, unit: Unit, axes: Axes) -> None:
     """Write the surface as a binary STL in a DICOM file; raises as `dicom_stl`."""
     stream = BytesIO()
     dicom_stl(run, unit, axes).save_as(stream, enforce_file_format=True)
     file.write_bytes(stream.getvalue())
 
 
-def dicom_stl(run: ExportedRun, unit: Unit, axes: Axes) -> Any:
+def dicom_stl(run: Result, unit: Unit, axes: Axes) -> Any:
     """Return the surface as a binary STL in a data set of pydicom: anonymous, and without a date.
 
     The unit of a surface of unknown scale is "no units", so that no viewer measures in it. Raises `SettingsError`
@@ -47,7 +47,7 @@ def dicom_stl(run: ExportedRun, unit: Unit, axes: Axes) -> Any:
     return data
 
 
-def _dataset(run: ExportedRun, unit: tuple[str, str]) -> Any:
+def _dataset(run: Result, unit: tuple[str, str]) -> Any:
     """Return what the modules of the IOD require, without identifiers and document."""
     from pydicom.dataset import Dataset, FileMetaDataset
     from pydicom.sr.codedict import codes

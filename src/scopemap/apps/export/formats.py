@@ -15,9 +15,9 @@ from scopemap.apps.export.surfaces import Axes, write_glb, write_slicer, write_s
 from scopemap.apps.export.trajectories import write_euroc_file, write_kitti_folder
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.input.trajectory.trajectory import Unit, write_tum
-from scopemap.runner.exported_run import ExportedRun, read_exported
+from scopemap.result.result import Result
 
-Write = Callable[[ExportedRun, Path, Unit, Axes], None]
+Write = Callable[[Result, Path, Unit, Axes], None]
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ FORMATS: dict[str, ExportFormat] = {
     "endogslam": ExportFormat(lambda run, out, unit, axes: write_endogslam(run, out), ("mm",)),
     "endonerf": ExportFormat(lambda run, out, unit, axes: write_endonerf(run, out), ("mm",)),
     "tum": ExportFormat(
-        lambda run, out, unit, axes: write_tum(out, run.trajectory, unit=unit, comment=run.scale),
+        lambda run, out, unit, axes: write_tum(out, run.tracked.trajectory, unit=unit, comment=run.scale),
         ("m", "mm"),
         ending=".txt",
     ),
@@ -82,7 +82,7 @@ def export_run(
         raise InputError(f"cannot write {out}: its name must end in {form.ending}")
     if out.is_file() or (out.is_dir() and (form.ending or any(out.iterdir()))):
         raise InputError(f"{out} exists; give another name with --out")
-    run = read_exported(folder, source)
+    run = Result(folder, source).checked(with_poses=True)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         # An export that fails or is stopped leaves nothing.

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import SettingsError
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT
-from scopemap.runner.exported_run import ExportedRun
+from scopemap.result.result import Result
+from scopemap.runner.reread_frames import tracked_frames
 
 _NS_PER_S = 10**9
 _WORLD = "world"
@@ -47,7 +48,7 @@ _SCHEMAS = {
 _TOPICS = {"/image": "CompressedImage", "/calibration": "CameraCalibration", "/tf": "FrameTransform"}
 
 
-def write_mcap(run: ExportedRun, file: Path) -> None:
+def write_mcap(run: Result, file: Path) -> None:
     """Write the tracked frames with their camera and their poses (`/tf`: the camera in the world), lengths in m.
 
     Raises `SettingsError` where the package mcap is not installed.
@@ -64,9 +65,9 @@ def write_mcap(run: ExportedRun, file: Path) -> None:
             schema = writer.register_schema(f"foxglove.{name}", "jsonschema", json.dumps(_SCHEMAS[name]).encode())
             channels[topic] = writer.register_channel(topic, "json", schema)
         writer.add_metadata("scopemap", {"unit": "m", "scale": run.scale})
-        path = run.trajectory
+        path = run.tracked.trajectory
         for number, (frame, time_s, pose) in enumerate(
-            zip(run.tracked_frames(), path.times_s, path.T_world_camera, strict=True)
+            zip(tracked_frames(run), path.times_s, path.T_world_camera, strict=True)
         ):
             time_ns = round(time_s * _NS_PER_S)
             stamp = {"timestamp": {"sec": time_ns // _NS_PER_S, "nsec": time_ns % _NS_PER_S}}

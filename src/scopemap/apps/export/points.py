@@ -14,10 +14,12 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from scopemap.apps.export.surfaces import vertex_attributes
 from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.mesh_files import ply_bytes
+from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit
-from scopemap.runner.exported_run import ExportedRun
+from scopemap.result.result import Result
 
 _AXES = "axes: OpenCV (x right, y down, z forward)"
 _SH_DEGREE_0 = 0.28209479177387814
@@ -28,17 +30,17 @@ _LEAST_SCALE = 1e-7
 _THICKNESS = 0.1  # across the surface, of the scale along it
 
 
-def write_points(run: ExportedRun, file: Path, unit: Unit) -> None:
+def write_points(run: Result, file: Path, unit: Unit) -> None:
     """Write the vertices of the surface with their colours and normals as binary PLY without faces."""
     points, normals, colours = _points_of(run, unit)
-    attributes: dict[str, Any] = run.vertex_attributes(unit) | {
+    attributes: dict[str, Any] = vertex_attributes(run.mesh, unit) | {
         name: normals[:, column].astype(np.float32) for column, name in enumerate(("nx", "ny", "nz"))
     }
     cloud = trimesh.Trimesh(points, vertex_colors=colours, vertex_attributes=attributes, process=False)
     file.write_bytes(ply_bytes(cloud, [_AXES, f"unit: {unit}", run.scale]))
 
 
-def write_gaussians(run: ExportedRun, file: Path, unit: Unit) -> None:
+def write_gaussians(run: Result, file: Path, unit: Unit) -> None:
     """Write a Gaussian at each vertex, a disc on the surface as wide as the distance to its neighbours.
 
     Its colour is the vertex's from all sides: the coefficients of degrees 1 to 3 are 0.
@@ -60,9 +62,9 @@ def write_gaussians(run: ExportedRun, file: Path, unit: Unit) -> None:
     file.write_bytes("\n".join(head).encode() + table.tobytes())
 
 
-def _points_of(run: ExportedRun, unit: Unit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _points_of(run: Result, unit: Unit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions (V, 3) in a unit, normals (V, 3) and colours (V, 3) uint8 of the vertices."""
-    points_mm, colours = run.points
+    points_mm, colours = np.asarray(run.mesh.vertices, np.float64), vertex_colours(run.mesh)[:, :3]
     if not len(points_mm):
         raise InputError(f"{run.path}: the run has no surface to export")
     return points_mm / MM_PER_UNIT[unit], np.asarray(run.mesh.vertex_normals, np.float64), colours

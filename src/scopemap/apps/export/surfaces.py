@@ -10,7 +10,7 @@ seen from the feet by an upright camera that looks towards the head (x to the le
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -20,7 +20,7 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.mesh_files import ply_bytes, save_mesh
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit
-from scopemap.runner.exported_run import ExportedRun
+from scopemap.result.result import Result
 
 Axes = Literal["lps", "ras", "opencv", "gltf"]
 # World to the axes of a file; all are rotations, so triangles keep their front.
@@ -39,7 +39,7 @@ _AXES_IN_WORDS = {
 _STL_HEADER_BYTES = 80
 
 
-def write_surface(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> None:
+def write_surface(run: Result, file: Path, unit: Unit, axes: Axes) -> None:
     """Write the mesh as `file`, whose name ends in .ply, .obj or .stl; the last has no colours and no space for much.
 
     Raises `InputError` where the run has no surface.
@@ -56,7 +56,7 @@ def write_surface(run: ExportedRun, file: Path, unit: Unit, axes: Axes) -> None:
         file.write_text("".join(f"# {line}\n" for line in about) + text, encoding="utf-8")
 
 
-def write_surfaces(run: ExportedRun, folder: Path, unit: Unit, axes: Axes) -> None:
+def write_surfaces(run: Result, folder: Path, unit: Unit, axes: Axes) -> None:
     """Write the surface in the state of each tracked frame, as `000000.ply`, ..., named by the frame's number.
 
     Raises `InputError` where the run has no surface, or its tissue is taken to be at rest.
@@ -65,12 +65,12 @@ def write_surfaces(run: ExportedRun, folder: Path, unit: Unit, axes: Axes) -> No
         raise InputError(f"{run.path}: its tissue is taken to be at rest; export its one surface as ply")
     folder.mkdir(parents=True, exist_ok=True)
     shown, about, R = _surface_of(run, unit, axes), _about(run, unit, axes), _R_FILE_WORLD[axes]
-    for index in run.trajectory.indices.tolist():
+    for index in run.tracked.trajectory.indices.tolist():
         shown.vertices = run.states.moved(run.mesh, index).vertices @ R.T / MM_PER_UNIT[unit]
         (folder / f"{index:06d}.ply").write_bytes(ply_bytes(shown, about))
 
 
-def stl_bytes(run: ExportedRun, unit: Unit, axes: Axes) -> bytes:
+def stl_bytes(run: Result, unit: Unit, axes: Axes) -> bytes:
     """Return the mesh as binary STL. Raises `InputError` where the run has no surface."""
     content = trimesh.exchange.stl.export_stl(_surface_of(run, unit, axes))
     # Not all of the scale's words fit; a binary STL must not begin with "solid".
@@ -78,27 +78,35 @@ def stl_bytes(run: ExportedRun, unit: Unit, axes: Axes) -> bytes:
     return header.ljust(_STL_HEADER_BYTES) + content[_STL_HEADER_BYTES:]
 
 
-def write_glb(run: ExportedRun, file: Path) -> None:
+def write_glb(run: Result, file: Path) -> None:
     """Write the mesh as GLB: metres and y up, which glTF prescribes."""
     save_mesh(_surface_of(run, "mm", "opencv"), glb_file=file, comment=run.scale)
 
 
-def write_slicer(run: ExportedRun, folder: Path) -> None:
+def write_slicer(run: Result, folder: Path) -> None:
     """Write `surface.ply` and the camera's path as the open curve `path.mrk.json`, both LPS and mm."""
     folder.mkdir(parents=True, exist_ok=True)
     write_surface(run, folder / "surface.ply", "mm", "lps")
-    positions = run.trajectory.positions_mm @ _R_FILE_WORLD["lps"].T
-    points = {f"frame {index}": at for index, at in zip(run.trajectory.indices, positions, strict=True)}
+    positions = run.tracked.trajectory.positions_mm @ _R_FILE_WORLD["lps"].T
+    points = {f"frame {index}": at for index, at in zip(run.tracked.trajectory.indices, positions, strict=True)}
     write_markups([markup("Curve", "camera path", points, run.scale)], folder / "path.mrk.json")
 
 
-def _about(run: ExportedRun, unit: Unit, axes: Axes) -> list[str]:
+def vertex_attributes(mesh: trimesh.Trimesh, unit: Unit) -> dict[str, Any]:
+    """Return numbers of each vertex, (V,) float32: confidence, moving, sigma_mm, whose name has the unit."""
+    known: dict[str, Any] = {name: np.asarray(x, np.float32) for name, x in mesh.vertex_attributes.items()}
+    if "sigma_mm" in known:
+        known[f"sigma_{unit}"] = known.pop("sigma_mm") / np.float32(MM_PER_UNIT[unit])
+    return known
+
+
+def _about(run: Result, unit: Unit, axes: Axes) -> list[str]:
     return [_AXES_IN_WORDS[axes], f"unit: {unit}", run.scale]
 
 
-def _surface_of(run: ExportedRun, unit: Unit, axes: Axes) -> trimesh.Trimesh:
+def _surface_of(run: Result, unit: Unit, axes: Axes) -> trimesh.Trimesh:
     if not len(run.mesh.faces):
         raise InputError(f"{run.path}: the run has no surface to export")
     vertices = run.mesh.vertices @ _R_FILE_WORLD[axes].T / MM_PER_UNIT[unit]
-    colours, attributes = vertex_colours(run.mesh), run.vertex_attributes(unit)
+    colours, attributes = vertex_colours(run.mesh), vertex_attributes(run.mesh, unit)
     return trimesh.Trimesh(vertices, run.mesh.faces, vertex_colors=colours, vertex_attributes=attributes, process=False)

@@ -20,7 +20,7 @@ from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.input.live_source import LiveSource
 from scopemap.input.sequence import Sequence
-from scopemap.result.reconstruction import Reconstruction
+from scopemap.result.result import Result
 from scopemap.runner.provenance import Limits
 from scopemap.runner.reconstructor import Reconstructor
 from scopemap.runner.run import Progress
@@ -192,7 +192,7 @@ class LiveSession:
         self._last_snapshot = str(stem.with_suffix(".png"))
 
 
-def finished(reconstructor: Reconstructor, source: LiveSource) -> Reconstruction:
+def finished(reconstructor: Reconstructor, source: LiveSource) -> Result:
     """Return a session's result, its provenance with the frames that were dropped."""
     result = reconstructor.result()
     if source.dropped:

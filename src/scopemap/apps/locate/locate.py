@@ -23,7 +23,7 @@ from scopemap.engine.tracking.features import FeatureDetector, Features, relativ
 from scopemap.input.mask_files import create_masks
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence as FrameSequence
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.runner.reread_frames import reread_frames
 
 _CANDIDATES = 8  # keyframes whose matches are verified
@@ -88,7 +88,7 @@ class PlaceMap:
     """
 
     def __init__(self, folder: Path, source: Path | None = None, detector: FeatureDetector | None = None) -> None:
-        run = RunFolder(folder).checked()
+        run = Result(folder).checked()
         if not run.depth.present:
             raise InputError(f"the run {folder} kept no depth maps")
         self._detector, self._flow, self._depth = detector or AlikeFeatures(), DisFlow(), run.depth
@@ -176,7 +176,7 @@ def open_other(
 
     The settings of the input, and the parameters, are those of `open_sequence`, which see for what is raised.
     """
-    run = RunFolder(folder).checked()
+    run = Result(folder).checked()
     kept, settings = run.source_camera_file, run.config.input
     sequence = open_sequence(path, camera=camera, dataset=dataset, frames=frames, settings=settings)
     if sequence.calibrated or kept is None:
@@ -192,7 +192,7 @@ def locate(folder: Path, sequence: FrameSequence | Path | str, source: Path | No
     result's own input is now; else it is looked for.
     """
     sequence = open_other(folder, sequence) if isinstance(sequence, Path | str) else sequence
-    places, settings = PlaceMap(folder, source), RunFolder(folder).config.mask.model_copy(update={"files": ""})
+    places, settings = PlaceMap(folder, source), Result(folder).config.mask.model_copy(update={"files": ""})
     mask = Masker(settings, create_masks(settings, sequence.rectifier, sequence.source.masks))
     return (places.locate(mask(frame)) for frame in sequence.frames())
 

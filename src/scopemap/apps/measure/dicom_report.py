@@ -16,7 +16,7 @@ from scopemap.apps.export.dicom_stl import dicom_stl
 from scopemap.apps.measure.measure import Measure
 from scopemap.apps.measure.surface_finding import SurfaceFinding
 from scopemap.engine.errors import SettingsError
-from scopemap.runner.exported_run import ExportedRun
+from scopemap.result.result import Result
 
 _UNITS = {"mm": ("mm", "UCUM", "mm"), "mm2": ("mm2", "UCUM", "mm2")}
 _NO_UNITS = ("1", "UCUM", "no units")
@@ -32,7 +32,7 @@ _ENDOSCOPY = ("423827005", "SCT", "Endoscopy")
 _ONLY_RESEARCH = "research software, not a medical device; intervals are of 95 %"
 
 
-def write_dicom_report(run: ExportedRun, findings: list[SurfaceFinding], about_scale: str, file: Path) -> None:
+def write_dicom_report(run: Result, findings: list[SurfaceFinding], about_scale: str, file: Path) -> None:
     """Write findings with their sizes and intervals; about_scale : what these, and the points, rest on.
 
     Raises `SettingsError` where highdicom is not installed, `InputError` where the run has no surface.

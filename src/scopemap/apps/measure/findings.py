@@ -9,7 +9,7 @@ from scopemap.apps.export.slicer_markups import markup, write_markups
 from scopemap.apps.measure.dicom_report import write_dicom_report
 from scopemap.apps.measure.surface_finding import SurfaceFinding
 from scopemap.engine.errors import reporting
-from scopemap.runner.exported_run import read_exported
+from scopemap.result.result import Result
 
 FINDING_ENDINGS = (".json", ".dcm")
 
@@ -20,7 +20,7 @@ def write_findings(run: Path, findings: list[SurfaceFinding], scale: str, file: 
     scale : what their sizes rest on. Raises `InputError` where the file cannot be written, `SettingsError` where
     highdicom is not installed.
     """
-    exported = read_exported(run)
+    exported = Result(run).checked(with_poses=True)
     about = f"sizes: {scale}" + (f"; points, as the surface: {exported.scale}" if scale != exported.scale else "")
     with reporting(f"cannot write {file}"):
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -24,8 +24,8 @@ from scopemap.engine.geometry.lesion_shape import LesionView, view_shape
 from scopemap.engine.geometry.rendering import render_mesh, vertex_colours
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.input.camera_files.reading import read_calibration
-from scopemap.input.decoding import by_number, read_decoded
-from scopemap.runner.exported_run import ExportedRun, read_exported, write_image
+from scopemap.input.decoding import by_number, read_decoded, write_image
+from scopemap.result.result import Result
 
 _FIGURES = {
     "diameter": ("largest diameter", 1, 0.04),
@@ -82,7 +82,7 @@ def measure_lesion(
     whose straight distance is the unit of what is returned, or is `reference_mm`; needed where the run's scale is
     unknown. Raises `InputError` where it is missing, where masks do not fit, and where no frame sees the whole lesion.
     """
-    run = read_exported(folder)
+    run = Result(folder).checked(with_poses=True)
     scale = known_scale(run, _known(reference, frame if reference_frame is None else reference_frame, reference_mm))
     of_frames = _masks_of_folder(run, masks) if isinstance(masks, Path) and masks.is_dir() else None
     shown = carried_masks(run, *_mask_of_frame(run, masks, frame)) if of_frames is None else of_frames
@@ -108,12 +108,12 @@ def measure_lesion(
     return MeasuredLesion(found, scale.words, counted, _outline(run, best, counted[best]))
 
 
-def _outline(run: ExportedRun, index: int, mask: np.ndarray) -> np.ndarray:
+def _outline(run: Result, index: int, mask: np.ndarray) -> np.ndarray:
     """Return points (N, 3) of the surface, world mm, around what a mask (H, W) bool of a frame shows."""
     contours = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     pixels = max(contours, key=len)[:, 0]
     pixels = pixels[:: -(-len(pixels) // _OUTLINE_POINTS)]
-    pose = run.trajectory.T_world_camera[run.trajectory.indices == index][0]
+    pose = run.tracked.trajectory.T_world_camera[run.tracked.trajectory.indices == index][0]
     depth_mm = render_mesh(_at(run, run.mesh, index), run.camera, pose).depth_mm[pixels[:, 1], pixels[:, 0]]
     known = np.isfinite(depth_mm)
     return transform(pose, run.camera.unproject(pixels[known]) * depth_mm[known, None])
@@ -127,9 +127,9 @@ def _known(reference: np.ndarray | None, frame: int | None, length_mm: float | N
     return Known(frame, reference, length_mm)
 
 
-def _masks_of_folder(run: ExportedRun, folder: Path) -> dict[int, np.ndarray]:
+def _masks_of_folder(run: Result, folder: Path) -> dict[int, np.ndarray]:
     """Return the masks (H, W) bool of the frames that have a pose, by the number of the frame."""
-    tracked = set(run.trajectory.indices.tolist())
+    tracked = set(run.tracked.trajectory.indices.tolist())
     files = by_number(file for file in folder.iterdir() if not file.name.startswith("."))
     masks = {index: _read_mask(run, file) for index, file in files.items() if index in tracked}
     if not masks:
@@ -137,11 +137,11 @@ def _masks_of_folder(run: ExportedRun, folder: Path) -> dict[int, np.ndarray]:
     return masks
 
 
-def _mask_of_frame(run: ExportedRun, mask: Path | np.ndarray, frame: int | None) -> tuple[int, np.ndarray]:
+def _mask_of_frame(run: Result, mask: Path | np.ndarray, frame: int | None) -> tuple[int, np.ndarray]:
     """Return a frame's number and its mask (H, W) bool, by a picture, a mask, or corners (N, 2)."""
     if frame is None:
         raise SettingsError("one mask of a lesion, or corners, without the frame that they are of: give both")
-    if frame not in run.trajectory.indices:
+    if frame not in run.tracked.trajectory.indices:
         raise InputError(f"frame {frame}, of which the lesion's mask is, has no pose in {run.path}")
     if isinstance(mask, Path):
         return frame, _read_mask(run, mask)
@@ -154,7 +154,7 @@ def _mask_of_frame(run: ExportedRun, mask: Path | np.ndarray, frame: int | None)
     return frame, cv2.fillPoly(np.zeros(size, np.uint8), [np.rint(mask).astype(np.int32)], 1) > 0
 
 
-def _read_mask(run: ExportedRun, file: Path) -> np.ndarray:
+def _read_mask(run: Result, file: Path) -> np.ndarray:
     """Return a mask (H, W) bool of the rectified picture; one of the input's picture is rectified."""
     picture, camera = read_decoded(file), run.camera
     if picture is None:
@@ -174,7 +174,7 @@ def _read_mask(run: ExportedRun, file: Path) -> np.ndarray:
 
 def frame_at(folder: Path, second: float) -> int:
     """Return the number of the frame with a pose that is nearest to a time, s."""
-    trajectory = read_exported(folder).trajectory
+    trajectory = Result(folder).checked(with_poses=True).tracked.trajectory
     return int(trajectory.indices[np.abs(trajectory.times_s - second).argmin()])
 
 
@@ -183,7 +183,7 @@ def shaft_width(folder: Path, file: Path) -> np.ndarray:
 
     The tip is the end of the mask that is farther from the picture's border.
     """
-    mask = _read_mask(read_exported(folder), file)
+    mask = _read_mask(Result(folder).checked(with_poses=True), file)
     pixels = np.argwhere(mask)[:, ::-1].astype(float)
     if len(pixels) < _LEAST_PX:
         raise InputError(f"the mask {file} shows no shaft: it has {len(pixels)} pixels")
@@ -200,9 +200,9 @@ def shaft_width(folder: Path, file: Path) -> np.ndarray:
     return centre + np.outer([-0.5, 0.5], width * across)
 
 
-def carried_masks(run: ExportedRun, frame: int, mask: np.ndarray) -> dict[int, np.ndarray]:
+def carried_masks(run: Result, frame: int, mask: np.ndarray) -> dict[int, np.ndarray]:
     """Return the masks (H, W) bool of what a mask of one frame shows, in all frames that see it, by number."""
-    poses = dict(zip(run.trajectory.indices.tolist(), run.trajectory.T_world_camera, strict=True))
+    poses = dict(zip(run.tracked.trajectory.indices.tolist(), run.tracked.trajectory.T_world_camera, strict=True))
     surface = _marked(run, frame, mask, poses[frame])
     middle = np.asarray(surface.vertices)[vertex_colours(surface)[:, 0] > 127].mean(axis=0)
     pixels = {n: run.camera.project(transform(inverse(pose), middle[None]))[0] for n, pose in poses.items()}
@@ -228,11 +228,11 @@ def _largest_part(mask: np.ndarray) -> np.ndarray:
     return np.asarray(parts == 1 + facts[1:, cv2.CC_STAT_AREA].argmax())
 
 
-def _at(run: ExportedRun, mesh: trimesh.Trimesh, index: int) -> trimesh.Trimesh:
+def _at(run: Result, mesh: trimesh.Trimesh, index: int) -> trimesh.Trimesh:
     return mesh if run.states is None else run.states.moved(mesh, index)
 
 
-def _marked(run: ExportedRun, frame: int, mask: np.ndarray, pose: np.ndarray) -> trimesh.Trimesh:
+def _marked(run: Result, frame: int, mask: np.ndarray, pose: np.ndarray) -> trimesh.Trimesh:
     """Return the surface, its vertices white where a frame sees them inside a mask, black elsewhere."""
     mesh = run.mesh
     seen = render_mesh(_at(run, mesh, frame), run.camera, pose).depth_mm
@@ -249,7 +249,7 @@ def _marked(run: ExportedRun, frame: int, mask: np.ndarray, pose: np.ndarray) ->
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
 
-def _view(run: ExportedRun, index: int, mask: np.ndarray) -> LesionView | None:
+def _view(run: Result, index: int, mask: np.ndarray) -> LesionView | None:
     """Return the sizes of a lesion in a frame; None where it is cut off, too small, or its depth unknown."""
     depth_mm = run.depth.read(index)
     inner = mask[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX]
@@ -296,7 +296,7 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 def write_outlines(run: Path, masks: dict[int, np.ndarray], folder: Path) -> None:
     """Write the frames' pictures that a run kept with the outlines of masks (H, W) bool on them, as JPEG."""
-    exported = read_exported(run)
+    exported = Result(run).checked(with_poses=True)
     for index, mask in masks.items():
         picture = read_decoded(exported.picture_file(index))
         if picture is not None:

@@ -18,7 +18,7 @@ from scopemap.apps.measure.intervals import SIGMAS, LogChanges
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
 from scopemap.report.measured_surface import measure_errors, measured_depth, measured_mesh
-from scopemap.runner.exported_run import ExportedRun, read_exported
+from scopemap.result.result import Result
 
 _REFERENCE_SHARE = 0.3
 _MOST_SIGMA = 0.05
@@ -78,7 +78,7 @@ def measure(
     """
     if reference is None and reference_mm is not None:
         raise SettingsError("a length of the reference without its two points: give both")
-    run = read_exported(folder)
+    run = Result(folder).checked(with_poses=True)
     scale = known_scale(run, None if reference is None else Known(frame, reference, reference_mm))
     pose, mesh = _pose(run, frame), measured_mesh(run, frame)
     picked = _picked(run, mesh, frame, pose, pixels)
@@ -124,7 +124,7 @@ class KnownScale:
         return {"mm": "mm2"}.get(self.unit, "times the reference's square")
 
 
-def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
+def known_scale(run: Result, known: Known | None) -> KnownScale:
     """Return the scale that a run knows, or that of a reference. Raises `InputError` where neither gives one."""
     errors = measure_errors(run)
     by_focal = LogChanges(np.array([[0, 0], _focal_changes(errors["focal"]), [0, 0]]))
@@ -153,16 +153,16 @@ def known_scale(run: ExportedRun, known: Known | None) -> KnownScale:
     return KnownScale(length / (known.length_mm or 1.0), changes, from_views, unit, words)
 
 
-def _pose(run: ExportedRun, frame: int) -> np.ndarray:
-    row = np.flatnonzero(run.trajectory.indices == frame)
+def _pose(run: Result, frame: int) -> np.ndarray:
+    row = np.flatnonzero(run.tracked.trajectory.indices == frame)
     if len(row):
-        return np.asarray(run.trajectory.T_world_camera[row[0]])
+        return np.asarray(run.tracked.trajectory.T_world_camera[row[0]])
     place = run.frames.place[run.frames["index"] == frame]
     where = f"it is in maps/{place[0]}, a folder of its own" if len(place) and place[0] > 0 else "it has no pose"
     raise InputError(f"frame {frame} is not in the result {run.path}: {where}")
 
 
-def _picked(run: ExportedRun, mesh: trimesh.Trimesh, frame: int, pose: np.ndarray, pixels: np.ndarray) -> _Picked:
+def _picked(run: Result, mesh: trimesh.Trimesh, frame: int, pose: np.ndarray, pixels: np.ndarray) -> _Picked:
     points, depths = [], []
     for pixel in pixels:
         inside = (pixel >= -0.5).all() and (pixel < [run.camera.width - 0.5, run.camera.height - 0.5]).all()
@@ -177,7 +177,7 @@ def _picked(run: ExportedRun, mesh: trimesh.Trimesh, frame: int, pose: np.ndarra
     return _Picked(pixels, points, depth_mm, _depth_errors(run, frame, pixels, depth_mm))
 
 
-def _depth_errors(run: ExportedRun, frame: int, pixels: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
+def _depth_errors(run: Result, frame: int, pixels: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
     """Return relative standard deviations: the run's own, or what surface and frame differ by where that is more."""
     errors, coded = np.full(len(pixels), np.nan), measured_depth(run, frame)
     if coded is not None:
@@ -195,7 +195,7 @@ def _focal_changes(sigma: float) -> tuple[float, float]:
     return -float(np.log1p(-SIGMAS * sigma)), -float(np.log1p(SIGMAS * sigma))
 
 
-def _changes(run: ExportedRun, picked: _Picked, figure: Callable[[np.ndarray], np.ndarray]) -> LogChanges:
+def _changes(run: Result, picked: _Picked, figure: Callable[[np.ndarray], np.ndarray]) -> LogChanges:
     """Return the changes of ln of a figure of the points.
 
     Half of the variance of a depth is that of the whole frame, half its own.

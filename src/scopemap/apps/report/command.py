@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from scopemap.terminal.options import RunFolder
+from scopemap.terminal.options import ResultFolder
 
 
 def report(
-    run: RunFolder,
+    run: ResultFolder,
     pictures: Annotated[
         bool,
         typer.Option("--pictures", help="Take the frames' pictures from the input again; done where none were kept."),
@@ -19,10 +19,10 @@ def report(
     """Write report.html and summary.png of a run into its folder."""
     from scopemap.engine.errors import InputError
     from scopemap.report.page import write_report
-    from scopemap.result.run_folder import RunFolder
+    from scopemap.result.result import Result
     from scopemap.runner.reread_frames import keep_pictures_again
 
-    if pictures or not RunFolder(run).pictured:
+    if pictures or not Result(run).pictured:
         try:
             keep_pictures_again(run)
         except InputError as fault:

@@ -19,7 +19,7 @@ from scopemap.terminal.progress import run_progress
 if TYPE_CHECKING:
     from scopemap.engine.config import Config
     from scopemap.result.frame_table import FrameTable
-    from scopemap.result.reconstruction import Reconstruction
+    from scopemap.result.result import Result
 
 _SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
 _MOST_LOSSES = 5
@@ -182,7 +182,7 @@ def run(
         raise typer.Exit(interruption.exit_code)
 
 
-def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
+def _report(result: Result, config: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
     provenance = result.provenance
     if not quiet:
         print_warnings(provenance)
@@ -196,7 +196,7 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
         typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, depth_preview/, frames.csv{submaps}")
 
 
-def summary_lines(result: Reconstruction) -> list[str]:
+def summary_lines(result: Result) -> list[str]:
     """Return the summary of a run, one fact per line."""
     from scopemap.engine.notices import scale_words
     from scopemap.result.losses import losses
@@ -237,7 +237,7 @@ def _map_lines(frames: FrameTable) -> list[str]:
     return [f"maps in order of time: {', '.join(maps)}"] + [f"most doubtful map: {doubt}"] * bool(doubt)
 
 
-def _time_words(result: Reconstruction) -> str:
+def _time_words(result: Result) -> str:
     """Return how long the run took and its frames per second; of a resumed one since then."""
     from scopemap.result.verdict import frames_per_s
 

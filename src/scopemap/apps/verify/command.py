@@ -7,13 +7,13 @@ from dataclasses import asdict
 import typer
 
 from scopemap.terminal.figures import print_json
-from scopemap.terminal.options import AsJson, Quiet, RunFolder
+from scopemap.terminal.options import AsJson, Quiet, ResultFolder
 
 _MOST_NAMED = 20
 
 
 def verify(
-    run: RunFolder,
+    run: ResultFolder,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:

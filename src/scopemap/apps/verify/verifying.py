@@ -9,7 +9,7 @@ from pathlib import Path
 
 from scopemap.engine.errors import InputError, reporting
 from scopemap.result.checksums import NEEDED, SUMS, digest_of, files_in, read_checksums
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def verify_result(folder: Path) -> Verified:
 
 def _notes(folder: Path) -> list[str]:
     """Return whether the run was interrupted, and versions that are others here."""
-    provenance = RunFolder(folder).provenance
+    provenance = Result(folder).provenance
     versions, last = dict(provenance.get("versions") or {}), provenance.get("interrupted_at_frame")
     notes = [] if last is None else [f"it was interrupted at frame {last}"]
     notes.append(f"made by scopemap {versions.get('scopemap', 'of unknown version')}")

@@ -9,11 +9,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from scopemap.terminal.options import InputNow, RunFolder
+from scopemap.terminal.options import InputNow, ResultFolder
 
 
 def view(
-    run: RunFolder,
+    run: ResultFolder,
     port: Annotated[int, typer.Option(min=0, max=65535, metavar="PORT", help="0: any free port.")] = 0,
     turntable: Annotated[
         Path | None,

@@ -25,7 +25,7 @@ from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet, rgb_of
 from scopemap.report.shown_mesh import simplified
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 from scopemap.runner.reread_frames import reread_frames
 
 _SMOOTH_S = 0.2  # standard deviation of the path's filter
@@ -59,7 +59,7 @@ def write_fly_through(folder: Path, file: Path, source: Path | None = None, pain
     Raises `InputError` where the folder holds no finished run or no surface, its input is gone, or the film cannot be
     written.
     """
-    run = RunFolder(folder).checked()
+    run = Result(folder).checked()
     if not len(run.mesh.faces):
         raise InputError(f"{folder}: the run has no surface to fly through")
     time_s = run.frames.only(run.frames.tracked)["time_s"]
@@ -85,7 +85,7 @@ def smoothed_poses(T_world_camera: np.ndarray, time_s: np.ndarray) -> np.ndarray
     return np.stack([se3(*motion) for motion in zip(R, smooth[:, :3], strict=True)])
 
 
-def _pictures(run: RunFolder, source: Path | None, painting: Painting | None) -> Iterator[np.ndarray]:
+def _pictures(run: Result, source: Path | None, painting: Painting | None) -> Iterator[np.ndarray]:
     """Yield the pictures of the film, (H, W, 3) uint8."""
     tracked, mesh = run.frames.only(run.frames.tracked), simplified(run.mesh, MOST_FACES)
     painted = None if painting is None else simplified(painting.mesh, MOST_FACES)
@@ -93,7 +93,7 @@ def _pictures(run: RunFolder, source: Path | None, painting: Painting | None) ->
     smooth = dict(zip(indices, smoothed_poses(poses, tracked["time_s"]), strict=True))
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)))
     way, lumen = dict(zip(indices, along, strict=True)), _centreline(run)
-    for frame in reread_frames(run.path, set(indices), source):
+    for frame in reread_frames(run.folder, set(indices), source):
         pose = smooth[frame.index]
         surface, known_mm = _surface(run, mesh, frame, pose)
         if painted is not None:
@@ -111,11 +111,11 @@ def _pictures(run: RunFolder, source: Path | None, painting: Painting | None) ->
         yield _side_by_side(frame, surface, words, float(px_per_mm), clock, legend)
 
 
-def _at(run: RunFolder, mesh: trimesh.Trimesh, frame: Frame) -> trimesh.Trimesh:
+def _at(run: Result, mesh: trimesh.Trimesh, frame: Frame) -> trimesh.Trimesh:
     return mesh if run.states is None else run.states.moved(mesh, frame.index)
 
 
-def _surface(run: RunFolder, mesh: trimesh.Trimesh, frame: Frame, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _surface(run: Result, mesh: trimesh.Trimesh, frame: Frame, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the surface (H, W, 3) uint8 from a pose, lit and exposed as a frame, and the frame's depth (H, W), mm."""
     depth_mm = run.depth.read(frame.index)
     known_mm = np.full(frame.valid.shape, np.nan) if depth_mm is None else np.where(frame.valid, depth_mm, np.nan)
@@ -125,7 +125,7 @@ def _surface(run: RunFolder, mesh: trimesh.Trimesh, frame: Frame, pose: np.ndarr
     return np.where(np.isnan(view.depth_mm)[..., None], np.array(rgb_of(_EMPTY), np.uint8), view.rgb), known_mm
 
 
-def _centreline(run: RunFolder) -> tuple[Centreline, int] | None:
+def _centreline(run: Result) -> tuple[Centreline, int] | None:
     """Return the centreline of a lumen, and the number of its point where the examined part begins; None: no lumen."""
     try:
         space = examined_space(run)

@@ -12,7 +12,7 @@ from scopemap.apps.coverage.coverage import coverage
 from scopemap.apps.view.fly_through import Painting
 from scopemap.engine.errors import InputError
 from scopemap.report.coverage_picture import COLOURS, OUTSIDE
-from scopemap.result.run_folder import RunFolder
+from scopemap.result.result import Result
 
 _LEVELS = 0.0, 0.25, 0.5, 0.75, 1.0
 
@@ -26,7 +26,7 @@ def coverage_painting(folder: Path) -> Painting:
 
 def confidence_painting(folder: Path) -> Painting:
     """Return the surface of a run by the confidence of its vertices; `InputError` where the run does not know it."""
-    mesh = RunFolder(folder).checked().mesh
+    mesh = Result(folder).checked().mesh
     if "confidence" not in mesh.vertex_attributes:
         raise InputError(f"{folder}: the confidence of its surface is not known")
     colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]

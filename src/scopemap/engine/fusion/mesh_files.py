@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from scopemap.engine.errors import reporting
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.mapping.tissue_states import TissueStates
 
@@ -38,6 +39,28 @@ def save_mesh(
         ply_file.write_bytes(ply_bytes(mesh, [_PLY_AXES, comment]))
     if glb_file is not None and len(mesh.faces):
         glb_file.write_bytes(_glb(mesh, comment))
+
+
+def read_mesh(file: Path) -> trimesh.Trimesh:
+    """Return the surface in a PLY file with its vertices' attributes; empty where there is no file or no face.
+
+    Raises `InputError` where it is damaged.
+    """
+    if not file.is_file():
+        return trimesh.Trimesh()
+    with reporting(f"cannot read {file}"):
+        mesh = trimesh.load(file, process=False)
+        if not isinstance(mesh, trimesh.Trimesh):
+            return trimesh.Trimesh()
+        # trimesh leaves properties that it does not know in the raw table.
+        vertices = mesh.metadata["_ply_raw"]["vertex"]["data"]
+        for name in sorted({"confidence", "moving", "sigma_mm"} & set(vertices.dtype.names)):
+            mesh.vertex_attributes[name] = np.array(vertices[name])
+        if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+            raise ValueError("it is damaged: a face has a vertex that is not there")
+        if not np.isfinite(mesh.vertices).all():
+            raise ValueError("it is damaged: a vertex is nowhere")
+    return mesh
 
 
 def save_mesh_over_time(mesh: trimesh.Trimesh, states: TissueStates, glb_file: Path, *, comment: str = "") -> None:

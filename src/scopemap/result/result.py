@@ -1,0 +1,371 @@
+"""`Result`: what a run found, read from its folder part by part, or held in memory until it is saved.
+
+out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frames.csv  config.toml  provenance.json
+      depth/000000.png (16 bit, depth/depth.json has the scale)  depth_sigma/000000.png (8 bit, relative)
+      depth_preview/000000.jpg (colours)  tissue_motion.npz mesh_over_time.glb (where tissue moves)
+      maps/1 (the same for submaps that are not merged), ...
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
+from scopemap.engine.config import Config
+from scopemap.engine.errors import InputError, reporting
+from scopemap.engine.fusion.mesh_files import read_mesh, save_mesh, save_mesh_over_time
+from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.engine.notices import scale_words
+from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.trajectory.trajectory import Trajectory, write_tum
+from scopemap.result.depth_maps import DepthReader
+from scopemap.result.frame_table import FrameTable
+from scopemap.result.trajectory_folders import read_frames, submap_folders
+
+if TYPE_CHECKING:
+    from scopemap.apps.coverage.coverage import Coverage
+    from scopemap.apps.locate.locate import LocatedFrame
+    from scopemap.apps.measure.lesion import MeasuredLesion
+    from scopemap.apps.measure.measure import Measure
+    from scopemap.input.sequence import Sequence
+
+_SCALE_NOT_STATED = "scale unknown (the run does not state it): sizes are a guess, compare shapes"
+_MOST_PX = 1 << 15
+
+
+class StatedVerdict(NamedTuple):
+    """The verdict on a result: the level (good, doubtful, bad) and the codes of its reasons, worst first."""
+
+    level: str
+    codes: tuple[str, ...]
+
+
+class Result:
+    """The result of a run, or one of its submaps, `maps/N`.
+
+    >>> result = Result("result")  # a folder; parts are read when they are asked for, or `InputError`
+    >>> result.trajectory.T_world_camera, result.mesh, result.depth.read(12), result.verdict
+
+    `reconstruct(..., out=...)` returns it from the folder that it wrote. Without `out`, and from a `Reconstructor`, it
+    is held in memory, where `path` is None, until `save` writes it.
+
+    path : the folder. input_path : where the input of the run is now; None: it is looked for where it was.
+    """
+
+    path: Path | None
+
+    def __init__(self, path: Path | str, input_path: Path | None = None) -> None:
+        self.path, self.input_path = Path(path), input_path
+
+    @classmethod
+    def in_memory(
+        cls,
+        camera: PinholeCamera,
+        frames: FrameTable,
+        mesh: trimesh.Trimesh,
+        config: Config,
+        provenance: dict[str, Any] | None = None,
+        *,
+        source_camera: CameraModel | None = None,
+        states: TissueStates | None = None,
+    ) -> Result:
+        """Return a result that is in no folder yet, without other submaps; the parameters are its attributes."""
+        result = cls.__new__(cls)
+        result.path, result.input_path = None, None
+        # A cached property takes what is here for what it has read.
+        result.__dict__ |= {
+            "camera": camera,
+            "frames": frames,
+            "mesh": mesh,
+            "config": config,
+            "provenance": {} if provenance is None else provenance,
+            "source_camera": source_camera,
+            "others": [],
+            "states": states,
+        }
+        return result
+
+    @property
+    def folder(self) -> Path:
+        """Its folder. Raises `InputError` where it is in memory alone."""
+        if self.path is None:
+            raise InputError("the result is in memory alone: give `reconstruct` a folder, out=, which keeps depth")
+        return self.path
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the folder holds a finished run with its camera: an imported trajectory has none."""
+        needed = ("frames.csv", "trajectory.tum", "provenance.json")
+        return all((self.folder / name).is_file() for name in needed) and "camera" in self.provenance
+
+    def checked(self, *, with_poses: bool = False) -> Result:
+        """Return this result, its table read.
+
+        Raises `InputError` where the folder holds no finished run, or a damaged one; `with_poses`: or no tracked frame.
+        """
+        if not self.is_finished:
+            needed = "frames.csv, trajectory.tum and a provenance.json that knows the camera are needed"
+            raise InputError(f"no finished run in {self.path}: {needed}")
+        if not self.frames.tracked.any() and with_poses:
+            raise InputError(f"{self.path}: no frame was tracked")
+        return self
+
+    @cached_property
+    def provenance(self) -> dict[str, Any]:
+        """What it depends on and what was assumed: input, camera, scale, weights, versions, notices; {} : not known."""
+        file = self.folder / "provenance.json"
+        if not file.is_file():
+            return {}
+        with reporting(f"cannot read {file}"):
+            return dict(json.loads(file.read_text(encoding="utf-8")))
+
+    @property
+    def config_text(self) -> str:
+        """The content of config.toml; "" where there is none."""
+        file = self.folder / "config.toml"
+        with reporting(f"cannot read {file}"):
+            return file.read_text(encoding="utf-8") if file.is_file() else ""
+
+    @cached_property
+    def config(self) -> Config:
+        """The settings of the run, resolved: the TSDF parameters are numbers.
+
+        Raises `SettingsError` for those of another version.
+        """
+        return Config.load(file=self.folder / "config.toml")
+
+    @cached_property
+    def frames(self) -> FrameTable:
+        """A row for each frame, those that were lost, skipped or are in other submaps, too."""
+        frames, _ = read_frames(self.folder)
+        if not self.is_submap:
+            frames.rows["map"][frames["map"] >= len(self.submaps)] = -1
+        return frames
+
+    @property
+    def tracked(self) -> FrameTable:
+        """The frames that have a pose in this submap."""
+        return self.frames.only(self.frames.tracked)
+
+    @property
+    def lost(self) -> FrameTable:
+        """The frames that could not be tracked; those of other submaps are not among them."""
+        return self.frames.only(self.frames.lost)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses with their status; NaN where a frame is lost or in another submap."""
+        return self.frames.trajectory
+
+    @cached_property
+    def others(self) -> list[Result]:
+        """The other submaps, most frames first; each has its own world and scale: their relative pose is unknown."""
+        return [Result(folder, self.input_path) for folder in submap_folders(self.folder)[1:]]
+
+    @property
+    def submaps(self) -> list[Result]:
+        """Itself, then the other submaps: maps/1, maps/2, ..."""
+        return [self, *self.others]
+
+    @property
+    def is_submap(self) -> bool:
+        """Whether it is `maps/N` of a result."""
+        folder = self.folder.resolve().parent
+        return folder.name == "maps" and (folder.parent / "provenance.json").is_file()
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """The surface, world mm, with colours and attributes of its vertices; empty where there is none."""
+        return read_mesh(self.folder / "mesh.ply")
+
+    @cached_property
+    def states(self) -> TissueStates | None:
+        """The states of tissue that moves, of which `mesh` shows one; None where it is taken to be at rest."""
+        return TissueStates.read(self.folder)
+
+    def mesh_at(self, index: int) -> trimesh.Trimesh:
+        """Return the surface in the state of the frame with this number; `mesh` itself where tissue is at rest."""
+        return self.mesh if self.states is None else self.states.moved(self.mesh, index)
+
+    @cached_property
+    def camera(self) -> PinholeCamera:
+        """The working camera of all frames, whose size the depth maps have."""
+        with reporting(f"{self.path}/provenance.json does not state the camera"):
+            facts = self.provenance["camera"]
+            fx, fy, cx, cy = (float(facts[name]) for name in ("fx", "fy", "cx", "cy"))
+            width, height = int(facts["width"]), int(facts["height"])
+            possible = min(fx, fy) > 0 and np.isfinite([fx, fy, cx, cy]).all()
+            if not (possible and 0 < width <= _MOST_PX and 0 < height <= _MOST_PX):
+                raise ValueError(f"it is of {width}x{height} px with a focal length of {fx:g} px")
+            return PinholeCamera(fx, fy, cx, cy, width, height)
+
+    @property
+    def source_camera_file(self) -> Path | None:
+        """The calibration of the input's images before rectification; None where it was not kept."""
+        file = self.folder / "source_camera.yaml"
+        return file if file.is_file() else None
+
+    @cached_property
+    def source_camera(self) -> CameraModel | None:
+        """The camera of the input's images before rectification; None where it was not kept.
+
+        With it `camera.source_pixel` gives the pixel before rectification.
+        """
+        from scopemap.input.camera_files.reading import stated_calibration
+
+        file = self.source_camera_file
+        return None if file is None else stated_calibration(file, (self.camera.width, self.camera.height)).camera
+
+    @property
+    def verdict(self) -> StatedVerdict | None:
+        """Whether it can be trusted, as the report says it; None where no run has stated it."""
+        facts = self.provenance.get("verdict")
+        return facts and StatedVerdict(facts["level"], tuple(reason["code"] for reason in facts["reasons"]))
+
+    @property
+    def scale(self) -> str:
+        """What is known of the scale, in words."""
+        return scale_words(self.provenance.get("scale") or {}) or _SCALE_NOT_STATED
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether sizes were measured or anchored."""
+        return bool((self.provenance.get("scale") or {}).get("known"))
+
+    @cached_property
+    def depth(self) -> DepthReader:
+        """The final depth of its frames; that of a submap is the run's."""
+        own = DepthReader(self.folder)
+        return own if own.present or not self.is_submap else DepthReader(self.folder.resolve().parent.parent)
+
+    def picture_file(self, index: int) -> Path:
+        """Return the file of a frame's small picture."""
+        return self.folder / "frames" / f"{index:06d}.jpg"
+
+    def mask_file(self, index: int) -> Path:
+        """Return the file of the mask of a frame's small picture."""
+        return self.folder / "frames" / f"{index:06d}_mask.png"
+
+    @cached_property
+    def pictured(self) -> list[int]:
+        """The numbers of the frames that have a small picture, ascending; none where it is in memory."""
+        pictures = () if self.path is None else (self.path / "frames").glob("*.jpg")
+        return sorted(int(file.stem) for file in pictures if file.stem.isdecimal())
+
+    @cached_property
+    def measures(self) -> dict[int, tuple[float, float]]:
+        """Sharpness and milliseconds by frame number; {} where a run kept none."""
+        file = self.folder / "frames" / "measures.csv"
+        if not file.is_file():
+            return {}
+        with reporting(f"cannot read {file}"):
+            rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
+            return {int(row["index"]): (float(row["sharpness"]), float(row["ms"])) for row in rows}
+
+    def coverage(self) -> Coverage:
+        """Return which share of the tissue no frame saw, and where, as `scopemap coverage` does.
+
+        `total` and `segments` are shares with intervals of 90 %, `spots` the blind spots, the largest first, `map` the
+        unrolled map; `print` shows it in words (docs/coverage.md). Raises `InputError` where it cannot be said.
+        """
+        from scopemap.apps.coverage.coverage import coverage
+
+        return coverage(self.folder)
+
+    def measure(
+        self, frame: int, pixels: ArrayLike, reference: ArrayLike | None = None, reference_mm: float | None = None
+    ) -> list[Measure]:
+        """Return distances between two pixels (2, 2) of a frame, or the area inside more, as `scopemap measure` does.
+
+        Each has `what`, `value`, `unit`, and `low` and `high`, the ends of its 95 % interval.
+        reference : two pixels (2, 2) of the frame whose distance is the unit, or is `reference_mm` (docs/measure.md).
+        Raises `InputError` where nothing can be measured there.
+        """
+        from scopemap.apps.measure.measure import measure
+
+        ends = None if reference is None else np.asarray(reference, float)
+        return measure(self.folder, frame, np.asarray(pixels, float), ends, reference_mm)
+
+    def measure_lesion(
+        self,
+        masks: Path | str | ArrayLike,
+        frame: int | None = None,
+        *,
+        reference: ArrayLike | None = None,
+        reference_frame: int | None = None,
+        reference_mm: float | None = None,
+    ) -> MeasuredLesion:
+        """Return the sizes of a lesion from all frames together, as `scopemap measure --lesion` does.
+
+        `measures` are its sizes, `scale` what they rest on, `masks` the lesion by frame.
+        masks : a folder of pictures numbered as frames; or of one `frame` a picture, a mask (H, W) bool, or the corners
+        (N, 2) of an outline, px. reference : as in `measure`, pixels of `reference_frame`, by default of `frame`.
+        Raises `InputError` where nothing can be measured.
+        """
+        from scopemap.apps.measure.lesion import measure_lesion
+
+        return measure_lesion(
+            self.folder,
+            Path(masks) if isinstance(masks, Path | str) else np.asarray(masks),
+            frame,
+            reference=None if reference is None else np.asarray(reference, float),
+            reference_frame=reference_frame,
+            reference_mm=reference_mm,
+        )
+
+    def locate(self, sequence: Sequence | Path | str) -> list[LocatedFrame]:
+        """Return where each frame of another video is in the map of this result, as `scopemap locate` does.
+
+        Each has its `status`, "found" or "not found", `T_world_camera` and `inliers`.
+        sequence : from `open_sequence`; or the path of a video, which has the camera of this result's input where it
+        has no calibration of its own (docs/locate.md). Raises `InputError` where the result has no map.
+        """
+        from scopemap.apps.locate.locate import locate
+
+        return list(locate(self.folder, sequence))
+
+    def save(self, folder: Path | str) -> None:
+        """Write everything but the depth maps, which a `DepthWriter` writes frame by frame.
+
+        Raises `InputError` where the folder cannot be written.
+        """
+        folder = Path(folder)
+        for number, other in enumerate(self.others, 1):
+            other.save(folder / "maps" / str(number))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            scale = scale_words(self.provenance.get("scale", {}))
+            write_tum(folder / "trajectory.tum", self.trajectory, comment=scale)
+            save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb", comment=scale)
+            if self.states is not None:
+                self.states.save(folder)
+                save_mesh_over_time(self.mesh, self.states, folder / "mesh_over_time.glb", comment=scale)
+            sigma_px = self.provenance.get("camera", {}).get("focal_sigma_px")
+            write_calibration(self.camera, folder / "camera.yaml", focal_sigma_px=sigma_px)
+            if (source := self.source_camera) is not None:
+                sigma_px = None if sigma_px is None else sigma_px * source.central.fx / self.camera.fx
+                write_calibration(source, folder / "source_camera.yaml", focal_sigma_px=sigma_px)
+            self.frames.write(folder / "frames.csv")
+            (folder / "config.toml").write_text(self.config.toml(), encoding="utf-8")
+            provenance = json.dumps(self.provenance, indent=2) + "\n"
+            (folder / "provenance.json").write_text(provenance, encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"cannot write the result to {folder}: {error.strerror or error}") from None
+
+    def __repr__(self) -> str:
+        from scopemap.report.notebook import in_one_line
+
+        return in_one_line(self)
+
+    def _repr_html_(self) -> str:
+        from scopemap.report.notebook import as_html
+
+        return as_html(self)
