@@ -54,8 +54,8 @@ class TissueStates:
 
     def moved(self, mesh: trimesh.Trimesh, index: int) -> trimesh.Trimesh:
         """Return the surface in the state of the frame with this number."""
-        if not len(mesh.vertices):
-            return mesh
+        if not len(mesh.faces):
+            return mesh  # trimesh cannot copy coloured vertices without a face
         moved = mesh.copy()
         moved.vertices = mesh.vertices + np.tensordot(self.change(index), self.motion(np.asarray(mesh.vertices)), 1)
         return moved
