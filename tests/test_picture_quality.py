@@ -67,6 +67,15 @@ def test_fluid_that_stays_for_two_seconds_is_not_worth_more_in_the_end() -> None
     assert fluid[0] < 0.6
 
 
+@pytest.mark.parametrize("noise", [0, 1])
+def test_pictures_without_colours_are_worth_as_much_as_others(noise: int) -> None:
+    grey, rng = cv2.cvtColor(TISSUE, cv2.COLOR_RGB2GRAY)[..., None], np.random.default_rng(0)
+    quality = PictureQuality()
+    pictures = [np.clip(grey + rng.integers(-noise, noise + 1, TISSUE.shape), 0, 255).astype(np.uint8) for _ in "abc"]
+    assert min(quality(picture, EVERYWHERE) for picture in pictures) > 0.9
+    assert quality(cv2.GaussianBlur(pictures[0], (0, 0), 3.0), EVERYWHERE) < 0.7
+
+
 def test_a_picture_without_a_usable_pixel_has_the_least_worth_and_is_no_measure_for_others() -> None:
     quality = PictureQuality()
     assert [quality(TISSUE, ~EVERYWHERE) for _ in range(3)] == [0.01] * 3

@@ -18,6 +18,9 @@ _SMALL_PX = 320
 _NEIGHBOURS = 100
 _CLEAR_PERCENTILE = 75
 LEAST_QUALITY = 0.01
+# Least sharpness, usable share and saturation of clear frames by which others are judged: pictures may all be flat, or
+# have no colours; coding alone makes saturations of one level in a hundred.
+_LEAST_MEASURES = np.array([1e-6, 1e-6, 0.02])
 
 
 class SharpnessMonitor:
@@ -38,7 +41,8 @@ class PictureQuality:
     """Image quality of frames, in order, beside that of the last 100.
 
     The product of three shares, each 1 at most, of the upper quartile of these frames: sharpness; usable pixels, which
-    are neither saturated nor too dark; and saturation of the colours, since tissue is red and haze is white.
+    are neither saturated nor too dark; and saturation of the colours, since tissue is red and haze is white. What
+    the clear frames lack, too, as a video without colours lacks saturation, does not count.
     """
 
     def __init__(self) -> None:
@@ -57,7 +61,7 @@ class PictureQuality:
         found = sharpness(rgb, valid), share, _saturation(rgb, valid)
         self._recent.append(found)
         clear = np.percentile(self._recent, _CLEAR_PERCENTILE, axis=0)
-        shares = np.minimum(found / np.maximum(clear, 1e-9), 1.0)
+        shares = np.where(clear < _LEAST_MEASURES, 1.0, np.minimum(found / np.maximum(clear, _LEAST_MEASURES), 1.0))
         return max(float(shares.prod()), LEAST_QUALITY)
 
 
