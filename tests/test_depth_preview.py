@@ -18,7 +18,7 @@ from scopemap.engine.config import Config
 from scopemap.engine.frame import Frame
 from scopemap.engine.notices import scale_words
 from scopemap.input.sequence import Sequence
-from scopemap.report.depth_figures import write_previews
+from scopemap.report.depth_figures import MASKED_GREY, DepthPreviews
 from scopemap.result.depth_maps import DepthReader, DepthWriter
 from scopemap.result.result import Result
 
@@ -52,12 +52,15 @@ def _frame(images: Sequence, index: int, depth_mm: float) -> Frame:
 def test_previews_have_one_range_and_legend_for_all_frames_and_unknown_is_black(
     images: Sequence, tmp_path: Path
 ) -> None:
-    write = DepthWriter(tmp_path)
+    write, previews = DepthWriter(tmp_path), DepthPreviews(tmp_path)
     for index, depth_mm in enumerate((10.0, 40.0)):
-        write(_frame(images, index, depth_mm))
+        frame = _frame(images, index, depth_mm)
+        frame.valid[20:30] = False
+        write(frame)
+        previews(frame)
     range_mm = write.finish(scale_known=False)
     assert range_mm is not None
-    write_previews(tmp_path, range_mm, scale_known=False)
+    previews.finish(range_mm, scale_known=False)
     facts = json.loads((tmp_path / "depth" / "depth.json").read_text())
     near_mm, far_mm = facts["preview_mm"]
     assert (near_mm, far_mm) == range_mm
@@ -68,6 +71,8 @@ def test_previews_have_one_range_and_legend_for_all_frames_and_unknown_is_black(
     assert near.dtype == np.uint8
     assert max(near[:6].max(), far[:6].max()) < 20
     assert near[11, 5, 2] > 100 > near[11, 5, 0]  # red, as OpenCV orders colours
+    assert np.abs(near[22:28].astype(int) - MASKED_GREY).max() < 20
+    assert not list((tmp_path / "depth_preview").glob("*.png"))
     height = images.camera.height
     legend = far[height:]
     assert far[height - 2, -5, 0] > far[height - 2, -5, 2]
@@ -79,7 +84,9 @@ def test_previews_have_one_range_and_legend_for_all_frames_and_unknown_is_black(
     assert np.abs(nearest - near[10:14, :4].mean((0, 1))).max() < 40
     assert np.abs(farthest - far[height - 3 : height, -4:].mean((0, 1))).max() < 40
     assert unknown.max() < 30
-    write_previews(tmp_path, range_mm, scale_known=True)
+    for index in (0, 1):
+        previews(_frame(images, index, 10.0))
+    previews.finish(range_mm, scale_known=True)
     known = cv2.imread(str(tmp_path / "depth_preview" / "000001.jpg"))[height:]
     assert (known != legend).any()  # millimetres, not multiples
     assert DepthWriter(tmp_path / "none").finish(scale_known=True) is None

@@ -75,6 +75,10 @@ def test_figures_of_a_wall_are_those_in_closed_form() -> None:
     figures = agreement_figures([same, half])
     assert (figures["frames"], figures["coverage_least"]) == (2, half.coverage)
     assert figures["coverage_mean"] == pytest.approx((1 + half.coverage) / 2)
+    # Half the wall is missing, and so is its agreement; the median does not tell it.
+    assert (same.within_10_percent, half.within_10_percent) == (1.0, half.coverage)
+    assert _compared(wall, rgb, _depth(56.0)).within_10_percent == 0.0
+    assert figures["within_10_percent_least"] == half.coverage
 
 
 def test_without_usable_pixels_there_is_no_figure() -> None:
@@ -82,7 +86,10 @@ def test_without_usable_pixels_there_is_no_figure() -> None:
     assert blind.coverage == 0
     assert math.isnan(blind.depth_error)
     assert agreement_figures([]) == {"frames": 0}
-    assert agreement_figures([blind]) == {"frames": 1, "coverage_mean": 0, "coverage_least": 0}
+    nothing = dict.fromkeys(("coverage", "within_10_percent"), 0)
+    assert agreement_figures([blind]) == {"frames": 1} | {
+        f"{name}_{of}": value for name, value in nothing.items() for of in ("mean", "least")
+    }
 
 
 @pytest.fixture(scope="module")

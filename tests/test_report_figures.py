@@ -59,6 +59,8 @@ def test_trajectories_show_estimate_green_and_truth_red(tmp_path: Path) -> None:
     assert both.shape[1] > 900
     assert count_colour(both, ESTIMATE_COLOUR) > 500
     assert count_colour(both, TRUTH_COLOUR) > 500
+    draw_trajectories(estimate, estimate + 4.0, tmp_path / "runs.png", names=("first", "second"), unit="units")
+    assert (read(tmp_path / "runs.png") != both).any()
 
 
 def test_a_plot_puts_values_where_its_axes_say_and_leaves_gaps() -> None:

@@ -13,6 +13,7 @@ from drawn_run import CAMERA, GOOD_SURFACE, changed, placed_frames, tube
 
 from scopemap.engine.config import Config
 from scopemap.engine.notices import KINDS, Notice, fields_of_kind, notices_of
+from scopemap.report.summary_picture import _head_lines
 from scopemap.result import verdict as rules
 from scopemap.result.frame_table import LOST, NOT_USED
 from scopemap.result.result import Result
@@ -122,6 +123,10 @@ def test_submaps_of_three_seconds_that_are_usable_stand_for_their_part(apart: in
         (surface(depth_error=0.05), "good"),
         (surface(depth_error=0.06), "doubtful"),
         (surface(depth_error=0.16), "not usable"),
+        # A median hides a main organ that has no surface.
+        (surface(within_10_percent_mean=0.75, within_10_percent_least=0.2), "good"),
+        (surface(within_10_percent_mean=0.6, within_10_percent_least=0.3), "doubtful"),
+        (surface(within_10_percent_mean=0.24, within_10_percent_least=0.04), "not usable"),
         ({}, "good"),
     ],
 )
@@ -248,3 +253,13 @@ def test_the_documents_list_every_code() -> None:
 
 def test_no_doubtful_notice_is_left_out_of_the_verdict() -> None:
     assert [code for code, kind in KINDS.items() if kind.level == "doubtful" and kind.plain == ""] == []
+
+
+def test_the_summary_names_every_caution() -> None:
+    run = run_of([0] * 60, interrupted_at_frame=30, camera={"origin": "assumed"}, surface=surface(depth_error=0.06))
+    found = verdict(run)
+    cautions = [reason.text for reason in found.reasons if reason.level in ("bad", "doubtful")]
+    assert len(cautions) == 3
+    lines = " ".join(_head_lines(found))
+    assert all(caution in lines for caution in cautions)
+    assert found.sentence in lines

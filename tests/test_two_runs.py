@@ -54,7 +54,7 @@ def test_the_same_run_in_another_world_agrees(
     found = figures(capfd, first, move(tmp_path / "b", first))
     assert found["common_frames"] == IN_RESULT
     assert found["scale"] == pytest.approx(1.7, rel=1e-4)
-    assert found["path"]["position_max_mm"] < 1e-2
+    assert found["path"]["position_max"] < 1e-2
     assert found["path"]["rotation_max_deg"] < 1e-2
     assert found["surface"]["both_percent"] > 99
     assert found["surface"]["within_2_percent"] > 99
@@ -78,6 +78,7 @@ def test_it_is_told_in_words_and_drawn(tmp_path: Path, capfd: pytest.CaptureFixt
     assert "% within 2 %" in said
     assert "Where they differ, neither is confirmed" in said
     assert "one: scale unknown" in said
+    assert " mm" not in said
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"path.png", "difference.png", "report.html"}
 
 

@@ -23,6 +23,7 @@ from scopemap.report.page import PAGE, write_comparison
 from scopemap.report.sheet import picture_grid
 from scopemap.result.result import Result
 
+_NO_UNIT = "units of the second run"
 _LEAST_COMMON = 3
 _MOST_VIEWS, _DRAWN = 16, 3
 _WITHIN_PERCENT = (2, 5)
@@ -41,21 +42,21 @@ class _View:
 
 @dataclass(frozen=True)
 class TwoRuns:
-    """What two runs differ by. first_mm, second_mm : positions (N, 3) at the common frames, the first's moved."""
+    """What two runs differ by. first, second : positions (N, 3) at the common frames, in the unit of the second."""
 
     figures: dict[str, Any]
-    first_mm: np.ndarray
-    second_mm: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
     views: list[_View]
 
     def lines(self) -> list[str]:
         """Return the figures in words."""
-        path, surface = self.figures["path"], self.figures["surface"]
+        path, surface, unit = self.figures["path"], self.figures["surface"], self.figures["unit"]
         found = [
             f"{self.figures['common_frames']} common frames; the first run was moved onto the second by Sim(3), scale "
             f"{self.figures['scale']:.3f}",
-            f"path: {path['position_rmse_mm']:.2f} mm apart (RMS, {path['position_rmse_percent']:.1f} % of length), "
-            f"{path['position_max_mm']:.2f} mm at most; rotation {path['rotation_mean_deg']:.2f} deg, at most "
+            f"path: {path['position_rmse']:.2f} {unit} apart (RMS, {path['position_rmse_percent']:.1f} % of length), "
+            f"{path['position_max']:.2f} {unit} at most; rotation {path['rotation_mean_deg']:.2f} deg, at most "
             f"{path['rotation_max_deg']:.2f} deg",
         ]
         if surface:
@@ -77,10 +78,11 @@ class TwoRuns:
         """Write difference.png and path.png, the page of both runs, and return the files."""
         with reporting(f"cannot write to {out}"):
             out.mkdir(parents=True, exist_ok=True)
-            draw_trajectories(self.first_mm, self.second_mm, out / "path.png")
+            names = list(self.figures["scales"])
+            unit = self.figures["unit"]
+            draw_trajectories(self.first, self.second, out / "path.png", names=(names[0], names[1]), unit=unit)
             files = [out / "path.png"]
             worst = sorted(self.views, key=lambda view: -float(np.nanmedian(view.difference)))[:_DRAWN]
-            names = list(self.figures["scales"])
             rows = [
                 {
                     f"{names[0]}, frame {v.index}": v.first.rgb,
@@ -115,10 +117,10 @@ def compare_two(
     poses = [table["T_world_camera"][row] for table, row in zip(tables, rows, strict=True)]
     similarity = _similarity(*poses)
     moved = similarity.transform_poses(poses[0])
-    off_mm, off_deg = translation_errors_mm(moved, poses[1]), np.degrees(rotation_errors_rad(moved, poses[1]))
-    rmse_mm, length_mm = float(np.sqrt(np.mean(off_mm**2))), path_length_mm(poses[1][:, :3, 3])
-    path = {"position_rmse_mm": rmse_mm, "position_max_mm": float(off_mm.max())}
-    path |= {"position_rmse_percent": 100 * rmse_mm / length_mm if length_mm else float("nan")}
+    off, off_deg = translation_errors_mm(moved, poses[1]), np.degrees(rotation_errors_rad(moved, poses[1]))
+    rmse, length = float(np.sqrt(np.mean(off**2))), path_length_mm(poses[1][:, :3, 3])
+    path = {"position_rmse": rmse, "position_max": float(off.max())}
+    path |= {"position_rmse_percent": 100 * rmse / length if length else float("nan")}
     path |= {"rotation_mean_deg": float(off_deg.mean()), "rotation_max_deg": float(off_deg.max())}
     chosen = np.unique(np.linspace(0, len(common) - 1, min(_MOST_VIEWS, len(common))).astype(int))
     views = _views(runs, similarity, {int(common[n]): poses[1][n] for n in chosen})
@@ -126,6 +128,7 @@ def compare_two(
         "runs": [str(first), str(second)],
         "common_frames": len(common),
         "scale": similarity.scale,
+        "unit": "mm" if runs[1].scale_known else _NO_UNIT,
         "path": path,
         "surface": _surface_figures(views),
         "scales": dict(zip(names, (run.scale for run in runs), strict=True)),

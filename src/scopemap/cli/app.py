@@ -67,9 +67,16 @@ def _root(
     """From a monocular endoscope video to camera poses and a tissue surface."""
 
 
+def _freeze() -> None:
+    """Keep Python from looking through all that the libraries made once more at exit, which takes .4 s."""
+    # Triton, which comes with torch, prints as leaked what is not collected.
+    if "triton" not in sys.modules:
+        gc.freeze()
+
+
 def main() -> None:
     """Run the command line."""
-    atexit.register(gc.freeze)  # else Python looks through all that the libraries made once more: .4 s
+    atexit.register(_freeze)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             # A pipe on Windows has a code page that lacks most letters.

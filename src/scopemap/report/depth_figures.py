@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from scopemap.engine.errors import reporting
+from scopemap.engine.frame import Frame
 from scopemap.engine.models.device import cpu_threads
 from scopemap.input.decoding import read_decoded
 from scopemap.report.sheet import Sheet, picture_grid
@@ -19,8 +20,10 @@ from scopemap.result.depth_maps import DepthReader, write_picture
 _CELL_PX = (300, 250)
 _LEGEND_PX = 36
 _STEP_PX = 54
-_LAST_PX = 74
+_LAST_PX = 140
 _MOST_NUMBERS = 5
+MASKED_GREY = 110
+"""Level of the pixels of a depth picture that the mask leaves out: border, overlay, highlight, instrument."""
 
 
 def colour_depth(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndarray:
@@ -34,26 +37,45 @@ def colour_depth(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndar
     return rgb
 
 
-def write_previews(folder: Path, range_mm: tuple[float, float], *, scale_known: bool) -> None:
-    """Write a JPEG of each depth map of a result: turbo over its logarithm, red near, blue far, black unknown.
+class DepthPreviews:
+    """Pictures of the depth of a run's frames, for which it keeps the mask of each frame until the colours are known.
 
-    range_mm : depth at the ends of the colours, the same for all frames. What they mean is written below the map: mm,
-    or multiples of the nearest depth where the scale is unknown. Raises `InputError` where nothing can be written.
+    folder : that of the result. Raises `InputError` where nothing can be written.
     """
-    previews = folder / "depth_preview"
-    with reporting(f"cannot write to {previews}"):
-        previews.mkdir(exist_ok=True)
-    bgr_by_unit = _logarithmic(DepthReader(folder).scale_mm * np.arange(1 << 16).clip(1), range_mm)[:, ::-1].copy()
-    bgr_by_unit[0] = 0
-    legend_of = cache(lambda width: _depth_legend(width, range_mm, scale_known)[..., ::-1])
 
-    def write(file: Path) -> None:
-        picture = bgr_by_unit.take(np.asarray(read_decoded(file)), axis=0)
-        write_picture(previews / f"{file.stem}.jpg", np.vstack([picture, legend_of(picture.shape[1])]))
+    NOT_IN_CHECKPOINT = ("_folder",)
+    """Not in a checkpoint: a run may go on under another name of its folder."""
 
-    # All of it but the loop runs without Python's lock.
-    with ThreadPoolExecutor(cpu_threads()) as pool:
-        list(pool.map(write, sorted((folder / "depth").glob("*.png"))))
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "depth_preview"
+
+    def __call__(self, frame: Frame) -> None:
+        """Keep the mask of a frame, as PNG in the place of its picture."""
+        with reporting(f"cannot write to {self._folder}"):
+            self._folder.mkdir(parents=True, exist_ok=True)
+        write_picture(self._folder / f"{frame.index:06d}.png", frame.valid.astype(np.uint8))
+
+    def finish(self, range_mm: tuple[float, float], *, scale_known: bool) -> None:
+        """Write a JPEG of each depth map: turbo over its logarithm, red near, blue far, black unknown, grey masked.
+
+        range_mm : depth at the ends of the colours, the same for all frames. What they mean is written below the map:
+        mm, or multiples of the nearest depth where the scale is unknown.
+        """
+        scale_mm = DepthReader(self._folder.parent).scale_mm
+        bgr_by_unit = _logarithmic(scale_mm * np.arange(1 << 16).clip(1), range_mm)[:, ::-1].copy()
+        bgr_by_unit[0] = 0
+        legend_of = cache(lambda width: _depth_legend(width, range_mm, scale_known)[..., ::-1])
+
+        def write(file: Path) -> None:
+            picture = bgr_by_unit.take(np.asarray(read_decoded(file)), axis=0)
+            kept = self._folder / file.name
+            picture[np.asarray(read_decoded(kept)) == 0] = MASKED_GREY
+            write_picture(kept.with_suffix(".jpg"), np.vstack([picture, legend_of(picture.shape[1])]))
+            kept.unlink()
+
+        # All of it but the loop runs without Python's lock.
+        with ThreadPoolExecutor(cpu_threads()) as pool:
+            list(pool.map(write, sorted((self._folder.parent / "depth").glob("*.png"))))
 
 
 def _logarithmic(depth_mm: np.ndarray, range_mm: tuple[float, float]) -> np.ndarray:
@@ -69,6 +91,7 @@ def _depth_legend(width: int, range_mm: tuple[float, float], scale_known: bool) 
     unit_mm = 1.0 if scale_known else range_mm[0]
     colours = (f"#{bytes(rgb).hex()}" for rgb in _logarithmic(shown_mm, range_mm))
     words = dict(zip([f"{mm / unit_mm:.3g}" for mm in shown_mm], colours, strict=True)) | {"unknown": "#000000"}
+    words["no tissue"] = f"#{bytes([MASKED_GREY] * 3).hex()}"
     sheet = Sheet(width, _LEGEND_PX)
     sheet.text((4, 2), "depth, mm" if scale_known else "depth, multiples of the nearest", 11)
     sheet.legend((4, 18), words, _STEP_PX, 10)

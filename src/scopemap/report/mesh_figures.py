@@ -1,6 +1,6 @@
 """Figures of meshes and camera paths, without a display and without OpenGL.
 
-Estimates are green, true values red, as in the paper's experiment 4 (arXiv 2508.11282).
+Estimates are green, true values red, as in the paper's experiment 4 (arXiv 2508.11282); of two runs the first is green.
 """
 
 from __future__ import annotations
@@ -40,13 +40,20 @@ class MeshView:
         return points, self.camera.project(points)
 
 
-def draw_trajectories(estimate_positions_mm: np.ndarray, true_positions_mm: np.ndarray, file: Path) -> None:
-    """Draw camera positions (N, 3) and the true ones (M, 3), mm, in three orthogonal views as a PNG.
+def draw_trajectories(
+    positions: np.ndarray,
+    reference: np.ndarray,
+    file: Path,
+    *,
+    names: tuple[str, str] = ("estimate", "truth"),
+    unit: str = "mm",
+) -> None:
+    """Draw camera positions (N, 3) over those that they are compared with (M, 3), in three orthogonal views as a PNG.
 
-    A dot marks the start; rows of NaN (lost frames) are gaps.
+    names : what the two are. unit : of the axes. A dot marks the start; rows of NaN (lost frames) are gaps.
     """
     sheet = Sheet(3 * _PLOT_PX + 20, _PLOT_PX + 20)
-    paths = {TRUTH_COLOUR: true_positions_mm, ESTIMATE_COLOUR: estimate_positions_mm}
+    paths = {TRUTH_COLOUR: reference, ESTIMATE_COLOUR: positions}
     for number, axes in enumerate([(0, 1), (0, 2), (2, 1)]):
         shown = {colour: positions[:, axes] for colour, positions in paths.items()}
         known = np.concatenate([values[np.isfinite(values).all(1)] for values in shown.values()])
@@ -56,11 +63,11 @@ def draw_trajectories(estimate_positions_mm: np.ndarray, true_positions_mm: np.n
         # The world's y points down.
         inside = (number * _PLOT_PX + 60.0, 15.0, _PLOT_PX - 60.0, _PLOT_PX - 60.0)
         plot = Plot(sheet, inside, x, y[::-1] if axes[1] == 1 else y)
-        plot.frame(f"{'xyz'[axes[0]]} mm", f"{'xyz'[axes[1]]} mm")
+        plot.frame(f"{'xyz'[axes[0]]} {unit}", f"{'xyz'[axes[1]]} {unit}")
         for colour, values in shown.items():
             _draw_line(sheet, plot.place(values), colour, 2)
-    sheet.text((80, _PLOT_PX - 92), "estimate", 14, ESTIMATE_COLOUR)
-    sheet.text((80, _PLOT_PX - 76), "truth", 14, TRUTH_COLOUR)
+    sheet.text((80, _PLOT_PX - 92), names[0], 14, ESTIMATE_COLOUR)
+    sheet.text((80, _PLOT_PX - 76), names[1], 14, TRUTH_COLOUR)
     sheet.text((80, _PLOT_PX - 60), "dot: start", 12, SOFT)
     sheet.save(file)
 

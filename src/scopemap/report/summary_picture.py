@@ -4,6 +4,7 @@ the submaps side by side where there are several.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import cv2
@@ -14,6 +15,8 @@ from PIL import Image
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.rendering import render_mesh, vertex_colours
 from scopemap.input.decoding import read_decoded
+from scopemap.report.depth_figures import MASKED_GREY
+from scopemap.report.frame_pictures import WHOLLY_USABLE
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     MeshView,
@@ -32,10 +35,12 @@ from scopemap.result.verdict import Verdict, scale_is_known, verdict
 
 _CELL_PX = 384
 _GAP_PX = 12
-_HEAD_PX = 104
+_HEAD_PX = 50  # above its lines
+_LINE_PX = 18
+_LINE_LETTERS = 190
 _LABEL_PX = 26
 _COLUMNS = 4
-_MOST_REASONS = 2
+_LEAST_REASONS = 2
 _TONES = {"good": "#17794a", "doubtful": "#a35a00", "bad": "#b3261e"}
 _UNKNOWN = 32
 
@@ -51,9 +56,11 @@ def summary_picture(run: Result, meshes: Sequence[trimesh.Trimesh]) -> Image.Ima
     rows = [row for row in rows if row]
     heights = [max(picture.shape[0] for picture in row.values()) + _LABEL_PX for row in rows]
     width = _COLUMNS * (_CELL_PX + _GAP_PX) + _GAP_PX
-    sheet = Sheet(width, _HEAD_PX + sum(heights) + _GAP_PX)
-    _write_head(sheet, verdict(run))
-    top = _HEAD_PX
+    found = verdict(run)
+    lines = _head_lines(found)
+    top = _HEAD_PX + _LINE_PX * max(len(lines), _LEAST_REASONS + 1)
+    sheet = Sheet(width, top + sum(heights) + _GAP_PX)
+    _write_head(sheet, found, lines)
     for row, height in zip(rows, heights, strict=True):
         for place, (title, picture) in enumerate(row.items()):
             left = _GAP_PX + place * (_CELL_PX + _GAP_PX)
@@ -64,13 +71,20 @@ def summary_picture(run: Result, meshes: Sequence[trimesh.Trimesh]) -> Image.Ima
     return Image.fromarray(sheet.rgb)
 
 
-def _write_head(sheet: Sheet, found: Verdict) -> None:
+def _head_lines(found: Verdict) -> list[str]:
+    """Return the main facts and every caution, as on the page; the first reasons where there is none."""
+    cautions = [reason for reason in found.reasons if reason.level in ("bad", "doubtful")]
+    shown = [f"- {reason.text}" for reason in cautions or found.reasons[:_LEAST_REASONS]]
+    return [part for line in (found.sentence, *shown) for part in textwrap.wrap(line, _LINE_LETTERS)]
+
+
+def _write_head(sheet: Sheet, found: Verdict, lines: list[str]) -> None:
     sheet.rgb[:9] = rgb_of(_TONES[found.level])
     sheet.text((_GAP_PX, 18), found.word.capitalize(), 38, _TONES[found.level])
     sheet.text((_GAP_PX, 66), "research software, not a medical device", 14, SOFT)
     sheet.text((330, 16), found.advice, 19)
-    for place, line in enumerate([found.sentence, *(f"- {reason.text}" for reason in found.reasons[:_MOST_REASONS])]):
-        sheet.text((330, 42 + 18 * place), line, 14, SOFT)
+    for place, line in enumerate(lines):
+        sheet.text((330, 42 + _LINE_PX * place), line, 14, SOFT)
 
 
 def _spread(run: Result) -> list[int]:
@@ -114,10 +128,22 @@ def _depth_row(run: Result, frames: list[int]) -> dict[str, np.ndarray]:
     if run.scale_known:
         ends = (f"{np.exp(near):.3g} mm", f"{np.exp(far):.3g} mm")
     titles = [f"depth: red {ends[0]}, blue {ends[1]}"] + [" " * place for place in range(1, len(depths))]
-    shown = {title: _fitted(_turbo(depth, near, far)) for title, depth in zip(titles, depths, strict=True)}
+    pictures = [
+        _without_masked(run, index, _turbo(depth, near, far)) for index, depth in zip(kept, depths, strict=True)
+    ]
+    shown = {title: _fitted(picture) for title, picture in zip(titles, pictures, strict=True)}
     for picture, index in zip(shown.values(), kept, strict=True):
         _scale_frame(run, index, picture)
     return shown
+
+
+def _without_masked(run: Result, index: int, picture: np.ndarray) -> np.ndarray:
+    """Return a picture (H, W, 3) uint8 of a frame's depth, grey where its mask says that there is no tissue."""
+    mask = read_decoded(run.mask_file(index))
+    if mask is not None:
+        mask = cv2.resize(mask, picture.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+        picture[mask != WHOLLY_USABLE] = MASKED_GREY
+    return picture
 
 
 def _turbo(depth_mm: np.ndarray, near: float, far: float) -> np.ndarray:

@@ -28,6 +28,10 @@ LEAST_COVERAGE = 0.5
 GOOD_DISAGREEMENT = 0.05
 MOST_DISAGREEMENT = 0.15
 """Median relative difference between the surface's depth and the frames' depth."""
+GOOD_WITHIN = 0.75
+LEAST_WITHIN = 0.3
+"""Mean share of the picture in which the surface is within 10 % of the frames' depth. Of 74 results on real clips and
+phantoms those called good had 0.8 and more, an abdomen whose main organ has no surface 0.60, one inside out 0.24."""
 MOST_MOVING = 0.5
 """Share of the frames in which tissue moves on its own."""
 LEAST_TRIANGULATED = 0.5
@@ -215,9 +219,14 @@ def _of_surface(run: Result) -> list[Reason]:
         found.append(Reason("surface-coverage", _level(-coverage, -GOOD_COVERAGE, -LEAST_COVERAGE), text))
     if "depth_error" in surface:
         error = float(surface["depth_error"])
-        level = _level(error, GOOD_DISAGREEMENT, MOST_DISAGREEMENT)
+        levels, seen = [_level(error, GOOD_DISAGREEMENT, MOST_DISAGREEMENT)], ""
+        if "within_10_percent_mean" in surface:
+            mean, least = (float(surface[f"within_10_percent_{name}"]) for name in ("mean", "least"))
+            levels.append(_level(-mean, -GOOD_WITHIN, -LEAST_WITHIN))
+            seen = f" They agree within 10 % in {_percent(mean)} of the picture (worst picture: {_percent(least)})."
+        level = max(levels, key=("good", "doubtful", "bad").index)
         words = {"good": "fits", "doubtful": "fits only roughly", "bad": "contradicts"}[level]
-        text = f"The surface {words} the single frames: distances differ by {_percent(error, 1)} (median)."
+        text = f"The surface {words} the single frames: distances differ by {_percent(error, 1)} (median).{seen}"
         found.append(Reason("surface-depth", level, text))
     return found
 

@@ -14,7 +14,7 @@ from scopemap.engine.pipeline import Pipeline
 from scopemap.engine.tracking.track import FrameTracker
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
-from scopemap.report.depth_figures import write_previews
+from scopemap.report.depth_figures import DepthPreviews
 from scopemap.report.notebook_progress import in_notebook, notebook_progress
 from scopemap.result.checksums import write_checksums
 from scopemap.result.depth_maps import DepthWriter
@@ -100,7 +100,8 @@ def _reconstruct(
         sequence, config, estimators, notices = prepare(sequence, config, clock.timed, progress)
         notices = [Notice("checkpoint-damaged", {"reason": reason}) for reason in damage] + notices
         write_depth = None if folder is None else DepthWriter(folder, largest_depth_mm(config, estimators))
-        writers: tuple[FrameWriter, ...] = () if write_depth is None else (write_depth,)
+        previews = None if folder is None else DepthPreviews(folder)
+        writers: tuple[FrameWriter, ...] = tuple(each for each in (write_depth, previews) if each is not None)
         if folder is not None and config.tracking.camera_at_rest:
             writers += (SurfaceWriter(folder, config, estimators),)
         with closing(store):
@@ -117,11 +118,11 @@ def _reconstruct(
         result.provenance["notices"] += [notice.as_json() for notice in changes]
         state_verdict(result)
         del run, pipeline  # with their keyframes and volumes: a long run has none to spare when it writes
-        if folder is not None and write_depth is not None:
+        if folder is not None and write_depth is not None and previews is not None:
             progress("writing", 0, 0)
             scale_known = result.provenance["scale"]["known"]
             if range_mm := write_depth.finish(scale_known=scale_known):
-                write_previews(folder, range_mm, scale_known=scale_known)
+                previews.finish(range_mm, scale_known=scale_known)
             result.save(folder)
             for owner in _kept_with(observers):
                 owner.save(folder)

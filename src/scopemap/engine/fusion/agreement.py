@@ -19,6 +19,7 @@ from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.similarity import structural_similarity
 from scopemap.engine.mapping.tissue_states import TissueStates
 
+_NEAR = float(np.log(1.1))
 _SAME_SURFACE = 0.02  # between a vertex and what is rendered at its pixel, of its depth: it is not hidden
 
 
@@ -28,12 +29,14 @@ class FrameAgreement(NamedTuple):
     coverage : share, 0..1, of the pixels with known depth where the mesh is seen.
     depth_error : median of |ln(depth of the mesh / depth of the frame)| where both are known; NaN where nowhere.
     ssim : mean structural similarity of grey values over all pixels with known depth; holes are black.
+    within_10_percent : share, 0..1, of the pixels with known depth where the mesh is seen within 10 % of it.
     lpips : mean perceptual distance over the same pixels, all others black in both pictures; NaN: not measured.
     """
 
     coverage: float
     depth_error: float
     ssim: float
+    within_10_percent: float
     lpips: float = float("nan")
 
 
@@ -87,17 +90,22 @@ def compare_rendering(
         float(seen.sum() / max(known.sum(), 1)),
         float(np.median(error)) if error.size else float("nan"),
         float(similarity[known].mean()) if known.any() else float("nan"),
+        float((error <= _NEAR).sum() / max(known.sum(), 1)),
         lpips,
     )
 
 
 def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
-    """Return the number of frames, mean and least coverage, median depth error, mean SSIM and LPIPS, where known."""
+    """Return the number of frames, mean and least coverage, mean and least share within 10 %, median depth error, mean
+    SSIM and LPIPS, where known.
+    """
     rows = list(agreements)
-    coverage, depth_error, ssim, lpips = (column[np.isfinite(column)] for column in np.array(rows).reshape(-1, 4).T)
+    columns = np.array(rows).reshape(-1, len(FrameAgreement._fields)).T
+    coverage, depth_error, ssim, within, lpips = (column[np.isfinite(column)] for column in columns)
     figures: dict[str, float] = {"frames": len(rows)}
     if coverage.size:
         figures |= {"coverage_mean": float(coverage.mean()), "coverage_least": float(coverage.min())}
+        figures |= {"within_10_percent_mean": float(within.mean()), "within_10_percent_least": float(within.min())}
     if depth_error.size:
         figures["depth_error"] = float(np.median(depth_error))
     if ssim.size:

@@ -1,6 +1,8 @@
 // The four pictures of a frame: video, depth, the surface seen from there, and how the two depths differ.
 
 const DIFFERENCE_LIMIT = 0.2;
+// Of the pixels that the mask leaves out, in pictures of depth.
+const MASKED_GREY = 110;
 
 function dimensioned(canvas, width, height) {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -84,7 +86,7 @@ class FramePanels {
     if (images) this.#video(canvas("video"), images.video, showMask ? mask : null);
     else blank(canvas("video"), width, height, "no picture was kept");
     const codes = images?.depth && this.#codes(bytesOfImage(images.depth, width, height));
-    if (codes) this.#depth(canvas("depth"), codes, showMask ? mask : null);
+    if (codes) this.#depth(canvas("depth"), codes, mask);
     else blank(canvas("depth"), width, height, "no depth was kept");
     if (!pose || !mesh.vertices) {
       blank(canvas("rendered"), width, height, pose ? "no surface" : "camera lost");
@@ -142,11 +144,11 @@ class FramePanels {
   #depth(canvas, codes, mask) {
     const bytes = new Uint8ClampedArray(codes.length);
     for (let i = 0; i < codes.length; i += 4) {
-      const known = codes[i] > 0 && (!mask || mask[i] > 127), level = 255 - Math.round(((codes[i] - 1) * 255) / 254);
-      for (let k = 0; k < 3; k++) bytes[i + k] = known ? this.turbo[3 * level + k] : 32;
+      const known = codes[i] > 0 && mask[i] > 127, level = 255 - Math.round(((codes[i] - 1) * 255) / 254);
+      for (let k = 0; k < 3; k++) bytes[i + k] = known ? this.turbo[3 * level + k] : mask[i] > 127 ? 32 : MASKED_GREY;
       bytes[i + 3] = 255;
     }
-    this.#put(canvas, bytes, "Depth of the frame: red is near, blue is far");
+    this.#put(canvas, bytes, "Depth of the frame: red is near, blue is far, grey is no tissue");
   }
 
   #rendered(canvas, mesh, pose, far, frame, mask) {
@@ -174,7 +176,7 @@ class FramePanels {
     const sizes = [];
     for (let i = 0; i < bytes.length; i += 4) {
       const usable = codes[i] > 1 && codes[i] < 255 && mask[i] > 127, covered = bytes[i + 3] > 0;
-      let colour = covered || !usable ? [32, 32, 32] : [224, 178, 60];
+      let colour = mask[i] <= 127 ? Array(3).fill(MASKED_GREY) : covered || !usable ? [32, 32, 32] : [224, 178, 60];
       if (usable && covered) {
         const level = ((bytes[i] * 256 + bytes[i + 1] - 1) / 65534) * 3 - 1;
         const share = Math.exp((level - (codes[i] - 1) / 254) * logs) - 1;
@@ -185,7 +187,7 @@ class FramePanels {
     }
     const median = sizes.length ? sizes.sort((a, b) => a - b)[sizes.length >> 1] : null;
     const words = median === null ? "nothing to compare" : `median difference ${(100 * median).toFixed(1)} %`;
-    this.#put(canvas, bytes, `Surface against depth: white where they agree, blue where the surface is nearer, red where it is farther, yellow where it is missing; ${words}`);
+    this.#put(canvas, bytes, `Surface against depth: white where they agree, blue where the surface is nearer, red where it is farther, yellow where it is missing, grey is no tissue; ${words}`);
     return median;
   }
 }
