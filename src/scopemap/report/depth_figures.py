@@ -82,7 +82,7 @@ def _logarithmic(depth_mm: np.ndarray, range_mm: tuple[float, float]) -> np.ndar
     """Return the colours (N, 3) uint8 of depths (N,), mm, in the previews."""
     near_mm, far_mm = range_mm
     share = np.clip(np.log(far_mm / depth_mm) / np.log(far_mm / near_mm), 0, 1)
-    return cv2.applyColorMap(np.round(255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)[:, 0, ::-1].copy()
+    return cv2.applyColorMap(np.round(255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1].copy()
 
 
 def _depth_legend(width: int, range_mm: tuple[float, float], scale_known: bool) -> np.ndarray:

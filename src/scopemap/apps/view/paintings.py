@@ -29,7 +29,7 @@ def confidence_painting(folder: Path) -> Painting:
     mesh = Result(folder).checked().mesh
     if "confidence" not in mesh.vertex_attributes:
         raise InputError(f"{folder}: the confidence of its surface is not known")
-    colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8), cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
+    colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
     of = np.round(255 * np.clip(mesh.vertex_attributes["confidence"], 0, 1)).astype(int)
     legend = {f"confidence {level:g}": "#" + bytes(colours[round(255 * level)]).hex() for level in _LEVELS}
     return Painting(painted(mesh, colours[of]), legend)
