@@ -15,6 +15,7 @@ SUMS = "SHA256SUMS"
 NEEDED = ("camera.yaml", "config.toml", "frames.csv", "mesh.ply", "trajectory.tum", "provenance.json")
 _MOST_INPUT_BYTES = 256 << 20
 _MOST_INPUT_FILES = 20_000
+_MOST_CHECKED_BYTES = 256 << 20  # half a second
 
 
 def write_checksums(folder: Path, *, only: Collection[str] = (), without: Collection[str] = ()) -> None:
@@ -95,6 +96,27 @@ def digest_of(file: Path, most_bytes: int | None = None) -> str:
                 found.update(part)
                 start += len(part)
         return found.hexdigest()
+
+
+def changed_files(folder: Path, most_bytes: int = _MOST_CHECKED_BYTES) -> list[str]:
+    """Return the files of a result, or of that of a submap, that are missing or changed; [] where it has no checksums.
+
+    At most so many bytes are read, those of the files that every result has first. Raises `InputError` where the
+    checksums are damaged.
+    """
+    folder = folder.parent.parent if folder.parent.name == "maps" else folder
+    if not (folder / SUMS).is_file():
+        return []
+    sums, changed = read_checksums(folder), []
+    with reporting(f"cannot read {folder}"):
+        for name in sorted(sums, key=lambda name: (name not in NEEDED, name)):
+            size = (folder / name).stat().st_size if (folder / name).is_file() else -1
+            most_bytes -= max(size, 0)
+            if most_bytes < 0:
+                break
+            if size < 0 or digest_of(folder / name) != sums[name]:
+                changed.append(name)
+    return changed
 
 
 def read_checksums(folder: Path) -> dict[str, str]:

@@ -41,6 +41,23 @@ _LABELS = {
     "mesh_accuracy_p90_mm": "mesh to true surface, 90th percentile (mm)",
     "mesh_completeness_mm": "true surface to mesh, mean (mm)",
 }
+_GROUP_LABELS = {
+    "against_video": "the surface against its own video",
+    "held_out": "frames kept out of fusion",
+    "fused": "frames that were fused",
+    "nearest_frame": "the nearest fused frame, about the best possible",
+}
+_MEMBER_LABELS = {
+    "frames": "frames",
+    "coverage_mean": "share of the picture that the surface covers, mean",
+    "coverage_least": "share of the picture that the surface covers, least",
+    "within_10_percent_mean": "share of the picture within 10 % of the depth, mean",
+    "within_10_percent_least": "share of the picture within 10 % of the depth, least",
+    "depth_error": "relative difference of depth, median",
+    "ssim": "structural similarity (SSIM), mean",
+    "lpips": "perceptual distance (LPIPS), mean",
+    "worst_frames": "the worst frames, drawn in worst.png",
+}
 _PAPER_ROWS = (
     ("T_avg +- std (mm)", "t_avg_mm", "t_std_mm"),
     ("R_avg +- std (rad)", "r_avg_rad", "r_std_rad"),
@@ -110,7 +127,14 @@ def _tables(figures: dict[str, Any]) -> None:
             rows = {label: " +- ".join(_text(group[key]) for key in keys) for label, *keys in _PAPER_ROWS}
             print_values(rows, title="in the paper's units")
         elif isinstance(group, dict) and name != "sources":
-            print_values({key: _text(value) for key, value in _flat(group)}, title=name)
+            rows = {_label(key): _text(value) for key, value in _flat(group)}
+            print_values(rows, title=_GROUP_LABELS.get(name, name))
+
+
+def _label(key: str) -> str:
+    """Return what a figure of a group is called, "held_out.ssim": frames kept out of fusion: ..."""
+    *groups, last = key.split(".")
+    return ": ".join([*(_GROUP_LABELS.get(group, group) for group in groups), _MEMBER_LABELS.get(last, last)])
 
 
 def _text(value: Any) -> str:

@@ -13,6 +13,7 @@ import typer
 
 from scopemap.engine.errors import InputError, SettingsError
 
+_MOST_NAMED = 3
 _QUOTED = 80  # characters of a text that an error repeats
 advanced = partial(typer.Option, rich_help_panel="Advanced")
 """An option below the first page of a command's help."""
@@ -38,6 +39,13 @@ PresetName = Annotated[
 ]
 ConfigFile = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
+]
+CameraFit = Annotated[
+    str | None,
+    advanced(
+        metavar="FIT",
+        help="What a calibration of another size means: exact (refused), scale (images were resized), crop:X,Y.",
+    ),
 ]
 Dataset = Annotated[
     str | None, advanced(metavar="NAME", help="Its reader (`scopemap datasets list`); recognised if left out.")
@@ -91,6 +99,16 @@ def check_output(file: Path, endings: tuple[str, ...], overwrite: bool) -> None:
         raise InputError(f"cannot write {file}: {around} is a file")
     if not os.access(file if file.exists() else around, os.W_OK):
         raise InputError(f"cannot write {file}: no permission to write in {around}")
+
+
+def warn_of_damage(run: Path, *, silent: bool = False) -> None:
+    """Print a warning where a result is not as its run wrote it; of a large one its main files are looked at alone."""
+    from scopemap.result.checksums import changed_files
+
+    if not silent and (changed := changed_files(run)):
+        more = f" and {len(changed) - _MOST_NAMED} more" if len(changed) > _MOST_NAMED else ""
+        names = ", ".join(changed[:_MOST_NAMED])
+        typer.echo(f"warning: {run} is not as its run wrote it: {names}{more}; see scopemap verify {run}", err=True)
 
 
 def _matched(text: str, pattern: str, what: str, expected: str) -> re.Match[str]:

@@ -47,6 +47,9 @@ def compare(
     from scopemap_bench.tables import benchmark_tables
     from scopemap_bench.two_runs import refuse_run_as_truth
 
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"comparing {path}: no such file or folder")
     given = [name.strip() for name in names.split(",")] if names else []
     if truth is not None:
         refuse_run_as_truth(truth)

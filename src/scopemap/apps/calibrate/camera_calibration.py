@@ -21,8 +21,10 @@ from scopemap.input.camera_files.writing import write_calibration
 
 _TERMS = {"pinhole": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4")}
 _FIX = {"k1": cv2.CALIB_FIX_K1, "k2": cv2.CALIB_FIX_K2, "k3": cv2.CALIB_FIX_K3, "p1": cv2.CALIB_ZERO_TANGENT_DIST}
-_FIX_FISHEYE = {f"k{k}": getattr(cv2.fisheye, f"CALIB_FIX_K{k}") for k in (1, 2, 3, 4)}
-_FISHEYE_FLAGS = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
+# OpenCV 4 has the flags of fisheye lenses by themselves, OpenCV 5 with the others.
+_OF_FISHEYE: Any = cv2.fisheye if hasattr(cv2.fisheye, "CALIB_FIX_K1") else cv2
+_FIX_FISHEYE = {f"k{k}": getattr(_OF_FISHEYE, f"CALIB_FIX_K{k}") for k in (1, 2, 3, 4)}
+_FISHEYE_FLAGS = _OF_FISHEYE.CALIB_RECOMPUTE_EXTRINSIC | _OF_FISHEYE.CALIB_FIX_SKEW
 _STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-8)
 # Focal lengths over the width from which fits start beside OpenCV's own guess, which strong distortion misleads.
 _FOCAL_GUESSES = (0.5, 0.9)
@@ -178,7 +180,7 @@ def _attempt(views: list[BoardView], size: tuple[int, int], form: LensForm, star
     flags = sum(flag for term, flag in (_FIX_FISHEYE if is_fisheye else _FIX).items() if term not in form.terms)
     try:
         if is_fisheye:
-            flags |= _FISHEYE_FLAGS | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
+            flags |= _FISHEYE_FLAGS | _OF_FISHEYE.CALIB_USE_INTRINSIC_GUESS
             found = cv2.fisheye.calibrate(boards, pixels, size, matrix, np.zeros((4, 1)), flags=flags, criteria=_STEPS)
         else:
             flags |= 0 if start is None else cv2.CALIB_USE_INTRINSIC_GUESS

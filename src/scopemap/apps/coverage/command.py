@@ -46,6 +46,7 @@ def coverage(
 
     if export is not None:
         options.check_output(export, FINDING_ENDINGS, overwrite)
+    options.warn_of_damage(run, silent=quiet)
     found = covered(run)
     with reporting(f"cannot write to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)

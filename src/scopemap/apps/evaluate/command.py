@@ -10,7 +10,7 @@ import typer
 
 from scopemap.engine.errors import InputError
 from scopemap.terminal.figures import show
-from scopemap.terminal.options import Align, AsJson, InputNow, Unit, advanced
+from scopemap.terminal.options import Align, AsJson, InputNow, Unit, advanced, warn_of_damage
 
 if TYPE_CHECKING:
     from scopemap.evaluation.poses import MatchedTrajectories
@@ -75,6 +75,8 @@ def evaluate(
     offset = offset_of(time_offset)
     if truth is None and not against_video:
         raise typer.BadParameter("needed for all figures but those of --against-video", param_hint="--truth")
+    if trajectory.is_dir():
+        warn_of_damage(trajectory, silent=quiet)
     figures = against_own_video(trajectory, source) if against_video else {}
     if truth is not None:
         from scopemap.evaluation.clock import by_clock

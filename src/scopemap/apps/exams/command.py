@@ -35,6 +35,8 @@ def compare_exams(
     from scopemap.apps.view.fly_through import write_fly_through
     from scopemap.result.result import Result
 
+    for folder in (first, second):
+        options.warn_of_damage(folder, silent=quiet)
     found = compare(first, second, source, second_input)
     write_comparison(found, first, second, out)
     if video is not None:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from scopemap.terminal.figures import print_json
-from scopemap.terminal.options import AsJson, InputNow, Quiet, Unit
+from scopemap.terminal.options import AsJson, InputNow, Quiet, Unit, warn_of_damage
 
 To = Literal[
     "nerfstudio", "colmap", "endogslam", "endonerf", "gaussians", "pointcloud", "ply", "obj", "stl", "glb",
@@ -34,6 +34,7 @@ def export(
     """Write a run in the layout of another tool: its tracked frames, surface and depth."""
     from scopemap.apps.export.formats import export_run
 
+    warn_of_damage(run, silent=quiet)
     scale = export_run(run, to, out, units, axes, source=source)
     if as_json:
         print_json({"out": str(out), "format": to, "scale": scale})

@@ -60,7 +60,7 @@ def inspect(
         _print(source, found)
         typer.echo(f"picture: {file}")
         if masks is not None:
-            typer.echo(f"mask: {masks / MASK_NAME}, for all frames" if written else "mask: none, nothing to leave out")
+            typer.echo(f"mask: {masks / MASK_NAME}, {'for all frames' if written else 'empty: nothing to leave out'}")
 
 
 def _refuse(file: Path, masks: Path | None, overwrite: bool) -> None:

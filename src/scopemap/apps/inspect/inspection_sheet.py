@@ -76,13 +76,12 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
 
 
 def write_mask(inspection: Inspection, folder: Path) -> bool:
-    """Write a PNG, white on overlays and pictures in the picture, for all frames; False, and nothing, without any.
+    """Write a PNG, white on overlays and pictures in the picture, for all frames; return whether there are any.
 
-    These are what a run does not find by itself. Raises `OSError` where the folder cannot be written.
+    These are what a run does not find by itself. Without any the mask is black: a run that reads it leaves nothing out.
+    Raises `OSError` where the folder cannot be written.
     """
     boxes = [*inspection.insets, *(overlay.box for overlay in inspection.overlays if overlay.in_field)]
-    if not boxes:
-        return False
     width, height = inspection.size
     mask = np.zeros((height, width), np.uint8)
     for left, top, right, bottom in boxes:
@@ -90,7 +89,7 @@ def write_mask(inspection: Inspection, folder: Path) -> bool:
         mask[rows, int(np.floor(left * width)) : int(np.ceil(right * width))] = 255
     folder.mkdir(parents=True, exist_ok=True)
     (folder / MASK_NAME).write_bytes(cv2.imencode(".png", mask)[1].tobytes())
-    return True
+    return bool(boxes)
 
 
 def _draw_found(sheet: Sheet, box: Box, view: InspectedFrame, inspection: Inspection) -> str:

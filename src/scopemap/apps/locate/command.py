@@ -16,6 +16,7 @@ def locate(
     path: options.Input,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Table to write, .csv: a line and a pose for each frame.")],
     camera: options.CameraFile = None,
+    camera_fit: options.CameraFit = None,
     dataset: options.Dataset = None,
     frames: options.Frames = None,
     source: options.InputNow = None,
@@ -33,7 +34,8 @@ def locate(
     from scopemap.apps.locate import locate as locating
     from scopemap.terminal.progress import count_progress
 
-    found, sequence = [], locating.open_other(run, path, camera, dataset, frames)
+    options.warn_of_damage(run, silent=quiet)
+    found, sequence = [], locating.open_other(run, path, camera, dataset, frames, camera_fit)
     with count_progress("locating", "located", silent=quiet or as_json) as show:
         for one in locating.locate(run, sequence, source):
             found.append(one)

@@ -171,17 +171,21 @@ def open_other(
     camera: Path | str | None = None,
     dataset: str | None = None,
     frames: slice | str | None = None,
+    camera_fit: str | None = None,
 ) -> FrameSequence:
     """Return the frames of another video; without a calibration of its own it has the camera of a result's input.
 
     The settings of the input, and the parameters, are those of `open_sequence`, which see for what is raised.
+    camera_fit : that of the settings' `input`, for this video.
     """
     run = Result(folder).checked()
     kept, settings = run.source_camera_file, run.config.input
+    if camera_fit is not None:
+        settings = settings.model_copy(update={"camera_fit": camera_fit})
     sequence = open_sequence(path, camera=camera, dataset=dataset, frames=frames, settings=settings)
     if sequence.calibrated or kept is None:
         return sequence
-    resized = settings.model_copy(update={"camera_fit": "scale"})
+    resized = settings.model_copy(update={"camera_fit": camera_fit or "scale"})
     return open_sequence(path, camera=kept, dataset=dataset, frames=frames, settings=resized)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scopemap.terminal.options import AsJson, check_output
+from scopemap.terminal.options import AsJson, check_output, warn_of_damage
 
 if TYPE_CHECKING:
     from scopemap.apps.measure.measure import Measure
@@ -70,14 +70,19 @@ def measure(
     from scopemap.apps.measure import measure as measuring
     from scopemap.apps.measure.findings import FINDING_ENDINGS, write_findings
     from scopemap.apps.measure.surface_finding import SurfaceFinding
+    from scopemap.result.result import Result
 
     if export is not None:
         check_output(export, FINDING_ENDINGS, overwrite=True)
 
+    warn_of_damage(run, silent=as_json)
     if frame is not None and points:
         known = None if ends is None else np.array(ends)
         found = measuring.measure(run, frame, np.array(pixels), known, reference_mm)
         _show(found, [_facts(one) for one in found], as_json)
+        if not as_json:
+            camera = Result(run).camera
+            typer.echo(f"pixels are those of frame {frame} after rectification, {camera.width}x{camera.height} px")
         return
     frame = frame if second is None else lesions.frame_at(run, second)
     masks = Path(lesion) if Path(lesion).exists() else np.array(_pixels(lesion, "--lesion"))

@@ -16,6 +16,7 @@ import trimesh
 
 from scopemap.apps.measure.intervals import SIGMAS, LogChanges
 from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
 from scopemap.report.measured_surface import measure_errors, measured_depth, measured_mesh
 from scopemap.result.result import Result
@@ -170,11 +171,23 @@ def _picked(run: Result, mesh: trimesh.Trimesh, frame: int, pose: np.ndarray, pi
         found = meet_surface(mesh, pose[:3, 3], pose[:3, :3] @ ray) if inside else None
         if found is None:
             size = f"{run.camera.width}x{run.camera.height} px"
-            raise InputError(f"no surface at pixel {pixel[0]:g},{pixel[1]:g} of frame {frame}, whose size is {size}")
+            near = _nearest_surface(run, mesh, pose, pixel)
+            there = "" if near is None else f"; the nearest with a surface is {near[0]},{near[1]}"
+            where = f"pixel {pixel[0]:g},{pixel[1]:g} of frame {frame} (its rectified picture has {size})"
+            raise InputError(f"there is no surface at {where}{there}")
         points.append(found)
         depths.append(float((found.position - pose[:3, 3]) @ pose[:3, 2]))
     depth_mm = np.array(depths)
     return _Picked(pixels, points, depth_mm, _depth_errors(run, frame, pixels, depth_mm))
+
+
+def _nearest_surface(run: Result, mesh: trimesh.Trimesh, pose: np.ndarray, pixel: np.ndarray) -> tuple[int, int] | None:
+    """Return the pixel (x, y) nearest to one at which the frame sees the surface; None where it sees none."""
+    rows, columns = np.nonzero(np.isfinite(render_mesh(mesh, run.camera, pose).depth_mm))
+    if not len(rows):
+        return None
+    nearest = np.argmin((columns - pixel[0]) ** 2 + (rows - pixel[1]) ** 2)
+    return int(columns[nearest]), int(rows[nearest])
 
 
 def _depth_errors(run: Result, frame: int, pixels: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:

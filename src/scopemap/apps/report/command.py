@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from scopemap.terminal.options import ResultFolder
+from scopemap.terminal.options import ResultFolder, warn_of_damage
 
 
 def report(
@@ -22,6 +22,7 @@ def report(
     from scopemap.result.result import Result
     from scopemap.runner.reread_frames import keep_pictures_again
 
+    warn_of_damage(run)
     if pictures or not Result(run).pictured:
         try:
             keep_pictures_again(run)

@@ -32,13 +32,7 @@ def run(
     config: options.ConfigFile = None,
     dataset: options.Dataset = None,
     camera: options.CameraFile = None,
-    camera_fit: Annotated[
-        str | None,
-        options.advanced(
-            metavar="FIT",
-            help="What a calibration of another size means: exact (refused), scale (images were resized), crop:X,Y.",
-        ),
-    ] = None,
+    camera_fit: options.CameraFit = None,
     fov: options.FieldOfView = None,
     scope: options.Scope = None,
     stereo: Annotated[

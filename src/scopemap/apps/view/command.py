@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from scopemap.terminal.options import InputNow, ResultFolder
+from scopemap.terminal.options import InputNow, Overwrite, ResultFolder, check_output, warn_of_damage
 
 
 def view(
@@ -28,6 +28,7 @@ def view(
         typer.Option(help="Colours of --video over the surface: what was not seen, or how sure the surface is."),
     ] = None,
     source: InputNow = None,
+    overwrite: Overwrite = False,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
     """Show a run's page with all triangles and pictures at localhost, until Ctrl-C.
@@ -36,6 +37,9 @@ def view(
     """
     if colours is not None and video is None:
         raise typer.BadParameter("they are those of --video", param_hint="--colours")
+    for film in filter(None, (turntable, video)):
+        check_output(film, (".mp4", ".mkv", ".webm"), overwrite)
+    warn_of_damage(run)
     if turntable is not None or video is not None:
         from scopemap.apps.view.fly_through import write_fly_through
         from scopemap.apps.view.paintings import confidence_painting, coverage_painting
