@@ -123,6 +123,13 @@ def test_constraints_fit_the_requirements() -> None:
     assert "://" not in _text("constraints.txt")
 
 
+def test_the_words_of_the_makefile_are_those_that_contributing_shows() -> None:
+    words = re.findall(r"^(\w+):", _text("Makefile"), flags=re.MULTILINE)
+    assert re.findall(r"^    make (\w+)", _text("CONTRIBUTING.md"), flags=re.MULTILINE) == words
+    scripts = re.findall(r"python (\S+\.py)", _text("Makefile"))
+    assert [name for name in scripts if not (ROOT / name).is_file()] == []
+
+
 def test_the_container_is_what_the_readme_says() -> None:
     lines = _text("Containerfile").splitlines()
     copied, climb = (
