@@ -17,7 +17,7 @@ from scopemap.engine.models.weights import REGISTRY
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-NOTICE = ROOT / "src" / "scopemap" / "tracking" / "alike.LICENSE.txt"
+NOTICE = ROOT / "src" / "scopemap" / "engine" / "tracking" / "alike.LICENSE.txt"
 _HEAD = """# Licences
 
 scopemap and its network scopenet are under Apache-2.0, the weights of ALIKE-t in the package under BSD-3-Clause.

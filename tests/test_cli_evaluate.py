@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -16,10 +16,14 @@ from tiny_phantom import write_tiny
 from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
+from scopemap.apps.evaluate.command import evaluate
+from scopemap.apps.evaluate.measures import Compared, with_measures
+from scopemap.apps.run.command import run as run_command
+from scopemap.cli import app as cli
 from scopemap.engine.errors import AlignmentError, InputError, SettingsError
 from scopemap.engine.geometry.align import align_trajectories
 from scopemap.input.trajectory.trajectory import write_kitti
-from scopemap_bench.cli.evaluate import evaluate
+from scopemap_bench.cli.evaluate import MEASURES
 
 KEYS = [
     *("frames", "tracked", "align", "straight", "scale", "ate_rmse_mm", "ate_hold_rmse_mm", "ate_mean_mm"),
@@ -34,7 +38,7 @@ KEYS = [
 
 def run(*arguments: object, code: int = 0) -> Any:
     app = typer.Typer()
-    app.command()(evaluate)
+    app.command()(with_measures(evaluate, MEASURES))
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     assert result.exit_code == code, (result.output, result.exception)
     return result
@@ -130,6 +134,28 @@ def test_refusals(tmp_path: Path, folders: tuple[Path, Path]) -> None:
     assert "no depth maps" in str(run(folders[0], *truth, "--depth", "none", code=1).exception)
     for wrong in ((), (*truth, "--align", "sim4"), (*truth, "--csv", "--json"), (*truth, "--depth", "scaled")):
         run(folders[0], *wrong, code=2)
+
+
+def test_another_package_adds_measures_and_options(folders: tuple[Path, Path]) -> None:
+    def turned(compared: Compared, name: Annotated[str | None, typer.Option("--turned")] = None) -> dict[str, Any]:
+        return {name: {"frames": len(compared.estimate)}} if name else {}
+
+    app = typer.Typer()
+    app.command()(with_measures(evaluate, [turned]))
+    given = [str(folders[0]), "--truth", str(folders[1]), "--json"]
+    figures = json.loads(CliRunner().invoke(app, [*given, "--turned", "mine"]).stdout)
+    assert figures["mine"] == {"frames": 60}
+    assert "mine" not in json.loads(CliRunner().invoke(app, given).stdout)
+    without = CliRunner().invoke(app, [given[0], "--against-video", "--turned", "mine"])
+    assert (without.exit_code, "--truth" in without.output) == (2, True)
+
+
+def test_a_command_of_scopemap_cannot_be_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    added = (("compare", len), ("run", len))
+    monkeypatch.setattr(cli, "plugins", lambda group: added if group == "scopemap.commands" else ())
+    found, left_out = cli.commands()
+    assert (found["compare"], left_out) == (len, ["run"])
+    assert found["run"] is run_command
 
 
 def test_depth_and_its_consistency_are_measured_on_demand(tmp_path: Path) -> None:

@@ -19,9 +19,10 @@ from scopemap.engine.config import DepthSettings
 from scopemap.engine.depth.scopenet import estimator as module
 from scopemap.engine.depth.scopenet.colours import one_colour
 from scopemap.engine.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth
-from scopemap.engine.depth.scopenet.planes import LINEAR, input_planes
+from scopemap.engine.depth.scopenet.planes import input_planes
 from scopemap.engine.errors import WeightsError
 from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.srgb import LINEAR
 from scopemap.engine.models import weights
 from scopemap.runner.depth_backends import create_depth
 from training.export import export

@@ -123,21 +123,31 @@ def test_constraints_fit_the_requirements() -> None:
     assert "://" not in _text("constraints.txt")
 
 
+def test_the_words_of_the_makefile_are_those_that_contributing_shows() -> None:
+    words = re.findall(r"^(\w+):", _text("Makefile"), flags=re.MULTILINE)
+    assert re.findall(r"^    make (\w+)", _text("CONTRIBUTING.md"), flags=re.MULTILINE) == words
+    scripts = re.findall(r"python (\S+\.py)", _text("Makefile"))
+    assert [name for name in scripts if not (ROOT / name).is_file()] == []
+
+
 def test_the_container_is_what_the_readme_says() -> None:
     lines = _text("Containerfile").splitlines()
-    copied, climb = (
-        [source for line in _text(file).splitlines() if line.startswith("COPY ") for source in line.split()[1:-1]]
-        for file in ("Containerfile", "containers/climb/Containerfile")
-    )
-    assert {"constraints.txt", "pyproject.toml", "src"} <= set(copied)
+    copied = {source for line in lines if line.startswith("COPY ") for source in line.split()[1:-1]}
+    assert {"constraints.txt", "pyproject.toml", "src"} <= copied
     assert [source for source in copied if not (ROOT / source).exists()] == []
     kept = {line.removeprefix("!") for line in _text(".dockerignore").splitlines() if line.startswith("!")}
-    assert {source.split("/")[0] for source in [*copied, *climb]} == kept
+    assert {source.split("/")[0] for source in copied} == kept
+    assert list((ROOT / "containers").rglob("Containerfile*")) == []
     first = next(line.strip() for line in _text("README.md").splitlines() if line.startswith("    pip install"))
     assert f"RUN {first.partition(' && ')[0]}" in lines
     user = next(line for line in lines if line.startswith("USER "))
     assert user.split()[1].split(":")[0] not in ("0", "root")
-    assert lines.index(user) > max(number for number, line in enumerate(lines) if line.startswith("RUN "))
+    last = [number for number, line in enumerate(lines) if line.startswith(("RUN ", "FROM "))][-1]
+    assert lines[last].split() == ["FROM", "installed"]
+    assert lines.index(user) > last
+    stages = re.findall(r"--target (\w+)", _text("docs/climb.md"))
+    assert stages
+    assert {f"FROM installed AS {stage}" for stage in stages} <= set(lines)
 
 
 def test_workflows_name_files_that_exist_and_store_no_secret() -> None:

@@ -13,13 +13,15 @@ from drawn_datasets import WRITERS
 from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
+from scopemap.apps.evaluate.command import evaluate
+from scopemap.apps.evaluate.measures import with_measures
 from scopemap.engine.errors import CalibrationError, InputError, SettingsError
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import write_tum
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.reference import read_reference, reference_trajectory
 from scopemap.runner.reread_frames import open_truth
-from scopemap_bench.cli.evaluate import evaluate
+from scopemap_bench.cli.evaluate import MEASURES
 from scopemap_bench.scoring import default_protocol
 
 KNOWS_POSES = sorted(
@@ -32,7 +34,7 @@ KNOWS_DEPTH_ONLY = ["hamlyn", "hamlyn-tracking", "serv-ct"]
 
 def _figures(*arguments: object) -> dict:
     app = typer.Typer()
-    app.command()(evaluate)
+    app.command()(with_measures(evaluate, MEASURES))
     result = CliRunner().invoke(app, [*map(str, arguments), "--json"])
     if result.exception is not None:
         raise result.exception

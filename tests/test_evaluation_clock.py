@@ -114,30 +114,29 @@ def test_poses_are_read_between_their_neighbours() -> None:
         PoseCurve(truth.rows(np.array([0])))
 
 
-def run(*arguments: object, code: int = 0, bench: bool = True) -> Any:
-    from scopemap.apps.evaluate.command import evaluate as plain
-    from scopemap_bench.cli.evaluate import evaluate
+def run(*arguments: object, code: int = 0) -> Any:
+    from scopemap.apps.evaluate.command import evaluate
+    from scopemap.apps.evaluate.measures import with_measures
 
     app = typer.Typer()
-    app.command()(evaluate if bench else plain)
+    app.command()(with_measures(evaluate, ()))
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     assert result.exit_code == code, result.output
     return result
 
 
-@pytest.mark.parametrize("bench", [True, False])
-def test_the_command_takes_seconds_or_fit(tmp_path: Path, bench: bool) -> None:
+def test_the_command_takes_seconds_or_fit(tmp_path: Path) -> None:
     estimate = write_run(tmp_path / "run", seen(TIMES_S + 0.05, 0.05))
     given = (estimate, "--truth", write_c3vd(tmp_path / "truth", winding(TIMES_S).T_world_camera))
-    result = run(*given, "--time-offset", "fit", "--json", bench=bench)
+    result = run(*given, "--time-offset", "fit", "--json")
     figures = json.loads(result.stdout)
     assert figures["time_offset_s"] == pytest.approx(0.05, abs=0.004)
     assert figures["ate_rmse_mm"] < figures["ate_as_recorded_mm"] / 4
     assert "the truth is read 0.05" in result.stderr
-    assert "this clock offset is" in run(*given, "--time-offset", "0.05", bench=bench).stdout
-    assert "(fitted)" in run(*given, "--time-offset", "fit", "--quiet", bench=bench).stdout
+    assert "this clock offset is" in run(*given, "--time-offset", "0.05").stdout
+    assert "(fitted)" in run(*given, "--time-offset", "fit", "--quiet").stdout
     for wrong in ("soon", "nan", "inf"):
-        run(*given, "--time-offset", wrong, code=2, bench=bench)
+        run(*given, "--time-offset", wrong, code=2)
 
 
 @pytest.mark.real

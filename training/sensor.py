@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from scopemap.engine.geometry.srgb import srgb_picture
 from training.light import brightest
 
 
@@ -172,9 +173,7 @@ def _encoded(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     grey = light.mean(-1, keepdims=True)
     light = grey + np.float32(rng.uniform(0.7, 1.5)) * (light - grey)
     light = light * rng.uniform(0.85, 1.15, 3).astype(np.float32) + np.float32(rng.uniform(0, 0.01))
-    light = np.clip(light, 0, 1)
-    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-6) ** (1 / 2.4) - 0.055)
-    return np.rint(255 * encoded).astype(np.uint8)
+    return srgb_picture(np.clip(light, 0, 1))
 
 
 def _coded(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:

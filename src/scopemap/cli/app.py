@@ -9,6 +9,7 @@ import atexit
 import gc
 import io
 import sys
+from typing import Any
 
 import typer
 
@@ -17,6 +18,7 @@ from scopemap.apps.calibrate.command import calibrate
 from scopemap.apps.coverage.command import coverage
 from scopemap.apps.demo.command import demo
 from scopemap.apps.evaluate.command import evaluate
+from scopemap.apps.evaluate.measures import with_measures
 from scopemap.apps.exams.command import compare_exams
 from scopemap.apps.export.command import export
 from scopemap.apps.inspect.command import inspect
@@ -38,13 +40,23 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+_MEASURES = [one for _, added in plugins("scopemap.measures") for one in added]
 _OWN = (
-    *(run, batch, live, view, report, demo, inspect, evaluate, export, measure, coverage, locate),
-    *(compare_exams, verify, calibrate, models.app),
+    *(run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage),
+    *(locate, compare_exams, verify, calibrate, models.app),
 )
-_COMMANDS = {getattr(command, "__name__", "models").replace("_", "-"): command for command in _OWN} | dict(
-    plugins("scopemap.commands")
-)
+
+
+def commands() -> tuple[dict[str, Any], list[str]]:
+    """Return the commands, scopemap's own and those of other packages; and names of theirs that scopemap has itself."""
+    own = {getattr(command, "__name__", "models").replace("_", "-"): command for command in _OWN}
+    added = dict(plugins("scopemap.commands"))
+    return own | {name: command for name, command in added.items() if name not in own}, sorted(
+        own.keys() & added.keys()
+    )
+
+
+_COMMANDS, _LEFT_OUT = commands()
 for name, command in _COMMANDS.items():
     if isinstance(command, typer.Typer):
         app.add_typer(command, name=name)
@@ -81,6 +93,10 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             # A pipe on Windows has a code page that lacks most letters.
             stream.reconfigure(errors="replace")
+    for name in _LEFT_OUT:
+        typer.echo(
+            f"warning: another package's command {name} is left out, since scopemap has one of that name", err=True
+        )
     try:
         app(prog_name="scopemap")
     except ScopemapError as error:

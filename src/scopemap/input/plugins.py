@@ -1,6 +1,7 @@
-"""What other installed packages add: commands, readers of data sets, trajectory formats, by entry points.
+"""What other installed packages add: commands, measures, readers of data sets, trajectory formats, by entry points.
 
-scopemap.commands             one Typer function or Typer app; it replaces a command of the same name
+scopemap.commands             one Typer function or Typer app; left out, with a warning, where scopemap has its name
+scopemap.measures             a tuple of measures of `scopemap evaluate` (`apps/evaluate/measures.py`)
 scopemap.readers              a tuple of `Source` classes, which come before scopemap's own
 scopemap.trajectory_formats   a tuple of `TrajectoryFormat`
 """
@@ -11,7 +12,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, Literal
 
-Group = Literal["scopemap.commands", "scopemap.readers", "scopemap.trajectory_formats"]
+Group = Literal["scopemap.commands", "scopemap.measures", "scopemap.readers", "scopemap.trajectory_formats"]
 
 
 @cache

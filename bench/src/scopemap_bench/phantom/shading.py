@@ -18,6 +18,7 @@ from av.video.codeccontext import VideoCodecContext
 from scopemap.engine.cameras.camera import CameraModel
 from scopemap.engine.errors import SettingsError
 from scopemap.engine.geometry.se3 import inverse, mean_near, transform
+from scopemap.engine.geometry.srgb import srgb_picture
 from scopemap_bench.phantom.march import SurfaceBuffers, noise_at, rays_of
 from scopemap_bench.phantom.scenes import Tint
 from scopemap_bench.phantom.spec import EventName
@@ -182,9 +183,7 @@ def develop(linear: np.ndarray, noise: float, rng: np.random.Generator) -> np.nd
         deviation = noise * np.sqrt(1.0 + _SHOT_NOISE**2 * np.clip(signal, 0, 1))
         signal = signal + deviation * rng.standard_normal(signal.shape, np.float32)
     signal = np.where(signal > _KNEE, _KNEE + 0.45 * (1 - np.exp((_KNEE - signal) / 0.45)), signal)
-    signal = np.clip(signal, 0, 1)
-    encoded = np.where(signal <= 0.0031308, 12.92 * signal, 1.055 * np.maximum(signal, 1e-6) ** (1 / 2.4) - 0.055)
-    return np.rint(255 * encoded).astype(np.uint8)
+    return srgb_picture(np.clip(signal, 0, 1))
 
 
 def _fluid(linear: np.ndarray, index: int) -> np.ndarray:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from scopemap.apps.evaluate.measures import Asked, Compared
 from scopemap.engine.errors import InputError
 from scopemap.terminal.figures import show
 from scopemap.terminal.options import Align, AsJson, InputNow, Unit, advanced, warn_of_damage
@@ -16,68 +18,60 @@ if TYPE_CHECKING:
     from scopemap.evaluation.poses import MatchedTrajectories
     from scopemap.terminal.figures import OutputForm
 
-EstimatePath = Annotated[
-    Path, typer.Argument(metavar="DIR|TRAJECTORY", help="A run's folder, or a trajectory file (docs/formats.md).")
-]
-AgainstVideo = Annotated[
-    bool,
-    typer.Option(
-        "--against-video",
-        help="A run's surface against its own video, no truth needed: every 10th frame is kept out of fusion and "
-        "compared with the mesh of the others; DIR/against_video holds a row per frame and a picture.",
-    ),
-]
-AlignBy = Annotated[
-    Align, typer.Option(help="Alignment before measuring; origin: of the first frames, scale: of the size alone.")
-]
-AlignFirst = Annotated[int | None, advanced(min=3, metavar="N", help="Fit on the first N tracked frames only.")]
-TimeOffset = Annotated[
-    str,
-    advanced(
-        metavar="SECONDS|fit",
-        help="Read the truth so much later, where its clock is not the pictures'; fit: the offset, of at most half a "
-        "second in either direction, that leaves the least error of positions.",
-    ),
-]
-OfUnit = Annotated[Unit, advanced(help="Unit of a trajectory file that does not state one.")]
-TruthUnit = Annotated[Unit | None, advanced(help="The same for the truth; as --unit if left out.")]
-OfKind = Annotated[str, advanced(help="Form of the trajectory file where its content fits two.")]
-TruthKind = Annotated[str, advanced(help="The same for the truth, or the name of a data set.")]
-AsCsv = Annotated[bool, typer.Option("--csv", help="Print CSV.")]
-OneLine = Annotated[bool, typer.Option("--quiet", help="One line of figures, no warnings.")]
-
 
 def evaluate(
-    trajectory: EstimatePath,
+    trajectory: Annotated[
+        Path, typer.Argument(metavar="DIR|TRAJECTORY", help="A run's folder, or a trajectory file (docs/formats.md).")
+    ],
     truth: Annotated[
-        Path | None, typer.Option(help="True poses: a trajectory file, or an input that comes with poses.")
+        Path | None,
+        typer.Option(help="True poses: the folder of any data set's sequence, or a trajectory file."),
     ] = None,
-    against_video: AgainstVideo = False,
+    against_video: Annotated[
+        bool,
+        typer.Option(
+            "--against-video",
+            help="A run's surface against its own video, no truth needed: every 10th frame is kept out of fusion and "
+            "compared with the mesh of the others; DIR/against_video holds a row per frame and a picture.",
+        ),
+    ] = False,
     source: InputNow = None,
-    align: AlignBy = "sim3",
-    align_first: AlignFirst = None,
-    time_offset: TimeOffset = "0",
-    unit: OfUnit = "mm",
-    truth_unit: TruthUnit = None,
-    kind: OfKind = "auto",
-    truth_kind: TruthKind = "auto",
+    align: Annotated[
+        Align, typer.Option(help="Alignment before measuring; origin: of the first frames, scale: of the size alone.")
+    ] = "sim3",
+    align_first: Annotated[int | None, advanced(min=3, metavar="N", help="Fit on the first N tracked frames only.")] = (
+        None
+    ),
+    time_offset: Annotated[
+        str,
+        advanced(
+            metavar="SECONDS|fit",
+            help="Read the truth so much later, where its clock is not the pictures'; fit: the offset, of at most half "
+            "a second in either direction, that leaves the least error of positions.",
+        ),
+    ] = "0",
+    unit: Annotated[Unit, advanced(help="Unit of a trajectory file that does not state one.")] = "mm",
+    truth_unit: Annotated[Unit | None, advanced(help="The same for the truth; as --unit if left out.")] = None,
+    kind: Annotated[str, advanced(help="Form of the trajectory file where its content fits two.")] = "auto",
+    truth_kind: Annotated[str, advanced(help="The same for the truth, or the name of a data set.")] = "auto",
     as_json: AsJson = False,
-    as_csv: AsCsv = False,
-    quiet: OneLine = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="One line of figures, no warnings.")] = False,
+    further: Sequence[Asked] = (),
 ) -> None:
     """Compare a trajectory with the truth, or a run's surface with its own video.
 
     Frames are matched by number where both sides have one (line of the pose file, index in frames.csv, whole numbers
-    as TUM time stamps), else by time within 0.01 s; files without times count 30 frames per s. With the package
-    scopemap-bench this command also measures depth, surfaces and the protocols of other papers.
+    as TUM time stamps), else by time within 0.01 s; files without times count 30 frames per s. The package
+    scopemap-bench adds depth, surfaces and the protocols of other papers.
     """
-    form = output_form(as_json=as_json, as_csv=as_csv, quiet=quiet)
-    offset = offset_of(time_offset)
-    if truth is None and not against_video:
+    form = _output_form(as_json=as_json, as_csv=as_csv, quiet=quiet)
+    offset = _offset_of(time_offset)
+    if truth is None and (not against_video or any(measure.by_name for measure in further)):
         raise typer.BadParameter("needed for all figures but those of --against-video", param_hint="--truth")
     if trajectory.is_dir():
         warn_of_damage(trajectory, silent=quiet)
-    figures = against_own_video(trajectory, source) if against_video else {}
+    figures = _against_own_video(trajectory, source) if against_video else {}
     if truth is not None:
         from scopemap.evaluation.clock import by_clock
         from scopemap.evaluation.poses import match, pose_report
@@ -87,18 +81,31 @@ def evaluate(
         estimate = read_trajectory(trajectory, unit=unit, kind=kind)
         reference = read_reference(truth, unit=truth_unit or unit, kind=truth_kind)
         if reference is None:
-            raise InputError(f"{truth} has no true poses")
-        reference, clock = by_clock(estimate, reference, align, offset, first=align_first)
-        matched = match(estimate, reference, align, first=align_first)
-        sources = {"trajectory": estimate.source, "truth": reference.source}
-        figures = pose_report(matched) | clock | figures | {"sources": sources}
-        if not quiet:
-            warn_of(matched, clock)
+            figures = _without_poses(Compared(trajectory, truth, estimate), further) | figures
+        else:
+            reference, clock = by_clock(estimate, reference, align, offset, first=align_first)
+            matched = match(estimate, reference, align, first=align_first)
+            measured = _measured(Compared(trajectory, truth, estimate, reference, matched), further)
+            sources = {"trajectory": estimate.source, "truth": reference.source}
+            figures = pose_report(matched) | clock | measured | figures | {"sources": sources}
+            if not quiet:
+                _warn_of(matched, clock)
     show(figures, form)
 
 
-def offset_of(text: str) -> float | Literal["fit"]:
-    """Return the clock offset of `--time-offset`, s, or "fit". Raises `BadParameter` for anything else."""
+def _measured(compared: Compared, further: Sequence[Asked]) -> dict[str, Any]:
+    return {name: group for measure in further for name, group in measure(compared).items()}
+
+
+def _without_poses(compared: Compared, further: Sequence[Asked]) -> dict[str, Any]:
+    if found := _measured(compared, further):
+        return found
+    alone = "if it has depth, --depth median (of scopemap-bench) compares that alone"
+    raise InputError(f"{compared.truth} has no true poses; {alone}")
+
+
+def _offset_of(text: str) -> float | Literal["fit"]:
+    """Return the clock offset, s, or "fit"."""
     if text == "fit":
         return "fit"
     try:
@@ -110,14 +117,14 @@ def offset_of(text: str) -> float | Literal["fit"]:
     return offset_s
 
 
-def output_form(*, as_json: bool, as_csv: bool, quiet: bool) -> OutputForm:
+def _output_form(*, as_json: bool, as_csv: bool, quiet: bool) -> OutputForm:
     """Return how figures are printed. Raises `BadParameter` where two forms are asked for."""
     if as_json and as_csv:
         raise typer.BadParameter("not both of --json and --csv", param_hint="--csv")
     return "json" if as_json else "csv" if as_csv else "line" if quiet else "table"
 
 
-def against_own_video(run: Path, source: Path | None = None) -> dict[str, Any]:
+def _against_own_video(run: Path, source: Path | None = None) -> dict[str, Any]:
     """Return the agreement of a run's surface with its own video, which is written into the run's folder, too."""
     from scopemap.apps.evaluate.against_video import held_out_agreement
 
@@ -126,7 +133,7 @@ def against_own_video(run: Path, source: Path | None = None) -> dict[str, Any]:
     return {"against_video": agreement.figures()}
 
 
-def warn_of(matched: MatchedTrajectories, clock: dict[str, Any]) -> None:
+def _warn_of(matched: MatchedTrajectories, clock: dict[str, Any]) -> None:
     """Print what limits the figures of these trajectories; `clock` : what `by_clock` says of the truth's clock."""
     from scopemap.evaluation.clock import clock_sentence
 

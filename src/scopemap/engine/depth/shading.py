@@ -8,8 +8,8 @@ import numpy as np
 from scopemap.engine.config import DepthSettings
 from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.depth.guided import filled, guided_filter
-from scopemap.engine.depth.scopenet.planes import LINEAR
 from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.srgb import LINEAR
 
 # Red alone saturates on near tissue, green alone follows the blood, blue is mostly noise.
 _CHANNEL_WEIGHTS = np.array([0.5, 0.5, 0.0], dtype=np.float32)

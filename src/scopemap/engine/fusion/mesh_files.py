@@ -12,6 +12,7 @@ import trimesh
 
 from scopemap.engine.errors import reporting
 from scopemap.engine.geometry.rendering import vertex_colours
+from scopemap.engine.geometry.srgb import LINEAR
 from scopemap.engine.mapping.tissue_states import TissueStates
 
 # glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
@@ -148,9 +149,7 @@ def _glb(mesh: trimesh.Trimesh, comment: str) -> bytes:
 
 
 def _linear_16_bit(srgb: np.ndarray) -> np.ndarray:
-    """Return (V, 4) uint16 linear colours, opaque, 65535 = 1, of (V, 3) uint8 sRGB colours (IEC 61966-2-1)."""
-    level = np.arange(256) / 255.0
-    linear = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    """Return (V, 4) uint16 linear colours, opaque, 65535 = 1, of (V, 3) uint8 sRGB colours."""
     rgba = np.full((len(srgb), 4), 65535, np.uint16)
-    rgba[:, :3] = np.round(65535 * linear).astype(np.uint16)[srgb]
+    rgba[:, :3] = np.round(65535 * LINEAR).astype(np.uint16)[srgb]
     return rgba

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scopemap.engine.depth.scopenet.planes import LINEAR
+from scopemap.engine.geometry.srgb import LINEAR
 
 # Linear red from which on it counts less, and from which on it does not count: sRGB levels 188 and 237.
 _SATURATES = 0.5

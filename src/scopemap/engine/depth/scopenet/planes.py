@@ -6,15 +6,13 @@ import cv2
 import numpy as np
 
 from scopemap.engine.errors import check_shape
+from scopemap.engine.geometry.srgb import LINEAR
 
 PLANES = 8
 INSTRUMENTS = "instruments"  # name of that output
 STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
 _DARKEST = 1e-3
-_LEVEL = np.arange(256) / 255
-LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4)
-"""Linear brightness, 0..1, of each 8-bit level of sRGB (IEC 61966-2-1)."""
 _HALF_LINEAR = (0.5 * LINEAR).astype(np.float32)
 
 
