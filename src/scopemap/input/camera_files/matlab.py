@@ -13,8 +13,6 @@ from struct import Struct, error
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
 
 from scopemap.input.camera_files.calibration import Calibration
 from scopemap.input.camera_files.parsing import Fields, mappings_below
@@ -29,7 +27,7 @@ _EXPORT = (
     "save its struct in MATLAB, `s = toStruct(params); save('cam.mat', '-struct', 's', '-v7')`, and give that file"
 )
 _DAMAGED = (
-    MatReadError, ValueError, TypeError, KeyError, IndexError, OSError, EOFError, zlib.error, error, OverflowError,
+    ValueError, TypeError, KeyError, IndexError, OSError, EOFError, zlib.error, error, OverflowError,
     MemoryError, UnicodeError, AttributeError,
 )  # fmt: skip
 _OCAM = ("ss", "xc", "yc", "c", "d", "e", "width", "height")
@@ -44,10 +42,12 @@ def mat_fields(content: bytes) -> Fields:
     """Return the mapping in a .mat file of version 5 to 7; `ValueError`, with what to do, for others and objects."""
     if content.startswith(_HEADER + b"7.3"):
         raise ValueError(f"it is a .mat file of version 7.3, which is not read: {_EXPORT}")
+    from scipy.io.matlab import MatReadError, loadmat  # its import takes longer than all other formats' reading
+
     try:
         _check_size(content)
         variables = loadmat(io.BytesIO(content), simplify_cells=True, verify_compressed_data_integrity=False)
-    except _DAMAGED as damage:
+    except (MatReadError, *_DAMAGED) as damage:
         raise ValueError(f"it is a damaged .mat file ({str(damage).partition(chr(10))[0][:80]})") from None
     fields = _fields_of(variables)
     if not fields.pairs:
