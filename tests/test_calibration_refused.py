@@ -27,6 +27,8 @@ from test_calibration_sources import (
     basalt,
     dso,
     mat,
+    npy,
+    npz,
     numbered,
 )
 
@@ -121,6 +123,12 @@ def test_zeros_and_the_same_coefficients_twice_are_no_contradiction(form: str, t
         (mat(**{**INTRINSICS, "Skew": 30.0}), "a skew of 30"),
         ({**NAMED, "skew": 30.0}, "a skew of 30"),
         (basalt("kb4", **numbered("k", 1, KB), k5=0.1), "k5"),
+        ({"K": K, "model": "fisheye", "D": [*KB, 0.1]}, "Kannala-Brandt lens has four coefficients, found 5"),
+        ({**NAMED, "model": "FisheyeRadTanThinPrism", "params": [0.1, 0.2]}, "'params'"),
+        ({**NAMED, "cam_model": "Ocam"}, "'ocam', but it has no polynomial"),
+        ({"cx": CX, "cy": CY, "a0": -400.0, "a2": 8e-4}, "begins with -400"),
+        ({"cx": CX, "cy": CY, "a0": 400.0, "a2": -8e-4, "c": 1.0}, "a 'stretch' of c, d and e"),
+        ({"one": NAMED, "two": NAMED}, "holds 2 cameras (one, two)"),
     ],
 )
 def test_numbers_of_a_lens_that_do_not_fit_are_refused(content: Content, name: str, tmp_path: Path) -> None:
@@ -152,7 +160,6 @@ MEI = {
         (basalt("ucm", alpha=0.6), "ucm"),
         (MEI, "mei"),
         ({"K": K, "D": [0.1, 0, 0, 0], "xi": [[1.2]]}, "MEI"),
-        ({**NAMED, "cam_model": "Ocam"}, "ocam"),
         (METASHAPE.replace("frame", "fisheye"), "fisheye' of Metashape"),
         (METASHAPE.replace("frame", "equisolid_fisheye"), "equisolid_fisheye' of Metashape"),
         (
@@ -315,6 +322,13 @@ def test_mat_files_that_cannot_be_read_are_one_sentence(content: bytes, message:
 
 def test_a_compressed_bomb_is_not_unpacked(tmp_path: Path) -> None:
     assert "larger than any calibration" in refusal(tmp_path, bomb())
+    assert "larger than any calibration" in refusal(tmp_path, npz(K=np.zeros(40_000_000)))
+
+
+def test_arrays_that_are_damaged_or_pickled_are_refused(tmp_path: Path) -> None:
+    assert "its arrays cannot be read" in refusal(tmp_path, npz(K=np.eye(3))[:100])
+    assert "its arrays cannot be read" in refusal(tmp_path, npy(np.array([{"fx": 1}])))
+    assert "no 3x3 camera matrix" in refusal(tmp_path, npz(K=np.array([{"fx": 1}])))
 
 
 def test_a_column_of_five_is_bouguets_lens_and_a_skew_is_noted(tmp_path: Path) -> None:

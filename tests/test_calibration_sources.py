@@ -188,6 +188,18 @@ def mat(compressed: bool = True, **variables: Any) -> bytes:
     return stream.getvalue()
 
 
+def npz(**arrays: Any) -> bytes:
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    return stream.getvalue()
+
+
+def npy(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
 def basalt(kind: str, **lens: float) -> dict[str, Any]:
     cameras = [{"camera_type": kind, "intrinsics": {**NAMED, **lens}}, {"camera_type": "ds", "intrinsics": {"xi": 1}}]
     return {"value0": {"T_imu_cam": [{"px": 0.0, "qw": 1}], "intrinsics": cameras, "resolution": [[W, H], [9, 9]]}}
@@ -228,6 +240,11 @@ FILES: dict[str, tuple[Content, Formula]] = {
         f"cam_model: Pinhole\ncam_width: {W}\ncam_height: {H}\n"
         + "".join(f"cam_{n}: {v}\n" for n, v in {**NAMED, **numbered("d", 0, BROWN)}.items()), brown(*BROWN),
     ),
+    "f c k": ({"f": [FX, FY], "c": [CX, CY], "k": list(BROWN3)}, brown(*BROWN3)),
+    "the left of two": (
+        "[LEFT]\n" + "".join(f'{n} = "{v}"\n' for n, v in NAMED.items()) + "k1=-0.3\nk2=0.1\np1=1e-3\np2=-5e-4\n"
+        "[RIGHT]\nfx=1\nfy=1\ncx=2\ncy=2\nk1=0.4\n", brown(*BROWN),
+    ),
     "kc1 ... kc5": ({**NAMED, **numbered("kc", 1, BROWN3)}, brown(*BROWN3)),
     # ---- numbers
     "scikit-surgery": (f"{K_ROWS}-0.3 0.1 0.001 -0.0005 -0.01 ", brown(*BROWN3)),
@@ -257,6 +274,10 @@ FILES: dict[str, tuple[Content, Formula]] = {
     "dso kannala-brandt": (dso("KannalaBrandt", (FX, FY, CX, CY, *KB)), kannala_brandt(*KB)),
     "dso pinhole": (dso("Pinhole", (*DSO_SHARES, 0.0)), brown(0, 0, 0, 0)),
     "dso, omega 0": (dso("", (*DSO_SHARES, 0.0)), brown(0, 0, 0, 0)),
+    # ---- NumPy
+    "npz": (npz(mtx=np.reshape(K_ROWS.split(), (3, 3)).astype(float), dist=np.array([BROWN3]), rvecs=np.ones((2, 3, 1)),
+                notes=np.array([None, 1], object)), brown(*BROWN3)),
+    "npy": (npy(np.reshape(K_ROWS.split(), (3, 3)).astype(float)), brown(0, 0, 0, 0)),
     # ---- Basalt
     "basalt kb4": (basalt("kb4", **numbered("k", 1, KB)), kannala_brandt(*KB)),
     "basalt pinhole": (basalt("pinhole"), brown(0, 0, 0, 0)),
@@ -311,9 +332,10 @@ def test_our_camera_projects_as_the_files_own_formula(form: str, tmp_path: Path)
 
 STATES_NO_SIZE = {
     *(f"k{first} ... by name" for first in (0, 1, 2)), "k0 ... in yaml", "k_0 ... in an ini", "k0 ... in a mapping",
-    "d0 ... of a fisheye", "k0 k1 p0 p1", "k1 k2 t1 t2 k3", "kc1 ... kc5", "scikit-surgery", "scikit-surgery, four",
+    "d0 ... of a fisheye", "k0 k1 p0 p1", "k1 k2 t1 t2 k3", "kc1 ... kc5", "f c k", "the left of two",
+    "scikit-surgery", "scikit-surgery, four",
     "a column of coefficients", "shares in a 4x4", "shares in a 4x4 by name", "3x4 by name", "ptam", "ptam with more",
-    "five shares alone",
+    "five shares alone", "npz", "npy",
 }  # fmt: skip
 
 

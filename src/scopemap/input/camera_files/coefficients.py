@@ -23,6 +23,8 @@ _RADIAL_LISTS = ("RadialDistortion", "radial", "radial_distortion_coefficients",
 _TANGENTIAL_LISTS = (
     "TangentialDistortion", "tangential", "tangential_distortion_coefficients", "tangential_coefficients",
 )  # fmt: skip
+# A list of coefficients, or a camera matrix.
+_LIST_OR_MATRIX, _MATRIX_COUNTS = ("k",), (9, 12, 16)
 # Letters before the number of a coefficient: radial, tangential, and one of a list in the order of the lens.
 _RADIAL, _TANGENTIAL, _LISTED = "k", ("p", "t", "r"), ("d", "kc", "dist")
 _MOST_RADIAL, _MOST_TANGENTIAL, _MOST_FISHEYE = 6, 2, 4
@@ -31,7 +33,7 @@ _ALL_RATIONAL = (4, 5, 6)
 _FROM_TWO = {2, 3, 4, 5}
 _OMEGA = ("omega", "w")
 _STRAY = re.compile(r"(k|p|s|kc)\d{1,2}|tau[xy12]|omega")
-_UNREAD = re.compile(r"(?<!un)dist(?!anc|rib)|coef|radial|tangential", re.IGNORECASE)
+_UNREAD = re.compile(r"(?<!un)dist(?!anc|rib)|coef|radial|tangential|^param(eter)?s$", re.IGNORECASE)
 # Counts, settings and precisions of a lens, and the second camera's, are not its coefficients.
 _BESIDE = re.compile(
     r"num|count|estim|flag|model$|type$|fix|zero|max|min|std|sigma|err|uncert|cov|rms|right|inverse|depth|2$|_r$|distr$|coeffs?r$",
@@ -89,6 +91,10 @@ def _agree(one: _Set, other: _Set) -> bool:
 def _sets_at(place: Fields, kind: Kind) -> Iterator[_Set]:
     for name, node in place.nodes(LISTS):
         if (values := numbers_in(node, name)) is not None:
+            yield _Set(place, (name,), values)
+    for name, node in place.nodes(_LIST_OR_MATRIX):
+        values = numbers_in(node, name) if isinstance(node, Fields | list | str) else None
+        if values and len(values) not in _MATRIX_COUNTS:
             yield _Set(place, (name,), values)
     lists = [(names, place.numbers(names)) for names in (_RADIAL_LISTS, _TANGENTIAL_LISTS)]
     if any(values for _, values in lists):

@@ -18,6 +18,7 @@ _OTHER_PROJECTION = re.compile(
     r"\bomni|\bds\b|double ?sphere|\beucm\b|\bucm\b|unified|\bc?mei\b|scaramuzza|ocam|catadioptric|equirect|panoram|"
     r"spherical|stereographic|equisolid|orthographic|cylind|f ?theta|taylor|cahvor|fisheye ?62|mirror"
 )
+_SCARAMUZZA = re.compile(r"scaramuzza|ocam|omnidirectional")
 # and these where one is not.
 _OTHER_DISTORTION = re.compile(r"thin ?prism|division|inverse|modified|tilt")
 _FISHEYE = re.compile(r"fisheye|fish eye|\bequi(distant)?\b|kannala|\bkb[48]?\b")
@@ -52,6 +53,9 @@ def refuse_other_lens(levels: Sequence[Fields], model: str) -> None:
             for spelling, node in level.nodes((name,)):
                 if has_numbers(node):
                     raise _no_counterpart(model or lens, f", for {spelling[:_LONGEST_QUOTE]!r} in it")
+    if _SCARAMUZZA.search(model):
+        looked_for = "looked for as a0 a1 ..., as `polynomial`, and in OCamCalib's own text"
+        raise ValueError(f"its model is {model[:_LONGEST_QUOTE]!r}, but it has no polynomial ({looked_for})")
     if _OTHER_PROJECTION.search(model):
         raise _no_counterpart(model)
 
@@ -77,7 +81,10 @@ def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float])
     if _OTHER_PROJECTION.search(model) or (any(lens) and _OTHER_DISTORTION.search(model)):
         raise _no_counterpart(model)
     if _FISHEYE.search(model):
-        return FisheyeCamera(pinhole, _with_count(lens, 4)), ""
+        lens = _with_count(lens, 4)
+        if len(lens) != 4:
+            raise ValueError(f"a Kannala-Brandt lens has four coefficients, found {len(lens)}")
+        return FisheyeCamera(pinhole, lens), ""
     if _FOV.search(model):
         lens = _with_count(lens, 1)
         if len(lens) != 1:

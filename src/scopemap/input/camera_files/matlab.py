@@ -8,21 +8,19 @@ from __future__ import annotations
 
 import io
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from struct import Struct, error
-from typing import Any
 
 import numpy as np
 
+from scopemap.input.camera_files.arrays import LARGEST_BYTES, fields_of_arrays
 from scopemap.input.camera_files.calibration import Calibration
 from scopemap.input.camera_files.parsing import Fields, mappings_below
 from scopemap.input.camera_files.scaramuzza import of_ocamcalib
 
 _HEADER, _HEADER_BYTES, _ORDER_AT = b"MATLAB ", 128, 126
 _COMPRESSED = 15
-_LARGEST_BYTES = 1 << 24
 _FIRST_PIXEL = 1.0
-_DEEPEST = 3
 _EXPORT = (
     "save its struct in MATLAB, `s = toStruct(params); save('cam.mat', '-struct', 's', '-v7')`, and give that file"
 )
@@ -49,7 +47,7 @@ def mat_fields(content: bytes) -> Fields:
         variables = loadmat(io.BytesIO(content), simplify_cells=True, verify_compressed_data_integrity=False)
     except (MatReadError, *_DAMAGED) as damage:
         raise ValueError(f"it is a damaged .mat file ({str(damage).partition(chr(10))[0][:80]})") from None
-    fields = _fields_of(variables)
+    fields = fields_of_arrays(variables)
     if not fields.pairs:
         raise ValueError(f"it holds objects of MATLAB, which only MATLAB reads: {_EXPORT}")
     return fields
@@ -114,20 +112,6 @@ def _size(place: Fields) -> list[tuple[str, float]]:
     return [] if size is None else [("image_width", size[1]), ("image_height", size[0])]
 
 
-def _fields_of(variables: Mapping[str, Any], depth: int = 0) -> Fields:
-    """Return variables as a tree, of numbers, texts and structs; what only MATLAB reads is left out."""
-    pairs: list[tuple[str, Any]] = []
-    for name, value in variables.items():
-        if isinstance(value, dict) and depth < _DEEPEST:
-            pairs.append((name, _fields_of(value, depth + 1)))
-        elif isinstance(value, str):
-            pairs.append((name, value))
-        elif np.isrealobj(value) and np.asarray(value).dtype.kind in "fiu":
-            array = np.asarray(value, np.float64)
-            pairs.append((name, array.ravel().tolist() if array.ndim else float(array)))
-    return Fields((name, node) for name, node in pairs if not name.startswith("__"))
-
-
 def _check_size(content: bytes) -> None:
     """Raise `ValueError` where variables are compressed from more than any calibration."""
     order = "<" if content[_ORDER_AT:_HEADER_BYTES] == b"IM" else ">"
@@ -136,7 +120,7 @@ def _check_size(content: bytes) -> None:
         kind, length = head.unpack_from(content, at)
         part = content[at + head.size : at + head.size + length]
         if kind == _COMPRESSED:
-            total += len(zlib.decompressobj().decompress(part, _LARGEST_BYTES))
-        if total >= _LARGEST_BYTES:
+            total += len(zlib.decompressobj().decompress(part, LARGEST_BYTES))
+        if total >= LARGEST_BYTES:
             raise ValueError("it is larger than any calibration")
         at += head.size + length

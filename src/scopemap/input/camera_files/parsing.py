@@ -186,7 +186,8 @@ def _pair(part: str, yaml_nodes: str) -> tuple[str, str] | None:
     name, separator, value = (piece.strip() for piece in part.partition("=" if "=" in part else ":"))
     if not (separator and name and value) or value[0] in yaml_nodes:
         return None
-    return name, value if is_number(value) else value.translate(_SEPARATORS).strip()
+    bare = value.strip("\"'")
+    return name, bare if is_number(bare) else value.translate(_SEPARATORS).strip()
 
 
 def read_tree(text: str) -> Any:

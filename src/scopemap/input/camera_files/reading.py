@@ -12,6 +12,7 @@ import numpy as np
 
 from scopemap.engine.errors import CalibrationError
 from scopemap.input.camera_files import colmap_model, matlab, text_formats
+from scopemap.input.camera_files.arrays import numpy_fields
 from scopemap.input.camera_files.calibration import LARGEST_SIDE_PX, Calibration, Size, fitted, pinhole_of
 from scopemap.input.camera_files.direct_methods import CORNER_PX, direct_method_camera
 from scopemap.input.camera_files.lens import lens_of, model_in, refuse_other_lens
@@ -43,7 +44,8 @@ _INTRINSICS = {
     "cy": ("cy", "ppy", "cc_y", "v0", "principal_point_y"),
 }
 _FOCAL_LENGTHS = ("fc", "focal_length", "focal", "f")
-_CENTRES = ("cc", "principal_point", "optical_center", "pp", "c")
+_CENTRES = ("cc", "principal_point", "optical_center", "principal", "pp", "c")
+_MOST_NAMED = 4
 _SKEW = "skew"
 _SKEW_OF_FX = "alpha_c"
 _CORNER_TO_CENTRE_PX = 0.5
@@ -83,6 +85,8 @@ def _read(file: Path, image_size: Size) -> Calibration:
         return Calibration(colmap_model.only_camera(file), None, "")
     if matlab.is_mat_file(content):
         return of_fields(matlab.mat_fields(content), image_size)
+    if (arrays := numpy_fields(content)) is not None:
+        return of_fields(arrays, image_size)
     if b"\0" in content:
         raise ValueError("it is binary, not text")
     text = content.decode("utf-8-sig", errors="replace")  # comments may have any encoding
@@ -150,7 +154,11 @@ def _levels(fields: Fields) -> tuple[list[Fields], str]:
     below = [(name, [node, *node.inner(_INNER)]) for name, node in fields.pairs if isinstance(node, Fields)]
     found = [(name, inner) for name, inner in below if any(map(_has_camera, inner))]
     left = [(name, inner) for name, inner in found if _LEFT.search(name)]
-    if len(chosen := found if len(found) == 1 else left) != 1:
+    chosen = found if len(found) == 1 else left
+    if found and len(chosen) != 1:
+        names = ", ".join(name[:40] for name, _ in found[:_MOST_NAMED])
+        raise ValueError(f"it holds {len(found)} cameras ({names}): leave the one of these images in it")
+    if not found:
         return levels, ""
     note = f", {chosen[0][0][:40]} of {len(found)} cameras" if len(found) > 1 else ""
     return [*chosen[0][1], fields], note

@@ -29,6 +29,9 @@ def omnidirectional_of(levels: Sequence[Fields], root: Fields, image_size: Size)
     if len(polynomial) > MOST_TERMS or len(stretch) != len(_AFFINE):
         raise ValueError(f"expected a 'polynomial' of up to {MOST_TERMS} numbers and a 'stretch' of c, d and e")
     c, d, e = stretch
+    if polynomial[0] <= 0:
+        own = "OCamCalib's numbers, in other axes, are read from its own calib_results.txt or ocam_model"
+        raise ValueError(f"its polynomial begins with {polynomial[0]:g}, which C3VD and MATLAB have positive: {own}")
     cx, cy = _centre(place)
     size, note = size_of(levels, root, (0.0, 0.0, cx, cy), image_size)
     camera = OmnidirectionalCamera(tuple(polynomial), cx, cy, *(size or image_size), (c, d, e))
