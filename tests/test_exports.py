@@ -179,6 +179,41 @@ def test_tum_kitti_and_euroc(run: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(mm.positions_xyz, POSES[:, :3, 3], atol=1e-8)
 
 
+@pytest.mark.parametrize("to", ["tum", "kitti", "euroc"])
+@pytest.mark.parametrize("name", ["t.tum", "t.txt", "T.TXT", "t.csv", "t.kitti", "a.b.txt"])
+def test_a_text_file_of_poses_may_have_any_ending(to: str, name: str, run: Path, tmp_path: Path) -> None:
+    file = exported(run, to, tmp_path / name)
+    assert file.is_file()
+    reader = {
+        "tum": file_interface.read_tum_trajectory_file,
+        "kitti": file_interface.read_kitti_poses_file,
+        "euroc": file_interface.read_euroc_csv_trajectory,
+    }
+    assert_path(reader[to](file))
+
+
+@pytest.mark.parametrize("to", ["nerfstudio", "colmap", "endogslam", "endonerf", "surfaces", "slicer"])
+@pytest.mark.parametrize("name", ["a.json", "a.txt", "a.zip", "a.PLY"])
+def test_a_files_name_for_a_folder_is_refused(
+    to: str, name: str, run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    message = refused(capfd, "export", run, "--to", to, "--out", tmp_path / name)
+    assert f"{to} is a folder of files; give --out a name without {Path(name).suffix.lower()}" in message
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("to", "name"), [("tum", "t.ply"), ("kitti", "k.stl"), ("euroc", "e.mcap"), ("ply", "t.tum")])
+def test_the_ending_of_another_format_is_refused(
+    to: str, name: str, run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    message = refused(capfd, "export", run, "--to", to, "--out", tmp_path / name)
+    assert "ending of another format" in message or "must end in" in message
+
+
+def test_a_folder_may_have_a_point_in_its_name(run: Path, tmp_path: Path) -> None:
+    assert (exported(run, "kitti", tmp_path / "exam.2") / "poses.txt").is_file()
+
+
 def test_a_submap_is_exported_by_its_own_folder(run: Path, tmp_path: Path) -> None:
     found = file_interface.read_tum_trajectory_file(exported(run / "maps/1", "tum", tmp_path / "path.txt"))
     np.testing.assert_allclose(found.timestamps, np.arange(24 - IN_FIRST_MAP, 24) / 25, atol=1e-6)

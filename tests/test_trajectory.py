@@ -134,6 +134,39 @@ def test_c3vd_in_both_forms_and_with_a_pose_at_the_origin(tmp_path: Path, trajec
         np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.stack([np.eye(3)] * 4), atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["auto", "c3vd"])
+@pytest.mark.parametrize("separator", [",", " ", ", "])
+@pytest.mark.parametrize(
+    ("stamps", "indices"),
+    [((0.0, 0.034, 0.067, 0.134), None), ((3, 0, 1, 10), [0, 1, 3, 10]), ((7e9, 1.5, 2, 3), None)],
+)
+def test_c3vd_with_the_time_first(
+    tmp_path: Path,
+    trajectory: Trajectory,
+    stamps: tuple[float, ...],
+    indices: list[int] | None,
+    separator: str,
+    kind: str,
+) -> None:
+    """C3VDv3's renderer: time, then the matrix column by column."""
+    poses = trajectory.T_world_camera[trajectory.tracked]
+    rows = [[stamp, *T.T.ravel()] for stamp, T in zip(stamps, poses, strict=True)]
+    (tmp_path / "pose.txt").write_text("".join(separator.join(map(repr, map(float, row))) + "\n" for row in rows))
+    for path in (tmp_path / "pose.txt", tmp_path):
+        found = read_trajectory(path, kind=kind, unit="m")
+        np.testing.assert_allclose(found.T_world_camera, poses[np.argsort(stamps)], atol=1e-9)
+        assert found.has_indices == (indices is not None)
+        assert indices is None or found.indices.tolist() == indices
+        assert indices is not None or found.times_s.tolist() == sorted(stamps)
+
+
+def test_c3vds_times_may_not_repeat(tmp_path: Path, trajectory: Trajectory) -> None:
+    rows = [[0.5, *T.T.ravel()] for T in trajectory.T_world_camera[trajectory.tracked]]
+    np.savetxt(tmp_path / "pose.txt", rows, delimiter=",")
+    with pytest.raises(InputError, match=r"pose\.txt, line 2: the time stamp of an earlier line comes again"):
+        read_trajectory(tmp_path)
+
+
 def test_seven_scenes_is_metres_and_numbered_by_file(tmp_path: Path, trajectory: Trajectory) -> None:
     poses = trajectory.T_world_camera[[0, 1, 4]]
     for number, T in zip((3, 10, 100), poses, strict=True):

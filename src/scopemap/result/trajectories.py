@@ -40,7 +40,7 @@ _OWN = (
     TrajectoryFormat("c3vd", text.read_c3vd, ("pose.txt",)),
     TrajectoryFormat("colmap", colmap_poses.read_colmap, colmap_poses.COLMAP_FILES, lambda path: _is_colmap(path)),
 )
-_COLUMNS: dict[int, Reader] = {8: text.read_tum, 12: text.read_kitti, 16: text.read_c3vd}
+_COLUMNS: dict[int, Reader] = {8: text.read_tum, 12: text.read_kitti, **dict.fromkeys((16, 17), text.read_c3vd)}
 
 
 @cache
@@ -102,7 +102,7 @@ def _reader_of_file(path: Path) -> Reader:
     if columns not in _COLUMNS:
         raise InputError(
             f"cannot read a trajectory from {path}: its lines hold {columns} numbers; known are 8 (TUM), 12 (KITTI) "
-            "and 16 (C3VD pose.txt)"
+            "and 16 or 17 (C3VD pose.txt)"
         )
     return _COLUMNS[columns]
 

@@ -14,8 +14,9 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.cameras.lenses import OmnidirectionalCamera
 from scopemap.engine.errors import InputError
+from scopemap.input.camera_files.reading import stated_calibration
 from scopemap.input.decoding import read_decoded
-from scopemap.input.trajectory.text import read_poses
+from scopemap.input.trajectory.text import read_c3vd
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 CAMERA = OmnidirectionalCamera(
@@ -51,7 +52,11 @@ class C3vdFolder(LayoutFolder):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self.poses = dict(enumerate(read_poses(path / "pose.txt")))
+        truth = read_c3vd(path / "pose.txt", "mm")
+        if not truth.has_indices and len(truth) != len(self.file_of):
+            log = f"pose.txt is a log by time, of {len(truth)} poses for {len(self.file_of)} pictures"
+            raise InputError(f"reading {path}: {log}; give it one pose a picture, without the time")
+        self.poses = dict(zip(truth.indices.tolist(), truth.T_world_camera, strict=True))
         missing = next((file.name for number, file in self.file_of.items() if number not in self.poses), None)
         if missing is not None:
             held = f"which holds {len(self.poses)} poses (line = image number, from 0)"
@@ -64,6 +69,9 @@ class C3vdFolder(LayoutFolder):
                 UNDISTORTED_CAMERA, "EndoGSLAM's calibration of undistorted C3VD (pinhole)", "shipped for C3VD"
             )
             self.notes.append("depth of 8 bit, in steps of 0.39 mm: images undistorted and reduced by EndoGSLAM")
+        elif (config := path / "config.ini").is_file():  # of C3VDv3's renderer
+            camera = stated_calibration(config, (self.width, self.height)).camera
+            self._set_camera(camera, "C3VD's config.ini beside the frames (Scaramuzza polynomial)", str(config))
         else:
             self._set_camera(CAMERA, "published C3VD calibration (Scaramuzza polynomial)", "shipped for C3VD")
 

@@ -18,7 +18,12 @@ To = Literal[
 
 def export(
     to: Annotated[To, typer.Option("--to", help="The format (docs/exports.md).")],
-    out: Annotated[Path, typer.Option(help="File or folder to write, by the format.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="File or folder to write, by the format (docs/exports.md). kitti: a folder, or k.txt, poses alone."
+        ),
+    ],
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a submap, result/maps/1.")],
     units: Annotated[
         Unit | None, typer.Option(help="Unit of lengths; default: what the format prescribes, else mm.")

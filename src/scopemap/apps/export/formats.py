@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -14,7 +14,7 @@ from scopemap.apps.export.points import write_gaussians, write_points
 from scopemap.apps.export.surfaces import Axes, write_glb, write_slicer, write_surface, write_surfaces
 from scopemap.apps.export.trajectories import write_euroc_file, write_kitti_folder
 from scopemap.engine.errors import InputError, SettingsError
-from scopemap.input.trajectory.trajectory import Unit, write_tum
+from scopemap.input.trajectory.trajectory import Unit, write_kitti, write_tum
 from scopemap.result.result import Result
 
 Write = Callable[[Result, Path, Unit, Axes], None]
@@ -24,13 +24,16 @@ Write = Callable[[Result, Path, Unit, Axes], None]
 class ExportFormat:
     """A format: how it is written, its possible units and axes, the default first, and the ending of its file.
 
-    Without an ending it is a folder.
+    Without an ending it is a folder, or, where `write_file` is there, that file if the name is a file's. `is_text`:
+    programs recognise it by its content, so that any ending will do that is not of another format.
     """
 
     write: Write
     units: tuple[Unit, ...]
     axes: tuple[Axes, ...] = ("opencv",)
     ending: str = ""
+    is_text: bool = False
+    write_file: Write | None = None
 
 
 _ANY_AXES: tuple[Axes, ...] = ("lps", "ras", "opencv", "gltf")
@@ -43,9 +46,15 @@ FORMATS: dict[str, ExportFormat] = {
         lambda run, out, unit, axes: write_tum(out, run.tracked.trajectory, unit=unit, comment=run.scale),
         ("m", "mm"),
         ending=".txt",
+        is_text=True,
     ),
-    "kitti": ExportFormat(lambda run, out, unit, axes: write_kitti_folder(run, out, unit), ("m", "mm")),
-    "euroc": ExportFormat(lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv"),
+    "kitti": ExportFormat(
+        lambda run, out, unit, axes: write_kitti_folder(run, out, unit),
+        ("m", "mm"),
+        is_text=True,
+        write_file=lambda run, out, unit, axes: write_kitti(out, run.tracked.trajectory, unit=unit),
+    ),
+    "euroc": ExportFormat(lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv", is_text=True),
     "ply": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".ply"),
     "surfaces": ExportFormat(write_surfaces, ("mm", "m"), _ANY_AXES),
     "obj": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".obj"),
@@ -56,6 +65,12 @@ FORMATS: dict[str, ExportFormat] = {
     "gaussians": ExportFormat(lambda run, out, unit, axes: write_gaussians(run, out, unit), ("mm", "m"), ending=".ply"),
     "mcap": ExportFormat(lambda run, out, unit, axes: write_mcap(run, out), ("m",), ending=".mcap"),
     "dicom": ExportFormat(write_dicom_stl, ("mm", "m"), ("lps",), ".dcm"),
+}
+_NO_TEXT = {form.ending for form in FORMATS.values() if form.ending and not form.is_text}
+# Of files; other names with a point in them, such as exam.2, may be folders'.
+_FILE_ENDINGS = _NO_TEXT | {
+    *(".txt", ".csv", ".tum", ".kitti", ".json", ".yaml", ".yml", ".xml", ".html", ".npz", ".npy", ".bin", ".db"),
+    *(".zip", ".tar", ".gz", ".tgz", ".png", ".jpg", ".mp4"),
 }
 
 
@@ -78,8 +93,7 @@ def export_run(
     for option, given, possible in (("units", unit, form.units), ("axes", axes, form.axes)):
         if given is not None and given not in possible:
             raise SettingsError(f"--{option} {given}: {name} has {' or '.join(possible)}")
-    if form.ending and out.suffix.lower() != form.ending:
-        raise InputError(f"cannot write {out}: its name must end in {form.ending}")
+    form = _named(form, name, out)
     if out.is_file() or (out.is_dir() and (form.ending or any(out.iterdir()))):
         raise InputError(f"{out} exists; give another name with --out")
     run = Result(folder, source).checked(with_poses=True)
@@ -95,3 +109,17 @@ def export_run(
     except OSError as error:
         raise InputError(f"cannot write {out}: {error.strerror or error}") from None
     return run.scale
+
+
+def _named(form: ExportFormat, name: str, out: Path) -> ExportFormat:
+    """Return the format as a file where `out` is a file's name and it has one; `InputError` for a name of another."""
+    ending = out.suffix.lower()
+    if form.is_text and (form.ending or (form.write_file and ending in _FILE_ENDINGS)):
+        if ending in _NO_TEXT:
+            raise InputError(f"cannot write {out}: {ending} is the ending of another format than {name}, give .txt")
+        return replace(form, write=form.write_file or form.write, ending=ending or form.ending)
+    if not form.ending and ending in _FILE_ENDINGS:
+        raise InputError(f"cannot write {out}: {name} is a folder of files; give --out a name without {ending}")
+    if form.ending and ending != form.ending:
+        raise InputError(f"cannot write {out}: its name must end in {form.ending}")
+    return form

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.errors import CalibrationError, SettingsError
 
@@ -16,6 +18,9 @@ SizeOrigin: TypeAlias = Literal["stated", "images", "relative"]
 
 LARGEST_SIDE_PX = 100_000
 _LONGEST_RELATIVE_FOCAL = 10.0
+# Of a principal point that is a share of the size.
+_RELATIVE_CENTRE = (0.1, 0.9)
+_LONGEST_MM = 50.0
 _ASPECT_TOLERANCE = 0.01
 _CROP = re.compile(r"crop:(\d{1,6}),(\d{1,6})")
 _FOCAL_PER_WIDTH = (0.3, 5.0)
@@ -44,15 +49,33 @@ class Calibration:
         return f"the calibration {self.file}" if self.file else f"the {self.source}"
 
 
-def pinhole_of(intrinsics: Sequence[float], stated: Size | None, image_size: Size) -> tuple[PinholeCamera, SizeOrigin]:
-    """Return the pinhole of fx fy cx cy, px or (cx and cy up to 1) shares of the size, and where its size is from."""
+def pinhole_of(
+    intrinsics: Sequence[float], stated: Size | None, image_size: Size, corner_px: float = 0.0
+) -> tuple[PinholeCamera, SizeOrigin]:
+    """Return the pinhole of fx fy cx cy, px or (cx and cy up to 1) shares of the size, and where its size is from.
+
+    `corner_px` : what shares count the centre of the first pixel as: 0.5 where they count from the image's corner.
+    Raises `ValueError` for numbers that are neither px nor shares.
+    """
     fx, fy, cx, cy = intrinsics
     width, height = check_size(*(stated or image_size))
-    are_shares = max(cx, cy) <= 1 and max(abs(fx), abs(fy)) < _LONGEST_RELATIVE_FOCAL
+    are_shares = are_shares_of_size(intrinsics)
     if are_shares:
-        fx, fy, cx, cy = fx * width, fy * height, cx * width, cy * height
+        fx, fy, cx, cy = fx * width, fy * height, cx * width - corner_px, cy * height - corner_px
     origin: SizeOrigin = "stated" if stated else "relative" if are_shares else "images"
     return PinholeCamera(fx, fy, cx, cy, width, height), origin
+
+
+def are_shares_of_size(intrinsics: Sequence[float]) -> bool:
+    """Return whether fx fy cx cy are shares of the size, else px; `ValueError` where they can be neither."""
+    fx, fy, cx, cy = intrinsics
+    if max(cx, cy) > 1 or not np.isfinite(intrinsics).all():
+        return False
+    least, most = _RELATIVE_CENTRE
+    if max(abs(fx), abs(fy)) >= _LONGEST_RELATIVE_FOCAL or not least <= min(cx, cy) <= max(cx, cy) <= most:
+        found = f"focal length {fx:g}, {fy:g} and principal point {cx:g}, {cy:g}"
+        raise ValueError(f"its {found} are neither px nor shares of the picture's size")
+    return True
 
 
 def check_size(width: float, height: float) -> Size:
@@ -94,6 +117,8 @@ def check_plausible(camera: CameraModel, name: str) -> None:
     # Written so that NaN is refused, too.
     if not least < central.fx < most or not narrow < central.fy / central.fx < wide:
         fault = f"focal length {central.fx:g}, {central.fy:g} px (plausible: {least:g} to {most:g})"
+        if 0 < central.fx < min(least, _LONGEST_MM):
+            fault += "; if it is in mm, multiply it by the picture's width in px and divide by the sensor's in mm"
     elif not (0 <= central.cx < width and 0 <= central.cy < height):
         fault = f"its principal point {central.cx:g}, {central.cy:g} is outside; it was made for a larger image"
     else:

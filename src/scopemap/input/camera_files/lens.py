@@ -1,52 +1,42 @@
-"""The lens of a calibration file: its model's name, in any tool's words, and its distortion coefficients."""
+"""The lens of a calibration file: its model's name, in any tool's words, and its distortion coefficients.
+
+Nothing that a file says of its lens is passed over: what is not used is an error by its name (`coefficients.py`).
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.lenses import FisheyeCamera, FovCamera, OpenCvCamera
-from scopemap.input.camera_files.parsing import MOST_TERMS, Fields, is_number, numbers_in
+from scopemap.input.camera_files.coefficients import LISTS, Kind, coefficients_in, has_numbers
+from scopemap.input.camera_files.parsing import MOST_TERMS, Fields
 
 # Words come in lower case with blanks between them. These are other lenses even where all coefficients are zero,
 _OTHER_PROJECTION = re.compile(
-    r"\bomni|\bds\b|double ?sphere|\beucm\b|\bucm\b|unified|\bmei\b|scaramuzza|ocam|catadioptric|equirect|panoram|"
-    r"spherical|stereographic|equisolid|orthographic|cylind|f ?theta"
+    r"\bomni|\bds\b|double ?sphere|\beucm\b|\bucm\b|unified|\bc?mei\b|scaramuzza|ocam|catadioptric|equirect|panoram|"
+    r"spherical|stereographic|equisolid|orthographic|cylind|f ?theta|taylor|cahvor|fisheye ?62|mirror"
 )
+_SCARAMUZZA = re.compile(r"scaramuzza|ocam|omnidirectional")
 # and these where one is not.
 _OTHER_DISTORTION = re.compile(r"thin ?prism|division|inverse|modified|tilt")
 _FISHEYE = re.compile(r"fisheye|fish eye|\bequi(distant)?\b|kannala|\bkb[48]?\b")
-_FOV = re.compile(r"\bfov\b")
+_FOV = re.compile(r"\bfov\b|\batan\b")
 _OPENCV = re.compile(
     r"opencv|pin ?hole|perspective|plumb ?bob|rad ?tan|radial|tangential|brown|rational|standard|rectified|"
     r"undistorted|\bnone\b"
 )
-_LISTS = (
-    "distortion_coefficients", "D", "D1", "K_dist", "distCoeffs", "dist", "DL", "dist_coeff", "dist_coefs",
-    "dist_coef", "distortion", "distortion_coeffs", "distortion_coeff", "distortion_coefficient", "distortion_coefs",
-    "distortion_parameters", "distortion_params", "dist_params", "distortion_vector", "lens_distortion", "coeffs",
-    "coefficients", "kc", "distCoeffs1", "distCoeff1", "dist1",
+_MODELS = (
+    "camera_model", "distortion_model", "lens_model", "model", "model_type", "distortion_type", "type", "camera_type",
+    "lens_type", "projection", "projection_model", "projection_type", "intrinsics_model", "intrinsics_type",
+    "model_name",
 )  # fmt: skip
-_RADIAL_LISTS = ("RadialDistortion", "radial", "radial_distortion_coefficients", "radial_coefficients")
-_TANGENTIAL_LISTS = (
-    "TangentialDistortion", "tangential", "tangential_distortion_coefficients", "tangential_coefficients",
-)  # fmt: skip
-_RADIAL = ("k1", "k2", "k3", "k4", "k5", "k6")
-_TANGENTIAL = ("p1", "p2")
-_MODELS = ("camera_model", "distortion_model", "lens_model", "model", "model_type", "distortion_type", "type")
+# Numbers that lenses without a counterpart have beside those of a pinhole, and such a lens.
+_OF_OTHERS = {"xi": "unified omnidirectional (MEI)", "mirror_parameters": "unified omnidirectional (MEI)"}
 _FLAGS = ("fisheye_model", "fisheye", "is_fisheye")
-_UNREAD = re.compile(r"(?<!un)dist(?!anc|rib)|coef|radial|tangential", re.IGNORECASE)
-# Counts, settings and precisions of a lens, and the second camera's, are not its coefficients.
-_BESIDE = re.compile(
-    r"num|count|estim|flag|model$|type$|fix|zero|max|min|std|sigma|err|uncert|cov|right|inverse|depth|2$|_r$",
-    re.IGNORECASE,
-)
 _LONGEST_QUOTE = 40
 _WITH_THIN_PRISM = (12, 14)
-_MOST_TRIED = 100
-_DEEPEST = 3
 
 
 def model_in(levels: Sequence[Fields]) -> str:
@@ -56,17 +46,27 @@ def model_in(levels: Sequence[Fields]) -> str:
     return " ".join(filter(None, texts))
 
 
+def refuse_other_lens(levels: Sequence[Fields], model: str) -> None:
+    """Raise `ValueError`, with its name, for a lens that has no counterpart here, by its words or by its numbers."""
+    for name, lens in _OF_OTHERS.items():
+        for level in levels:
+            for spelling, node in level.nodes((name,)):
+                if has_numbers(node):
+                    raise _no_counterpart(model or lens, f", for {spelling[:_LONGEST_QUOTE]!r} in it")
+    if _SCARAMUZZA.search(model):
+        looked_for = "looked for as a0 a1 ..., as `polynomial`, and in OCamCalib's own text"
+        raise ValueError(f"its model is {model[:_LONGEST_QUOTE]!r}, but it has no polynomial ({looked_for})")
+    if _OTHER_PROJECTION.search(model):
+        raise _no_counterpart(model)
+
+
 def lens_of(pinhole: PinholeCamera, levels: Sequence[Fields], model: str) -> tuple[CameraModel, str]:
     """Return the camera with the lens in the levels of a tree, and a note on what was assumed of it.
 
-    Of several sets of coefficients the first that is not zero counts. Raises `ValueError` as `with_lens`, and where
-    something looks like coefficients but is not read.
+    Raises `ValueError` as `with_lens` and `coefficients_in`.
     """
-    found = [*_candidates(levels, model), []]
-    coefficients = next(filter(any, found), found[0])
-    if not any(coefficients):
-        _check_nothing_unread(levels)
-    return with_lens(pinhole, model, coefficients)
+    kind: Kind = "fisheye" if _FISHEYE.search(model) else "fov" if _FOV.search(model) else "opencv" if model else ""
+    return with_lens(pinhole, model, coefficients_in(_places(levels), kind))
 
 
 def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float]) -> tuple[CameraModel, str]:
@@ -79,10 +79,12 @@ def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float])
         raise ValueError(f"it has {len(coefficients)} distortion coefficients, more than any lens")
     lens = tuple(float(k) for k in coefficients)
     if _OTHER_PROJECTION.search(model) or (any(lens) and _OTHER_DISTORTION.search(model)):
-        advice = "calibrate as pinhole with radial-tangential or equidistant (fisheye) coefficients"
-        raise ValueError(f"the lens model {model[:_LONGEST_QUOTE]!r} has no counterpart here: {advice}")
+        raise _no_counterpart(model)
     if _FISHEYE.search(model):
-        return FisheyeCamera(pinhole, _with_count(lens, 4)), ""
+        lens = _with_count(lens, 4)
+        if len(lens) != 4:
+            raise ValueError(f"a Kannala-Brandt lens has four coefficients, found {len(lens)}")
+        return FisheyeCamera(pinhole, lens), ""
     if _FOV.search(model):
         lens = _with_count(lens, 1)
         if len(lens) != 1:
@@ -106,51 +108,9 @@ def _with_count(lens: tuple[float, ...], count: int) -> tuple[float, ...]:
 
 
 def _places(levels: Sequence[Fields]) -> list[Fields]:
-    return [*levels, *(inner for level in levels for inner in level.inner(_LISTS))]
+    return [*levels, *(inner for level in levels for inner in level.inner(LISTS))]
 
 
-def _candidates(levels: Sequence[Fields], model: str) -> Iterator[list[float]]:
-    """Yield coefficients in the order of the lens: of each list, by kind, by name."""
-    for place in _places(levels):
-        for name, node in place.nodes(_LISTS):
-            if (coefficients := numbers_in(node, name)) is not None:
-                yield coefficients
-        radial, tangential = place.numbers(_RADIAL_LISTS) or [], place.numbers(_TANGENTIAL_LISTS) or []
-        if len(radial) > len(_RADIAL) or len(tangential) > len(_TANGENTIAL):
-            raise ValueError("it has more radial or tangential coefficients than any lens")
-        if radial or tangential:
-            tangential += [0.0] * (len(_TANGENTIAL) - len(tangential))
-            yield _in_order(dict(zip((*_TANGENTIAL, *_RADIAL), (*tangential, *radial), strict=False)), model)
-        named = {name: place.number((name,)) for name in (*_RADIAL, *_TANGENTIAL)}
-        if found := {name: value for name, value in named.items() if value is not None}:
-            yield _in_order(found, model)
-
-
-def _in_order(found: dict[str, float], model: str) -> list[float]:
-    """Return named coefficients in the order of the lens; `ValueError` where their names do not tell which it is."""
-    radial, tangential = ([found.get(name, 0.0) for name in names] for names in (_RADIAL, _TANGENTIAL))
-    if _FISHEYE.search(model):
-        if any(tangential) or any(radial[4:]):
-            raise ValueError("a Kannala-Brandt lens has k1 k2 k3 k4 alone, found others, too")
-        return radial[:4]
-    if not model and radial[3] and not found.keys() & set(_TANGENTIAL):
-        raise ValueError("it has k4 but no p1, and names no model: OpenCV's or a fisheye's? add `model: fisheye`")
-    terms = [*radial[:2], *tangential, *radial[2:]]
-    return terms if any(terms[5:]) else terms[:5] if terms[4] else terms[:4]
-
-
-def _check_nothing_unread(levels: Sequence[Fields]) -> None:
-    for name, node in (pair for level in levels for pair in level.pairs):
-        is_lens = _UNREAD.search(name) or (isinstance(node, Fields) and node.number(("k1",)) is not None)
-        if is_lens and not _BESIDE.search(name) and _has_numbers(node):
-            advice = "call it distortion_coefficients, a list in OpenCV's order, k1 k2 p1 p2 k3"
-            raise ValueError(f"{name[:_LONGEST_QUOTE]!r} in it looks like distortion but is not read: {advice}")
-
-
-def _has_numbers(node: Any, depth: int = 0) -> bool:
-    """Return whether a number other than 0 is in a node; YAML's aliases may make it larger than the file."""
-    if isinstance(node, Fields):
-        node = [inner for name, inner in node.pairs if name not in ("rows", "cols")]
-    if isinstance(node, list):
-        return depth < _DEEPEST and any(_has_numbers(inner, depth + 1) for inner in node[:_MOST_TRIED])
-    return any(is_number(word) and float(word) for word in str(node).split())
+def _no_counterpart(model: str, why: str = "") -> ValueError:
+    advice = "calibrate as pinhole with radial-tangential or equidistant (fisheye) coefficients"
+    return ValueError(f"the lens model {model[:_LONGEST_QUOTE]!r}{why} has no counterpart here: {advice}")

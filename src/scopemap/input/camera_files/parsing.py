@@ -1,4 +1,4 @@
-"""Calibration files as trees of names, lists and numbers: YAML, JSON, XML and `name: value` lines, in bounded memory.
+"""Calibration files as trees of names, lists and numbers: YAML, JSON, XML, INI, `name: value` lines, in bounded memory.
 
 A tree is a `Fields`, a list, or a leaf (text or number). OpenCV's own parser is not used: nested deeply, a file of
 300 kB makes it take all memory there is.
@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Iterator
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 import yaml
@@ -22,14 +22,18 @@ from scopemap.engine.errors import CalibrationError
 MOST_TERMS = 20
 _MAX_BYTES = 1 << 20
 _MAX_DEPTH = 24
+_DEEPEST_MAPPING = 3
 _MAX_EVENTS = 100_000
 _MAX_NUMBERS = 1000
 _LONGEST_QUOTE = 40
-# ORB-SLAM writes `Camera.fx` or `Camera1.fx` for fx.
-_PASSED_OVER = re.compile(r"^camera1?\.|[-_\s]+")
+# ORB-SLAM writes `Camera.fx` or `Camera1.fx` for fx, SVO `cam_fx`.
+_PASSED_OVER = re.compile(r"^camera1?\.|^cam_|[-_\s]+")
 _WORD_BREAK = re.compile(r"[-_.\s]+")
 _BARE_POINT = re.compile(r"(?<=\d)\.(?=[\s,\]}eE])")
 _SEPARATORS = str.maketrans(",;[]", "    ")
+_SECTION = re.compile(r"\[\s*([A-Za-z_][^\[\],\"']*)\]")
+_YAML_NODES = "[{*&!|>"
+_COMMENT = re.compile(r"(#|//|%|^\s*;).*")
 _UNSET = ("false", "no", "off", "", "0", "0.0")
 
 
@@ -46,18 +50,18 @@ def calibration_bytes(file: Path) -> bytes:
 
 
 class Fields:
-    """A mapping of a file; case, `-`, `_`, blanks and ORB-SLAM's `Camera.` do not matter in names."""
+    """A mapping of a file; case, `-`, `_`, blanks, ORB-SLAM's `Camera.` and SVO's `cam_` do not matter in names."""
 
     def __init__(self, pairs: Iterable[tuple[Any, Any]]) -> None:
         self.pairs = [(name, node) for name, node in pairs if isinstance(name, str)]
         self._by_name: dict[str, list[tuple[str, Any]]] = {}
         for name, node in self.pairs:
-            self._by_name.setdefault(_PASSED_OVER.sub("", name.lower()), []).append((name, node))
+            self._by_name.setdefault(plain_name(name), []).append((name, node))
 
     def nodes(self, names: Iterable[str]) -> Iterator[tuple[str, Any]]:
         """Yield spelling and node of each of `names`, same spelling first; `ValueError` where one is there twice."""
         for name in names:
-            found = self._by_name.get(_PASSED_OVER.sub("", name.lower()), [])
+            found = self._by_name.get(plain_name(name), [])
             if len({spelling for spelling, _ in found}) < len(found):
                 raise ValueError(f"{found[0][0][:_LONGEST_QUOTE]!r} is there twice: leave one out")
             yield from sorted(found, key=lambda pair: pair[0] != name)
@@ -85,6 +89,27 @@ class Fields:
     def inner(self, names: Iterable[str]) -> list[Fields]:
         """Return the mappings under `names` that are no matrices."""
         return [node for _, node in self.nodes(names) if isinstance(node, Fields) and not any(node.nodes(("data",)))]
+
+
+def mappings_below(root: Fields, passed_over: re.Pattern[str] | None = None) -> Iterator[tuple[str, Fields]]:
+    """Yield the mappings in a mapping with their names, three deep, each once: YAML's aliases may repeat them.
+
+    One whose name `passed_over` finds is left out, with what is in it.
+    """
+    places, seen = [root], {id(root)}
+    for _ in range(_DEEPEST_MAPPING):
+        inner = [(name, node) for place in places for name, node in place.pairs if isinstance(node, Fields)]
+        places = []
+        for name, node in inner:
+            if id(node) not in seen and not (passed_over and passed_over.search(name)):
+                seen.add(id(node))
+                places.append(node)
+                yield name, node
+
+
+def plain_name(name: str) -> str:
+    """Return a name without what does not matter in it."""
+    return _PASSED_OVER.sub("", name.lower())
 
 
 def as_number(node: Any, name: str) -> float:
@@ -125,8 +150,8 @@ def is_number(leaf: Any) -> bool:
 
 
 def number_rows(text: str) -> list[list[float]] | None:
-    """Return the numbers of each line that has some, comments after # aside; None where there is anything else."""
-    lines = (line.partition("#")[0].translate(_SEPARATORS) for line in text.splitlines() if line.strip())
+    """Return the numbers of each line that has some, comments after #, % and // aside; None for anything else."""
+    lines = (_COMMENT.sub("", line).translate(_SEPARATORS) for line in text.splitlines())
     try:
         return [row for line in lines if (row := [float(word) for word in line.split()])]
     except ValueError:
@@ -134,31 +159,56 @@ def number_rows(text: str) -> list[list[float]] | None:
 
 
 def named_values(text: str) -> Fields | None:
-    """Return `name: value` or `name=value`, on lines of their own or separated by , or ;. None for anything else."""
-    pairs = []
-    lines = (line.partition("#")[0] for line in text.splitlines() if line.strip())
-    for part in (part.strip() for line in lines for part in re.split("[,;]", line)):
-        name, separator, value = (piece.strip() for piece in part.partition("=" if "=" in part else ":"))
-        if part and not (separator and name and value and value[0] not in "[{*&!|>"):  # which begin YAML's other nodes
+    """Return `name: value` or `name=value`, on lines of their own or separated by , or ;. None for anything else.
+
+    Sections `[name]` are mappings, as in INI files, whose comments begin with ; or #.
+    """
+    top: list[tuple[str, Any]] = []
+    pairs = top
+    lines = [line for line in (_COMMENT.sub("", line).strip() for line in text.splitlines()) if line]
+    yaml_nodes = "" if any(map(_SECTION.fullmatch, lines)) else _YAML_NODES
+    for line in lines:
+        if section := _SECTION.fullmatch(line):
+            pairs = []
+            top.append((section[1].strip(), pairs))
+            continue
+        parts = [_pair(part, yaml_nodes) for part in re.split("[,;]", line) if part.strip()]
+        if not all(parts):  # a list, or a comment behind a value
+            parts = [_pair(line.partition(";")[0], yaml_nodes)]
+        if not all(parts):
             return None
-        pairs += [(name, value)] * bool(part)
-    return Fields(pairs) if pairs else None
+        pairs += [part for part in parts if part]
+    found = [(name, Fields(node) if isinstance(node, list) else node) for name, node in top]
+    return Fields(found) if found else None
+
+
+def _pair(part: str, yaml_nodes: str) -> tuple[str, str] | None:
+    name, separator, value = (piece.strip() for piece in part.partition("=" if "=" in part else ":"))
+    if not (separator and name and value) or value[0] in yaml_nodes:
+        return None
+    bare = value.strip("\"'")
+    return name, bare if is_number(bare) else value.translate(_SEPARATORS).strip()
 
 
 def read_tree(text: str) -> Any:
-    """Return the tree in JSON, XML or else YAML; `ValueError` for anything else, and for what is nested too deeply."""
+    """Return the tree in JSON, XML, INI, lines or else YAML; `ValueError` for anything else, or nested too deeply."""
     start = text.lstrip()[:1]
+    is_ini = bool(start == "[" and _SECTION.fullmatch(text.lstrip().splitlines()[0].strip()))
     try:
         if start == "<":
             return _of_element(xml_root(text))
-        if start not in ("{", "["):
-            return _yaml(text)
+        if is_ini or start not in ("{", "["):
+            return named_values(text) or (_not_ini() if is_ini else _yaml(text))
         # OpenCV wrote numbers such as 318. into its JSON.
         return json.loads(_BARE_POINT.sub(".0", text), object_pairs_hook=Fields, parse_int=float)
     except json.JSONDecodeError as error:
         raise ValueError(f"it is no JSON: {error}") from None
     except RecursionError:
         raise ValueError("it is nested deeper than any calibration") from None
+
+
+def _not_ini() -> NoReturn:
+    raise ValueError("it begins as INI does, with [section], but has lines that are not name = value")
 
 
 class _YamlLoader(getattr(yaml, "CBaseLoader", yaml.BaseLoader)):  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Text files of poses, one a line: TUM (8 numbers), KITTI (12), C3VD (16)."""
+"""Text files of poses, one a line: TUM (8 numbers), KITTI (12), C3VD (16, or 17 with the time first)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 from scopemap.engine.errors import InputError, reporting
 from scopemap.input.trajectory.poses import are_frame_numbers, file_of, from_quaternions, rigid, stamped
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
+
+_TIMED_COLUMNS = 17
 
 
 @dataclass(frozen=True)
@@ -134,17 +136,24 @@ def read_c3vd(path: Path, unit: Unit) -> Trajectory:
     """Read C3VD's `pose.txt`, 16 numbers a line, always mm; `unit` is not used.
 
     C3VD stores the transposed matrix, its documentation says row-major; which of both is decided over all lines.
+    C3VDv3 has the time before it, s, or the number of the frame where all are whole (github.com/DurrLab/C3VDv3).
     """
-    table = read_numbers(file_of(path, ("pose.txt",))).with_columns(16, "C3VD's pose.txt")
-    T = table.values.reshape(-1, 4, 4)
+    table = read_numbers(file_of(path, ("pose.txt",)))
+    is_timed = table.values.shape[1] == _TIMED_COLUMNS
+    table = table.sorted_by_stamp() if is_timed else table.with_columns(16, "C3VD's pose.txt")
+    T = table.values[:, -16:].reshape(-1, 4, 4)
     if np.allclose(T[:, :3, 3], 0):
         T, order = np.swapaxes(T, 1, 2), "stored transposed"
     elif np.allclose(T[:, 3, :3], 0):
         order = "row-major"
     else:
         raise InputError(f"cannot read poses from {table.path}: neither the last row nor the last column is 0 0 0 1")
-    T = rigid(T, table.where)
-    return stamped(T, np.arange(len(T)), None, f"C3VD pose.txt, {order}, camera-to-world, mm, row = frame")
+    T, source = rigid(T, table.where), f"C3VD pose.txt, {order}, camera-to-world, mm"
+    if not is_timed:
+        return stamped(T, np.arange(len(T)), None, f"{source}, row = frame")
+    if are_frame_numbers(table.values[:, 0]):
+        return stamped(T, table.values[:, 0], None, f"{source}, whole stamps taken for frame numbers")
+    return stamped(T, None, table.values[:, 0], f"{source}, stamps are seconds")
 
 
 def read_poses(path: Path) -> np.ndarray:

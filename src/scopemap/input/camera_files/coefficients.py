@@ -1,0 +1,185 @@
+"""Distortion coefficients in a file: in a list, by kind or by name, counted from 0 or from 1; all of them are used."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from scopemap.input.camera_files.parsing import Fields, is_number, numbers_in, plain_name
+
+Kind = Literal["fisheye", "fov", "opencv", ""]
+
+LISTS = (
+    "distortion_coefficients", "D", "D1", "K_dist", "distCoeffs", "dist", "DL", "dist_coeff", "dist_coefs",
+    "dist_coef", "distortion", "distortion_coeffs", "distortion_coeff", "distortion_coefficient", "distortion_coefs",
+    "distortion_parameters", "distortion_params", "dist_params", "distortion_vector", "lens_distortion", "coeffs",
+    "coefficients", "kc", "distCoeffs1", "distCoeff1", "dist1",
+)  # fmt: skip
+_RADIAL_LISTS = ("RadialDistortion", "radial", "radial_distortion_coefficients", "radial_coefficients")
+_TANGENTIAL_LISTS = (
+    "TangentialDistortion", "tangential", "tangential_distortion_coefficients", "tangential_coefficients",
+)  # fmt: skip
+# A list of coefficients, or a camera matrix.
+_LIST_OR_MATRIX, _MATRIX_COUNTS = ("k",), (9, 12, 16)
+# Letters before the number of a coefficient: radial, tangential, and one of a list in the order of the lens.
+_RADIAL, _TANGENTIAL, _LISTED = "k", ("p", "t", "r"), ("d", "kc", "dist")
+_MOST_RADIAL, _MOST_TANGENTIAL, _MOST_FISHEYE = 6, 2, 4
+_ALL_RATIONAL = (4, 5, 6)
+# camodocal counts a fisheye's from 2, by the power of the angle before.
+_FROM_TWO = {2, 3, 4, 5}
+_OMEGA = ("omega", "w")
+_STRAY = re.compile(r"(k|p|s|kc)\d{1,2}|tau[xy12]|omega")
+_UNREAD = re.compile(r"(?<!un)dist(?!anc|rib)|coef|radial|tangential|^param(eter)?s$", re.IGNORECASE)
+# Counts, settings and precisions of a lens, and the second camera's, are not its coefficients.
+_BESIDE = re.compile(
+    r"num|count|estim|flag|model$|type$|fix|zero|max|min|std|sigma|err|uncert|cov|rms|right|inverse|depth|2$|_r$|distr$|coeffs?r$",
+    re.IGNORECASE,
+)
+_LONGEST_QUOTE = 40
+_MOST_TRIED = 100
+_DEEPEST = 3
+
+
+@dataclass(frozen=True)
+class _Set:
+    """Coefficients in the order of the lens, the names that they have in the file, and where they are in it."""
+
+    place: Fields
+    names: tuple[str, ...]
+    values: list[float]
+
+    @property
+    def trimmed(self) -> list[float]:
+        """The values without zeros at the end."""
+        return self.values[: max((i + 1 for i, value in enumerate(self.values) if value), default=0)]
+
+
+def coefficients_in(places: Sequence[Fields], kind: Kind) -> list[float]:
+    """Return the coefficients in mappings, in the order of the lens of that `kind` ("": the file does not say).
+
+    Raises `ValueError`, with the name, where a coefficient that is not zero is not used, and where two sets differ.
+    """
+    sets = [found for place in places for found in _sets_at(place, kind)]
+    chosen = next((found for found in sets if any(found.values)), sets[0] if sets else None)
+    if chosen is None:
+        chosen = _Set(Fields([]), (), [])
+    for other in sets:
+        if any(other.values) and not _agree(other, chosen):
+            names = " and ".join(", ".join(found.names)[:_LONGEST_QUOTE] for found in (chosen, other))
+            raise ValueError(f"its distortion coefficients are there twice and differ ({names}): leave one out")
+    _check_nothing_unread(places, sets)
+    return chosen.values
+
+
+def has_numbers(node: Any, depth: int = 0) -> bool:
+    """Return whether a number other than 0 is in a node; YAML's aliases may make it larger than the file."""
+    if isinstance(node, Fields):
+        node = [inner for name, inner in node.pairs if name not in ("rows", "cols")]
+    if isinstance(node, list):
+        return depth < _DEEPEST and any(has_numbers(inner, depth + 1) for inner in node[:_MOST_TRIED])
+    return any(is_number(word) and float(word) for word in str(node).split())
+
+
+def _agree(one: _Set, other: _Set) -> bool:
+    return len(one.trimmed) == len(other.trimmed) and np.allclose(one.trimmed, other.trimmed, rtol=1e-6, atol=0)
+
+
+def _sets_at(place: Fields, kind: Kind) -> Iterator[_Set]:
+    for name, node in place.nodes(LISTS):
+        if (values := numbers_in(node, name)) is not None:
+            yield _Set(place, (name,), values)
+    for name, node in place.nodes(_LIST_OR_MATRIX):
+        values = numbers_in(node, name) if isinstance(node, Fields | list | str) else None
+        if values and len(values) not in _MATRIX_COUNTS:
+            yield _Set(place, (name,), values)
+    lists = [(names, place.numbers(names)) for names in (_RADIAL_LISTS, _TANGENTIAL_LISTS)]
+    if any(values for _, values in lists):
+        radial, tangential = (dict(enumerate(values or [], start=1)) for _, values in lists)
+        names = tuple(name for spellings, values in lists if values for name, _ in place.nodes(spellings))
+        yield _Set(place, names, _in_order(radial, tangential, {}, kind))
+    if kind == "fov":
+        for name in _OMEGA:
+            if (omega := place.number((name,))) is not None and not (name == "w" and any(place.nodes(("h",)))):
+                yield _Set(place, (name,), [omega])
+    yield from _named_sets(place, kind)
+
+
+def _named_sets(place: Fields, kind: Kind) -> Iterator[_Set]:
+    """Yield the coefficients that have a name each."""
+    radial = _numbered(place, _RADIAL)
+    letters = (letter for letter in _TANGENTIAL if letter == "p" or not _numbered(place, letter).keys() & {3})
+    letter, tangential = next(((at, found) for at in letters if (found := _numbered(place, at))), ("p", {}))
+    if radial or tangential:
+        first = 2 if kind == "fisheye" and set(radial) == _FROM_TWO else int(0 not in radial)
+        radial_by_order = {number - first + 1: value for number, value in radial.items()}
+        tangential_by_order = {number + int(0 in tangential): value for number, value in tangential.items()}
+        names = {number - first + 1: f"k{number}" for number in radial}
+        names |= {-(number + int(0 in tangential)): f"{letter}{number}" for number in tangential}
+        yield _Set(place, tuple(names.values()), _in_order(radial_by_order, tangential_by_order, names, kind))
+    for letters_of_list in _LISTED:
+        found = _numbered(place, letters_of_list)
+        first = int(0 not in found)
+        if missing := [f"{letters_of_list}{i}" for i in range(first, max(found, default=0)) if i not in found]:
+            raise ValueError(f"its distortion coefficients have no {missing[0]}")
+        if found:
+            yield _Set(place, tuple(f"{letters_of_list}{i}" for i in sorted(found)), [found[i] for i in sorted(found)])
+
+
+def _numbered(place: Fields, letters: str) -> dict[int, float]:
+    """Return the numbers that are called by these letters and a digit or two, by what the digits say."""
+    named = {number: place.number((f"{letters}{number}",)) for number in range(21)}
+    return {number: value for number, value in named.items() if value is not None}
+
+
+def _in_order(radial: dict[int, float], tangential: dict[int, float], names: dict[int, str], kind: Kind) -> list[float]:
+    """Return radial and tangential coefficients, counted from 1, in the order of the lens.
+
+    `names` : of each radial one by its number, of each tangential one by minus its number. Raises `ValueError` where
+    one has no place in the lens, and where the names do not tell which lens it is.
+    """
+    most = _MOST_FISHEYE if kind == "fisheye" else _MOST_RADIAL
+    beyond = [names.get(i, f"radial {i}") for i, value in sorted(radial.items()) if value and i > most]
+    most = 0 if kind == "fisheye" else _MOST_TANGENTIAL
+    beyond += [names.get(-i, f"tangential {i}") for i, value in sorted(tangential.items()) if value and i > most]
+    k = [radial.get(i, 0.0) for i in range(1, _MOST_RADIAL + 1)]
+    if kind == "fisheye":
+        if beyond:
+            raise ValueError(f"a Kannala-Brandt lens has k1 k2 k3 k4 alone, found others, too: {', '.join(beyond)}")
+        return k[:_MOST_FISHEYE]
+    if beyond:
+        raise ValueError(f"{beyond[0]} in it has no place in OpenCV's lens: calibrate without it")
+    fourth = names.get(4, "k4")
+    if not kind and k[3] and not tangential:
+        raise ValueError(
+            f"it has {fourth} but no p1, and names no model: OpenCV's or a fisheye's? add `model: fisheye`"
+        )
+    if k[3] and not any(i in radial for i in _ALL_RATIONAL[1:]):
+        raise ValueError(f"{fourth} in it, without k5 and k6, is not OpenCV's, whose k4 divides: calibrate without it")
+    p = [tangential.get(i, 0.0) for i in range(1, _MOST_TANGENTIAL + 1)]
+    terms = [*k[:2], *p, *k[2:]]
+    return terms if any(terms[5:]) else terms[:5] if terms[4] else terms[:4]
+
+
+def _is_lens(node: Any) -> bool:
+    """Return whether a node is a mapping of a lens alone, not of another camera."""
+    return (
+        isinstance(node, Fields) and node.number(("k1",)) is not None and not any(node.nodes(("fx", "K", "intrinsics")))
+    )
+
+
+def _check_nothing_unread(places: Sequence[Fields], sets: Sequence[_Set]) -> None:
+    used = {(id(found.place), plain_name(name)) for found in sets for name in found.names}
+    read = {id(found.place) for found in sets}
+    for place in places:
+        for name, node in place.pairs:
+            if (id(place), plain_name(name)) in used or id(node) in read or not has_numbers(node):
+                continue
+            if not isinstance(node, Fields | list) and _STRAY.fullmatch(plain_name(name)):
+                raise ValueError(f"{name[:_LONGEST_QUOTE]!r} in it is a distortion coefficient that is not used")
+            if (_UNREAD.search(name) or _is_lens(node)) and not _BESIDE.search(name):
+                advice = "call it distortion_coefficients, a list in OpenCV's order, k1 k2 p1 p2 k3"
+                raise ValueError(f"{name[:_LONGEST_QUOTE]!r} in it looks like distortion but is not read: {advice}")
