@@ -43,7 +43,7 @@ def test_settings_that_are_named_exist(document: Path) -> None:
     named = re.findall(
         rf"(?<![\w/.])((?:{'|'.join(sorted(GROUPS))})(?:\.[a-z_]+)+)(?![\w(/])", document.read_text(encoding="utf-8")
     )
-    files = {f"{group}.{ending}" for group in GROUPS for ending in ("py", "json", "png", "toml")}
+    files = {f"{group}.{ending}" for group in GROUPS for ending in ("py", "json", "png", "toml", "md")}
     assert set(named) - files <= set(setting_names())
 
 
@@ -66,9 +66,13 @@ def test_the_page_of_the_interface_is_the_generated_one_and_has_every_public_nam
     assert set(scopemap.__all__) == set(scopemap._HOMES) | {"__version__"}
 
 
-def test_the_readme_names_every_preset_and_all_weights() -> None:
-    for name in (*PRESETS, *REGISTRY):
-        assert f"`{name}`" in _text("README.md").replace("--preset ", "")
+def test_every_preset_and_all_weights_are_documented() -> None:
+    presets, weights = (
+        re.findall(r"^\| (`[a-z-]+`.*?) \|", table, flags=re.MULTILINE)
+        for table in (_text("docs/presets.md"), _text("docs/depth.md").split("## Weights")[1])
+    )
+    assert set(re.findall(r"`([a-z-]+)`", " ".join(presets))) == set(PRESETS)
+    assert set(re.findall(r"`([a-z-]+)`", " ".join(weights))) == set(REGISTRY)
 
 
 def test_reproducing_names_plans_and_weights_that_exist() -> None:
