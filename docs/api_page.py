@@ -17,8 +17,8 @@ import scopemap_bench
 PAGE = Path(__file__).with_name("api.md")
 _HEAD = """# In Python
 
-The public names of `scopemap`, with signatures and docstrings; `help(scopemap)` shows the same. Other modules change with
-any version. `python docs/api_page.py` writes this page.
+The public names of `scopemap`, with signatures and docstrings; `help(scopemap)` shows the same. Other modules change
+with any version. `python docs/api_page.py` writes this page.
 
 ```python
 {example}

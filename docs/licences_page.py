@@ -20,9 +20,9 @@ PAGE = ROOT / "docs" / "licences.md"
 NOTICE = ROOT / "src" / "scopemap" / "engine" / "tracking" / "alike.LICENSE.txt"
 _HEAD = """# Licences
 
-Licences of scopemap, of what is installed with it, and of weights. scopemap and scopenet are under Apache-2.0, the weights
-of ALIKE-t under BSD-3-Clause. The core needs only packages with permissive licences; extras also bring MPL-2.0 and
-NVIDIA's own for CUDA. PyAV's wheel holds FFmpeg with x264 and x265 (GPL-2.0-or-later), OpenCV's holds FFmpeg
+Licences of scopemap, of what is installed with it, and of weights. scopemap and scopenet are under Apache-2.0, the
+weights of ALIKE-t under BSD-3-Clause. The core needs only packages with permissive licences; extras also bring MPL-2.0
+and NVIDIA's own for CUDA. PyAV's wheel holds FFmpeg with x264 and x265 (GPL-2.0-or-later), OpenCV's holds FFmpeg
 (LGPL-2.1-or-later): who passes on an image or installer with these wheels does so under these licences.
 `python docs/licences_page.py` writes this page.
 """
