@@ -17,10 +17,8 @@ import scopemap_bench
 PAGE = Path(__file__).with_name("api.md")
 _HEAD = """# In Python
 
-Everything here is imported from `scopemap` itself: `from scopemap import open_sequence, reconstruct`. `help(scopemap)`
-shows the same in Python.
-Other modules can be used, and are documented in their docstrings, but change with any version.
-`python docs/api_page.py` writes this page.
+The public names of `scopemap`, with signatures and docstrings; `help(scopemap)` shows the same. Other modules change
+with any version. `python docs/api_page.py` writes this page.
 
 ```python
 {example}

@@ -20,12 +20,11 @@ PAGE = ROOT / "docs" / "licences.md"
 NOTICE = ROOT / "src" / "scopemap" / "engine" / "tracking" / "alike.LICENSE.txt"
 _HEAD = """# Licences
 
-scopemap and its network scopenet are under Apache-2.0, the weights of ALIKE-t in the package under BSD-3-Clause.
-Below is what is installed with it, as the packages state it. A test holds them to a list of licences that are
-allowed: permissive ones for the core; for extras also MPL-2.0, and NVIDIA's own for the libraries that torch brings
-for its GPUs. Wheels bring libraries with licences of their own: that of PyAV holds FFmpeg with x264 and x265
-(GPL-2.0-or-later), that of OpenCV FFmpeg (LGPL-2.1-or-later). An image or an installer that holds these wheels is
-passed on under these licences. `python docs/licences_page.py` writes this page.
+Licences of scopemap, of what is installed with it, and of weights. scopemap and scopenet are under Apache-2.0, the
+weights of ALIKE-t under BSD-3-Clause. The core needs only packages with permissive licences; extras also bring MPL-2.0
+and NVIDIA's own for CUDA. PyAV's wheel holds FFmpeg with x264 and x265 (GPL-2.0-or-later), OpenCV's holds FFmpeg
+(LGPL-2.1-or-later): who passes on an image or installer with these wheels does so under these licences.
+`python docs/licences_page.py` writes this page.
 """
 # What their metadata leave out or say in a whole text, as in the files they bring.
 _STATED = {
@@ -105,7 +104,7 @@ def licences_page() -> str:
     lines.append("| ALIKE-t, part of the package | BSD-3-Clause, notice below |\n")
     lines += [f"| {one.name} | {one.licence} |\n" for one in REGISTRY.values()]
     notice = textwrap.indent(NOTICE.read_text(encoding="utf-8"), "    ")
-    lines.append(f"\n## Notice of ALIKE-t\n\nOf the weights in `src/scopemap/tracking/alike.onnx`:\n\n{notice}")
+    lines.append(f"\n## Notice of ALIKE-t\n\nOf the weights in `src/scopemap/engine/tracking/alike.onnx`:\n\n{notice}")
     return "".join(lines)
 
 

@@ -10,16 +10,15 @@ from scopemap.engine.config.settings import StageSettings
 
 _HEAD = """# Settings
 
-Every setting can be set on the command line (`--set tracking.keyframe_every=5`), in a TOML file (`--config FILE`) or by
-a preset. The order is defaults < preset < file < command line. A result's `config.toml` holds all settings and is a
-valid file. A cell "presets" names what presets change; `paper-strict` changes what `paper` does, too.
-`python docs/settings_page.py` writes this page.
+All settings: on the command line (`--set tracking.keyframe_every=5`), in a TOML file (`--config FILE`) or by a preset.
+The order is defaults < preset < file < command line. A result's `config.toml` is such a file. `paper-strict` also
+changes what `paper` changes. `python docs/settings_page.py` writes this page.
 """
 _METHODS = """
 ## Methods
 
-A stage's `method` names its constants (`src/scopemap/config/` states what each constant is). Methods can be joined, the
-later one wins: `--set tracking.method=paper+gauss-newton`.
+A stage's `method` names its constants (described in `src/scopemap/engine/config/`). Methods can be joined, the later
+one wins: `--set tracking.method=paper+gauss-newton`.
 
 | setting | method | constants that it changes |
 |---|---|---|

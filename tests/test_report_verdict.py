@@ -245,10 +245,11 @@ def test_every_notice_has_words_and_survives_json(code: str) -> None:
         Notice(code, values | {"more": 1})
 
 
-def test_the_documents_list_every_code() -> None:
+def test_the_documents_list_every_code_with_its_values() -> None:
     table = (DOCUMENT.parent / "formats.md").read_text(encoding="utf-8").split("### Notices")[1].split("\n## ")[0]
-    listed = dict(re.findall(r"^\| `([a-z-]+)` \| (\w+) \|", table, flags=re.MULTILINE))
-    assert listed == {code: kind.level for code, kind in KINDS.items()}
+    rows = re.findall(r"^\| `([a-z-]+)` \| (\w+) \|(?: `([a-z_, ]+)`)? \|", table, flags=re.MULTILINE)
+    listed = {code: (level, values) for code, level, values in rows}
+    assert listed == {code: (kind.level, ", ".join(sorted(fields_of_kind(code)))) for code, kind in KINDS.items()}
 
 
 def test_no_doubtful_notice_is_left_out_of_the_verdict() -> None:
