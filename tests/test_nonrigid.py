@@ -25,7 +25,7 @@ from scopemap.engine.mapping.deformation_graph import (
 )
 from scopemap.engine.mapping.frame_correction import TissueMotion
 from scopemap.engine.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
-from scopemap.engine.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
+from scopemap.engine.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, retracted
 
 KEYFRAMES, PER_KEYFRAME, GAPS = 16, 120, (1, 2, 3, 5)
 BREATH = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(KEYFRAMES) / 9)
@@ -231,7 +231,7 @@ def test_the_gradient_is_that_of_the_cost(free: bool) -> None:
     for first, end in zip(bounds, [*bounds[1:], None], strict=True):
         step = np.zeros(len(model.gradient))
         step[first:end] = rng.normal(size=len(step[first:end]))
-        ahead, behind = (NonRigidModel(problem, _retract(problem, state, s * step)).cost for s in (1e-6, -1e-6))
+        ahead, behind = (NonRigidModel(problem, retracted(problem, state, s * step)).cost for s in (1e-6, -1e-6))
         assert (ahead - behind) / 2e-6 == pytest.approx(model.gradient @ step, rel=1e-4)
 
 
