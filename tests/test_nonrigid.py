@@ -117,6 +117,7 @@ def breathing() -> NonRigidSolution:
     return found
 
 
+@pytest.mark.slow
 def test_tissue_that_breathes_is_recovered_with_its_curve_and_shape(breathing: NonRigidSolution) -> None:
     found, (problem, true) = breathing, _scene(BREATH)
     assert found.left_out.px < 0.6 < 2.0 < found.left_out.rigid_px
@@ -191,6 +192,7 @@ def test_tissue_at_rest_is_left_to_the_rigid_adjustment_whatever_the_matches_are
     assert _adjusted(wrong) is None
 
 
+@pytest.mark.slow
 def test_the_curve_of_many_keyframes_is_found_by_fewer_nodes() -> None:
     breath = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(80) / 9)
     problem, true = _scene(breath, per_keyframe=40)
@@ -255,6 +257,7 @@ def test_only_what_repeats_itself_has_a_rate() -> None:
     assert np.isnan(periodic_rate(time_s, 0 * time_s))
 
 
+@pytest.mark.slow
 def test_a_correction_states_the_motion_and_carries_it_into_another_world(breathing: NonRigidSolution) -> None:
     found = breathing
     index, at_rest = np.arange(KEYFRAMES), np.tile(np.eye(4), (KEYFRAMES, 1, 1))
