@@ -34,7 +34,8 @@ NEEDS = {
 PARTLY_NETWORKS = {"test_alike", "test_depth_benchmark", "test_weights"}
 BROWSER = {"test_report_browser", "test_serving", "test_tissue_states"}
 CLUSTER = {"test_engines", "test_addresses"}
-# Runs of whole clips, or of many processes: a module takes more than five seconds on an idle core.
+# Runs of whole clips, or of many processes: a module takes more than three seconds on an idle core. In other modules
+# single tests are marked `slow`, for the same reason.
 SLOW = {
     "test_backwards",
     "test_bad_input",
@@ -46,11 +47,14 @@ SLOW = {
     "test_cli",
     "test_cli_compare",
     "test_cli_demo",
+    "test_cli_inspect",
     "test_cli_interruption",
     "test_cli_report",
     "test_colmap_method",
+    "test_compare_exams",
     "test_depth_preview",
     "test_documented_commands",
+    "test_evaluation_deformation",
     "test_faulty_frames",
     "test_file_names",
     "test_films",
@@ -58,6 +62,8 @@ SLOW = {
     "test_free_space",
     "test_full_disk",
     "test_fusion_sizes",
+    "test_held_out",
+    "test_in_python",
     "test_inspection",
     "test_lens_trial",
     "test_live",
@@ -69,9 +75,13 @@ SLOW = {
     "test_memory",
     "test_moving_tissue",
     "test_networks_extra",
+    "test_other_starts",
     "test_overlays",
+    "test_path_of_a_frame",
     "test_phantom_motion",
     "test_phantom_pictures",
+    "test_phantom_polyps",
+    "test_phantom_truth",
     "test_pipeline",
     "test_pipeline_anchor",
     "test_pipeline_backend",
@@ -84,8 +94,10 @@ SLOW = {
     "test_security",
     "test_skipped_frames",
     "test_skipping",
+    "test_speed",
     "test_stereo_depth",
     "test_training_scenes",
+    "test_verify",
 }
 GROUPS = {"networks": PARTLY_NETWORKS, "browser": BROWSER, "cluster": CLUSTER, "slow": SLOW}
 

@@ -23,15 +23,14 @@ Damage = Callable[[bytes], bytes]
 class Content:
     """What a copy holds, by frame number; a planted fault changes it, or damages what is stored of it.
 
-    camera : of the pictures. eye : of the depth. rgb : (h, w, 3) uint8. poses : camera to world, mm, NaN = stored as
+    camera : of pictures and depth. rgb : (h, w, 3) uint8. poses : camera to world, mm, NaN = stored as
     NaN. depth_mm : (h, w). times_s : time stamps. depth_unit_mm : mm per unit of depth files. shallow : frames whose
     depth is stored with 8 bit. own : another camera, and mm per unit of depth files. *_damage : what happens to a
-    stored picture, to the file that holds all pictures, to a depth map and to the file of the poses. names_again :
-    frames whose number a second picture carries, too.
+    stored picture, to the file that holds all pictures, and to a depth map. names_again : frames whose number a second
+    picture carries, too.
     """
 
     camera: CameraModel
-    eye: CameraModel
     rgb: dict[int, np.ndarray]
     poses: dict[int, np.ndarray]
     depth_mm: dict[int, np.ndarray]
@@ -42,7 +41,6 @@ class Content:
     rgb_damage: dict[int, Damage] = field(default_factory=dict)
     stream_damage: Damage | None = None
     depth_damage: dict[int, Damage] = field(default_factory=dict)
-    poses_damage: Damage | None = None
     names_again: list[int] = field(default_factory=list)
 
     @property
@@ -50,16 +48,15 @@ class Content:
         return sorted(self.rgb)
 
 
-def content(camera: CameraModel, eye: CameraModel, scale: float, first: int, depth_unit_mm: float) -> Content:
-    """The scene, `scale` times as large, in frames that count from `first`."""
-    numbers = range(first, first + COUNT)
-    poses = {number: se3_exp(STEP * i) for i, number in enumerate(numbers)}
-    depth_mm = {number: scale * seen_depth_mm(pose, eye) for number, pose in poses.items()}
+def content(camera: CameraModel, scale: float, depth_unit_mm: float) -> Content:
+    """The scene, `scale` times as large."""
+    poses = {number: se3_exp(STEP * number) for number in range(COUNT)}
+    depth_mm = {number: scale * seen_depth_mm(pose, camera) for number, pose in poses.items()}
     for pose in poses.values():
         pose[:3, 3] *= scale
-    rgb = {number: picture(i, (camera.width, camera.height)) for i, number in enumerate(numbers)}
-    times_s = {number: number / RATE_HZ for number in numbers}
-    return Content(camera, eye, rgb, poses, depth_mm, times_s, depth_unit_mm)
+    rgb = {number: picture(number, (camera.width, camera.height)) for number in poses}
+    times_s = {number: number / RATE_HZ for number in poses}
+    return Content(camera, rgb, poses, depth_mm, times_s, depth_unit_mm)
 
 
 def seen_depth_mm(T_world_camera: np.ndarray, camera: CameraModel) -> np.ndarray:

@@ -80,19 +80,14 @@ def test_distant_keyframes_are_matched_along_those_between() -> None:
     assert np.median(along) < 0.25
 
 
-def test_a_map_that_the_camera_leaves_keeps_no_flows_and_goes_on_when_it_comes_back() -> None:
+def test_a_map_that_the_camera_leaves_goes_on_when_it_comes_back() -> None:
     tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2, 3))), DisFlow())
     poses = [plane_scene.pose(at_mm=(2.0 * n, 0.0, 0.0)) for n in range(4)]
     for number, (pose, map_number) in enumerate(zip(poses, (0, 0, 1, 0), strict=True)):
         tracks.add(plane_scene.frame(pose, number), map_number)
-        if map_number == 1:
-            assert all(past.composed is None for past in tracks._recent[0])
     points, observations = tracks.collected()
     pairs = set(zip(points.host[observations.point].tolist(), observations.keyframe.tolist(), strict=True))
     assert pairs == {(0, 1), (1, 0), (1, 3), (3, 1), (0, 3), (3, 0)}
-    # To the last keyframe the camera moved by 6 mm from the first one, by 4 mm from the second one.
-    first, second = (np.median(past.composed[0][..., 0]) for past in list(tracks._recent[0])[:2] if past.composed)
-    assert first / second == pytest.approx(1.5, abs=0.05)
 
 
 def test_keyframes_that_are_far_apart_are_matched_from_depth_and_poses_as_tracked() -> None:

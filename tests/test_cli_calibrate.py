@@ -51,6 +51,7 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_calibration_that_every_command_reads(calibrate: Say, frames: Path, tmp_path: Path) -> None:
     code, out, err = calibrate(frames, *BOARD, "--model", "pinhole", "--every", 2)
     assert code == 0

@@ -158,6 +158,7 @@ def test_a_command_of_scopemap_cannot_be_replaced(monkeypatch: pytest.MonkeyPatc
     assert found["run"] is run_command
 
 
+@pytest.mark.slow
 def test_depth_and_its_consistency_are_measured_on_demand(tmp_path: Path) -> None:
     """A run on true depth has no depth error, and its depth agrees from frame to frame as well as the truth does."""
     truth = write_tiny(tmp_path / "phantom", frames=4)

@@ -166,6 +166,7 @@ def test_the_command_writes_and_checks(run: Path, tmp_path: Path, capfd: pytest.
     assert "1 problems, the first: cannot read" in refused(capfd, "climb", "--out", out, "--quiet")
 
 
+@pytest.mark.slow
 def test_one_call_of_the_container_writes_every_clip(tmp_path: Path) -> None:
     videos, out = tmp_path / "input", tmp_path / "output"
     videos.mkdir()

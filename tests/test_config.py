@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,8 @@ from scopemap.engine.errors import SettingsError
 SOURCE = Path(scopemap.engine.config.__file__).parents[2]
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = {name: part for name, part in Config() if isinstance(part, StageSettings)}
+# What holds settings, or constants, where they are read; or an object named as their group is.
+OWNERS = ("settings", "advanced", "paper", "constants")
 # Where the settings of a group are read. A package's own `settings` object counts only in that package.
 READERS = {
     "run": ["runner/memory.py"],
@@ -181,15 +184,13 @@ def test_each_setting_and_each_constant_is_read() -> None:
     assert {group for group, _ in named} == set(READERS)
     for group, name in named:
         files = [file for pattern in READERS[group] for file in SOURCE.glob(pattern)]
-        assert any(_reads(file, group, name) for file in files), f"{group}.{name} is read nowhere in {READERS[group]}"
+        read = {key for file in files for owner, key in _read_in(file) if owner in (*OWNERS, group)}
+        assert name in read, f"{group}.{name} is read nowhere in {READERS[group]}"
 
 
-def _reads(file: Path, group: str, key: str) -> bool:
-    """Whether `<settings or group>.key` stands in the file, whatever `<...>` hangs on."""
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Attribute) and node.attr == key:
-            owner = node.value
-            name = owner.attr if isinstance(owner, ast.Attribute) else getattr(owner, "id", "")
-            if name.strip("_") in ("settings", "advanced", "paper", "constants", group):
-                return True
-    return False
+@cache
+def _read_in(file: Path) -> set[tuple[str, str]]:
+    """Return (owner, key) of every `<owner>.key` in the file, whatever `<owner>` hangs on."""
+    attributes = [node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Attribute)]
+    owners = [getattr(node.value, "attr", getattr(node.value, "id", "")) for node in attributes]
+    return {(owner.strip("_"), node.attr) for owner, node in zip(owners, attributes, strict=True)}

@@ -124,6 +124,7 @@ def _tracked(frames: list[Frame], **changes: object) -> list[Track]:
     return tracks
 
 
+@pytest.mark.slow
 def test_after_a_wall_features_confirm_the_pose_and_tell_the_scale_of_depth() -> None:
     tracks = _tracked(_frames(2.0))
     assert all(track.cause is LossCause.CONTACT for track in tracks[6:9])
@@ -137,6 +138,7 @@ def test_after_a_wall_features_confirm_the_pose_and_tell_the_scale_of_depth() ->
     assert np.linalg.norm((inverse(tracks[9].T_world_camera) @ inverse(TILTED[0]) @ TILTED[9])[:3, 3]) < 0.5
 
 
+@pytest.mark.slow
 def test_a_pose_after_a_wall_that_no_features_confirm_begins_a_new_map_later(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Tracker, "_found", lambda *_, **__: None)
     tracks = _tracked(_frames(1.0), new_map_after=4)
@@ -175,6 +177,7 @@ def test_rotations_are_marked_where_a_wall_filled_the_picture_and_not_counted_as
     assert np.isnan(frames["T_world_camera"][4, :3, 3]).all()
 
 
+@pytest.mark.slow
 def test_rotations_are_in_the_folder_and_come_back(tmp_path: Path) -> None:
     phantom = write_tiny(tmp_path / "phantom", frames=8)
     result = replace(reconstruct(open_sequence(phantom), with_true_depth(phantom)), frames=_frames_at_a_wall())

@@ -63,6 +63,7 @@ def test_true_poses_of_any_data_set_can_be_named(name: str, tmp_path: Path) -> N
     assert figures["ate_max_mm"] == pytest.approx(0.25, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["images", "hamlyn"])
 def test_depth_alone_can_be_compared(name: str, tmp_path: Path) -> None:
     folder, run = WRITERS[name](tmp_path / "input"), tmp_path / "run"
@@ -122,6 +123,7 @@ def halved(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_truth_is_read_as_the_run_read_its_input(halved: Path, tmp_path: Path) -> None:
     settings = {"depth.backend": "shading", "networks.flow": "dis", "networks.perceptual": "structure"}
     with pytest.raises(CalibrationError, match="--camera-fit scale"):
@@ -135,6 +137,7 @@ def test_truth_is_read_as_the_run_read_its_input(halved: Path, tmp_path: Path) -
     assert read_reference(halved).source.startswith("data set oneslam")
 
 
+@pytest.mark.slow
 def test_depth_of_a_run_with_another_camera_is_compared_pixel_by_pixel(tmp_path: Path) -> None:
     folder, run = WRITERS["hamlyn"](tmp_path / "input"), tmp_path / "run"
     settings = {"depth.backend": "shading", "networks.flow": "dis", "networks.perceptual": "structure"}

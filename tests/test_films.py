@@ -10,7 +10,7 @@ import pytest
 from drawn_run import IN_RESULT, draw_run, wavering
 from front_door import call, refused
 
-from scopemap.apps.view.fly_through import _centreline, _place_and_clock, smoothed_poses
+from scopemap.apps.view.fly_through import centreline_of, place_and_clock, smoothed_poses
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.report.films import write_turntable
 from scopemap.result.result import Result
@@ -57,14 +57,14 @@ def test_a_painting_shines_through_half_with_a_legend(colours: str, tmp_path: Pa
 
 
 def test_the_clock_is_that_of_the_tube_and_the_place_grows_along_it(tmp_path: Path) -> None:
-    line, first = _centreline(Result(draw_run(tmp_path / "run"))) or pytest.fail("it is a tube")
-    (near, hours), (far, _) = (_place_and_clock(line, first, se3(np.eye(3), np.array([0, 0, z]))) for z in (20.0, 40.0))
+    line, first = centreline_of(Result(draw_run(tmp_path / "run"))) or pytest.fail("it is a tube")
+    (near, hours), (far, _) = (place_and_clock(line, first, se3(np.eye(3), np.array([0, 0, z]))) for z in (20.0, 40.0))
     assert far - near == pytest.approx(20, abs=2 * line.step_mm)
     # The first camera is upright, and looks along the tube: y is down.
     right = {"12": [0, -1], "3": [1, 0], "6": [0, 1], "9": [-1, 0]}
     assert all(hours[hour] == pytest.approx(np.array(way), abs=0.2) for hour, way in right.items())
     across = se3(so3_exp(np.array([0.0, np.pi / 2, 0.0])), np.array([0.0, 0.0, 30.0]))
-    assert _place_and_clock(line, first, across)[1] == {}
+    assert place_and_clock(line, first, across)[1] == {}
 
 
 def test_a_shaken_path_is_smoothed_and_a_straight_one_stays() -> None:

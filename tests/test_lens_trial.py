@@ -16,7 +16,6 @@ from scopemap.engine.cameras.lenses import FisheyeCamera
 from scopemap.engine.config import Config
 from scopemap.engine.geometry.se3 import so3_exp
 from scopemap.input.camera_files.reading import read_calibration
-from scopemap.input.focal_length import trial
 from scopemap.input.focal_length.from_motion import FocalEstimate, with_focal_from_motion
 from scopemap.input.focal_length.trial import LensTrial, try_lenses
 from scopemap.input.focal_length.windows import Window
@@ -106,14 +105,6 @@ def test_a_kind_of_endoscope_leaves_out_other_lenses() -> None:
     assert found is not None
     assert (found.kind, found.reason) == ("orthographic fisheye", "")
     assert abs(math.log(found.focal_px / 190.0)) < max(2 * found.share, 0.02)
-
-
-def test_the_search_begins_at_a_wide_lens_whatever_is_expected(monkeypatch: pytest.MonkeyPatch) -> None:
-    tried, adjusted = list[float](), trial._adjusted
-    monkeypatch.setattr(trial, "_adjusted", lambda *of: tried.append(of[2]) or adjusted(*of))
-    windows = [_window("pinhole", 272.0, seed, **TURNING) for seed in range(2)]  # type: ignore[arg-type]
-    assert try_lenses(windows, SCOPES["laparoscope"]) is not None
-    assert 0.5 < tried[0] / (2 * HALF_PX) < 0.6 < SCOPES["laparoscope"].focal
 
 
 # ---- in a run

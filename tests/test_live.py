@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -117,17 +117,16 @@ def test_what_is_no_source_is_refused(tmp_path: Path, capfd: pytest.CaptureFixtu
 # ---- sessions
 
 
-@pytest.fixture
-def session(clip: Path, tmp_path: Path) -> LiveSession:
-    source = LiveSource(str(clip))
-    config = Config.load("realtime", settings=SETTINGS)
-    return LiveSession(source, sequence_of(source, settings=config.input), config, snapshots=tmp_path / "snapshots")
+def session_of(clip: Path, snapshots: Path, observer: Callable[[Any, Any], None]) -> LiveSession:
+    source, config = LiveSource(str(clip)), Config.load("realtime", settings=SETTINGS)
+    sequence = sequence_of(source, settings=config.input)
+    return LiveSession(source, sequence, config, observers=(observer,), snapshots=snapshots)
 
 
-def test_a_session_tracks_and_says_when_it_is_lost(session: LiveSession) -> None:
+def test_a_session_tracks_and_says_when_it_is_lost(clip: Path, tmp_path: Path) -> None:
+    words: list[str] = []
+    session = session_of(clip, tmp_path, lambda step, _: words.append(session.state()["words"]))
     assert session.state()["state"] == "starting"
-    words = []
-    session._observers = (lambda step, _: words.append(session.state()["words"]),)
     result = session.run().result()
     state = session.state()
     assert words[1] == "tracking"
@@ -140,7 +139,7 @@ def test_a_session_tracks_and_says_when_it_is_lost(session: LiveSession) -> None
     json.dumps(state)
 
 
-def test_a_reset_forgets_and_a_snapshot_is_kept(session: LiveSession) -> None:
+def test_a_reset_forgets_and_a_snapshot_is_kept(clip: Path, tmp_path: Path) -> None:
     def ask(step: Any, _: Any) -> None:
         if not session.state()["snapshot"]:
             session.snapshot()
@@ -150,7 +149,7 @@ def test_a_reset_forgets_and_a_snapshot_is_kept(session: LiveSession) -> None:
             session.reset()
 
     asked: list[int] = []
-    session._observers = (ask,)
+    session = session_of(clip, tmp_path / "snapshots", ask)
     result = session.run().result()
     assert asked
     assert result.trajectory.indices[0] > asked[0]

@@ -75,6 +75,7 @@ def test_segments_have_the_cause_that_began_them() -> None:
     assert in_words(found).startswith("Mostly by this: fast motion. Next time: turn and withdraw more slowly")
 
 
+@pytest.mark.slow
 def test_black_frames_of_a_phantom_are_too_dark_and_motion_is_measured(tmp_path: Path) -> None:
     spec = PhantomSpec(frames=8, width=96, height=80, seed=3, events=parse_events("black:4-5"))
     write_phantom(spec, tmp_path / "phantom")

@@ -144,6 +144,7 @@ def test_smoothing_takes_noise_and_leaves_volume_and_border() -> None:
     assert "confidence" in flat.vertex_attributes
 
 
+@pytest.mark.slow
 def test_the_options_of_a_run(tmp_path: Path) -> None:
     phantom = write_tiny(tmp_path / "phantom", frames=4)
     given = ("--depth", f"files:{phantom}", "--mesh-faces", "900", "--mesh-smooth", "2", "--colours", "raw", "--quiet")

@@ -25,7 +25,7 @@ from scopemap.engine.mapping.deformation_graph import (
 )
 from scopemap.engine.mapping.frame_correction import TissueMotion
 from scopemap.engine.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
-from scopemap.engine.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, _retract
+from scopemap.engine.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, retracted
 
 KEYFRAMES, PER_KEYFRAME, GAPS = 16, 120, (1, 2, 3, 5)
 BREATH = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(KEYFRAMES) / 9)
@@ -117,6 +117,7 @@ def breathing() -> NonRigidSolution:
     return found
 
 
+@pytest.mark.slow
 def test_tissue_that_breathes_is_recovered_with_its_curve_and_shape(breathing: NonRigidSolution) -> None:
     found, (problem, true) = breathing, _scene(BREATH)
     assert found.left_out.px < 0.6 < 2.0 < found.left_out.rigid_px
@@ -191,6 +192,7 @@ def test_tissue_at_rest_is_left_to_the_rigid_adjustment_whatever_the_matches_are
     assert _adjusted(wrong) is None
 
 
+@pytest.mark.slow
 def test_the_curve_of_many_keyframes_is_found_by_fewer_nodes() -> None:
     breath = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(80) / 9)
     problem, true = _scene(breath, per_keyframe=40)
@@ -231,7 +233,7 @@ def test_the_gradient_is_that_of_the_cost(free: bool) -> None:
     for first, end in zip(bounds, [*bounds[1:], None], strict=True):
         step = np.zeros(len(model.gradient))
         step[first:end] = rng.normal(size=len(step[first:end]))
-        ahead, behind = (NonRigidModel(problem, _retract(problem, state, s * step)).cost for s in (1e-6, -1e-6))
+        ahead, behind = (NonRigidModel(problem, retracted(problem, state, s * step)).cost for s in (1e-6, -1e-6))
         assert (ahead - behind) / 2e-6 == pytest.approx(model.gradient @ step, rel=1e-4)
 
 
@@ -255,6 +257,7 @@ def test_only_what_repeats_itself_has_a_rate() -> None:
     assert np.isnan(periodic_rate(time_s, 0 * time_s))
 
 
+@pytest.mark.slow
 def test_a_correction_states_the_motion_and_carries_it_into_another_world(breathing: NonRigidSolution) -> None:
     found = breathing
     index, at_rest = np.arange(KEYFRAMES), np.tile(np.eye(4), (KEYFRAMES, 1, 1))

@@ -57,6 +57,7 @@ def test_what_light_is_scattered_reaches_beside_the_beam(tube: Phantom) -> None:
     assert scattered.max() < 1.2 * dark.max()
 
 
+@pytest.mark.slow
 def test_an_omentum_is_near_and_dark_at_the_lower_edge_and_leaves_the_wall() -> None:
     phantom = prepare(OPEN)
     narrow, surface = light(replace(phantom, spec=replace(OPEN, beam_deg=24.0)), 2)

@@ -19,12 +19,12 @@ from scopemap.result.reference import reference_trajectory
 NAMES = sorted(WRITERS)
 
 
-@pytest.fixture(params=NAMES)
-def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
-    return request.param, WRITERS[request.param](tmp_path / "input")
+@pytest.fixture(scope="module", params=NAMES)
+def written(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    return request.param, WRITERS[request.param](tmp_path_factory.mktemp("reader") / "input")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def sequence(written: tuple[str, Path]) -> Sequence:
     return open_sequence(written[1])
 

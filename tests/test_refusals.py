@@ -32,12 +32,14 @@ def _depth_files(folder: Path, values_mm: list[float]) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_without_any_depth_no_frame_counts_as_tracked(folder: Path, tmp_path: Path) -> None:
     empty = _depth_files(tmp_path / "empty", [0.0] * FRAMES)
     with pytest.raises(InputError, match="too little of its depth is known"):
         reconstruct(open_sequence(folder), with_true_depth(empty))
 
 
+@pytest.mark.slow
 def test_the_world_starts_at_the_first_frame_with_depth(folder: Path, tmp_path: Path) -> None:
     late = _depth_files(tmp_path / "late", [0.0, 0.0] + [30.0] * (FRAMES - 2))
     result = reconstruct(open_sequence(folder), with_true_depth(late))

@@ -15,7 +15,7 @@ import pytest
 import trimesh
 from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, changed, draw_run, drawn_result, pose_of, tube
 
-from scopemap.apps.run.command import _time_words
+from scopemap.apps.run.command import time_words
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.notebook import in_one_line
 from scopemap.report.page import page_html, write_comparison, write_report
@@ -236,7 +236,7 @@ def test_prompt_and_report_tell_one_speed(folder: Path) -> None:
     result.provenance["seconds"] = {"total": 20.0, "compile kernels": 8.0}
     result.provenance["resumed_after_frame"] = None
     assert frames_per_s(result) == 24 / 12
-    assert _time_words(result) == "time: 20.0 s, 2.0 frames/s"
+    assert time_words(result) == "time: 20.0 s, 2.0 frames/s"
     run = Result(folder)
     assert page_data(run, shown_meshes(run, 1000))["frames_per_s"] == frames_per_s(run)
     result.provenance["resumed_after_frame"] = int(result.frames["index"][11])

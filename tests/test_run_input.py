@@ -71,6 +71,7 @@ def test_another_file_in_its_place_is_not_taken_for_it(video: tuple[Path, Path],
         find_input(run, tmp_path / "gone.mp4")
 
 
+@pytest.mark.slow
 def test_a_run_states_its_input_by_three_paths_and_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     only_images(write_tiny(tmp_path / "phantom", frames=5), tmp_path / "images")
     monkeypatch.chdir(tmp_path)

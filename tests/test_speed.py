@@ -47,7 +47,7 @@ def test_every_frame_of_a_run_is_measured_stage_by_stage(measured: Speed) -> Non
 def test_a_stage_counts_without_the_stages_within(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = iter(range(100))
     monkeypatch.setattr(speed.time, "thread_time", lambda: float(next(ticks)))
-    clock = speed._Stopwatch()
+    clock = speed.Stopwatch()
     with clock.noted("tracking"):
         for _ in range(2):
             with clock.noted("masks"):

@@ -161,7 +161,7 @@ def measure_speed(video: Path | None, config: Config, frames: int | None = None)
 
 
 def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Speed:
-    sequence, clock = open_sequence(path, frames=slice(frames)), _Stopwatch()
+    sequence, clock = open_sequence(path, frames=slice(frames)), Stopwatch()
     calibrations = calibrations_ms()
     started, cpu_started = time.perf_counter(), time.process_time()
     with clock.attached():
@@ -174,7 +174,7 @@ def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Spee
     return Speed(sequence.name, count, config.preset, size, calibration_ms, cpu_ms, passed_ms, stages)
 
 
-class _Stopwatch:
+class Stopwatch:
     """Notes the processor time of calls of the stages' functions, without that of the stages within them."""
 
     def __init__(self) -> None:

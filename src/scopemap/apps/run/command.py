@@ -207,7 +207,7 @@ def summary_lines(result: Result) -> list[str]:
         f"depth: {facts['estimators']['depth']}",
         f"flow: {facts['estimators']['flow']}; perceptual distance: {facts['estimators']['perceptual']}",
         f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces{_surface(facts['surface'])}",
-        _time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
+        time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
     ]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     if result.others:
@@ -231,7 +231,7 @@ def _map_lines(frames: FrameTable) -> list[str]:
     return [f"maps in order of time: {', '.join(maps)}"] + [f"most doubtful map: {doubt}"] * bool(doubt)
 
 
-def _time_words(result: Result) -> str:
+def time_words(result: Result) -> str:
     """Return how long the run took and its frames per second; of a resumed one since then."""
     from scopemap.result.verdict import frames_per_s
 

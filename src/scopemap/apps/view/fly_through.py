@@ -92,7 +92,7 @@ def _pictures(run: Result, source: Path | None, painting: Painting | None) -> It
     indices, poses = tracked["index"].tolist(), tracked["T_world_camera"]
     smooth = dict(zip(indices, smoothed_poses(poses, tracked["time_s"]), strict=True))
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)))
-    way, lumen = dict(zip(indices, along, strict=True)), _centreline(run)
+    way, lumen = dict(zip(indices, along, strict=True)), centreline_of(run)
     for frame in reread_frames(run.folder, set(indices), source):
         pose = smooth[frame.index]
         surface, known_mm = _surface(run, mesh, frame, pose)
@@ -104,7 +104,7 @@ def _pictures(run: Result, source: Path | None, painting: Painting | None) -> It
         far = f"{way[frame.index]:.0f} mm" if run.scale_known else f"{share:.0%}"
         words, clock = f"{frame.time_s:.1f} s, {far} along the camera's path", dict[str, np.ndarray]()
         if lumen is not None:
-            place, clock = _place_and_clock(*lumen, pose)
+            place, clock = place_and_clock(*lumen, pose)
             words += f", {place:.0f} {'mm' if run.scale_known else 'units'} along the centreline"
         px_per_mm = frame.camera.fx / np.nanmedian(known_mm) if run.scale_known and (known_mm > 0).any() else np.nan
         legend = {} if painting is None else painting.legend
@@ -125,7 +125,7 @@ def _surface(run: Result, mesh: trimesh.Trimesh, frame: Frame, pose: np.ndarray)
     return np.where(np.isnan(view.depth_mm)[..., None], np.array(rgb_of(_EMPTY), np.uint8), view.rgb), known_mm
 
 
-def _centreline(run: Result) -> tuple[Centreline, int] | None:
+def centreline_of(run: Result) -> tuple[Centreline, int] | None:
     """Return the centreline of a lumen, and the number of its point where the examined part begins; None: no lumen."""
     try:
         space = examined_space(run)
@@ -134,7 +134,7 @@ def _centreline(run: Result) -> tuple[Centreline, int] | None:
     return (space.layout.line, space.first) if isinstance(space.layout, Lumen) else None
 
 
-def _place_and_clock(line: Centreline, first: int, pose: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
+def place_and_clock(line: Centreline, first: int, pose: np.ndarray) -> tuple[float, dict[str, np.ndarray]]:
     """Return the place of a camera (4, 4) along the centreline, as blind spots have it, and directions (2,) of hours.
 
     There are none where it looks across the lumen.

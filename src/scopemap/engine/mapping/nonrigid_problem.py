@@ -88,11 +88,12 @@ def solve(problem: NonRigidProblem, start: NonRigidState) -> NonRigidState:
 
     most = _MAX_ITERATIONS if problem.free else _FOR_CURVE
     options = least_squares.Options(np.inf, most, min_step=0.0, min_decrease=_MIN_DECREASE)
-    search = least_squares.Problem(partial(NonRigidModel, problem), partial(_retract, problem), rescaled)
+    search = least_squares.Problem(partial(NonRigidModel, problem), partial(retracted, problem), rescaled)
     return minimise(search, rescaled(start), options).state
 
 
-def _retract(problem: NonRigidProblem, state: NonRigidState, step: np.ndarray) -> NonRigidState:
+def retracted(problem: NonRigidProblem, state: NonRigidState, step: np.ndarray) -> NonRigidState:
+    """Return the state after a step of the unknowns (N,), in the order of `NonRigidModel.gradient`."""
     first = PER_KEYFRAME * len(state.rigid.T_camera_world)
     end = first + state.modes.size
     last = end + problem.curve_unknowns
