@@ -6,7 +6,7 @@
                 -> smooth (WEMA)
     fuse        store, or fuse (TSDF)
     mapper.submaps    after the last frame: adjust all keyframes, close loops, merge maps
-    fusion.fuse       fuse the stored frames of a submap, corrected (TSDF)
+    finishing.py      of each submap: correct, triangulate, carve, fuse (TSDF), check
 
 A frame is tracked by the keyframe's corners, or by RTDL. The preset `paper` refines before it tracks.
 """
