@@ -27,7 +27,8 @@ from scopemap.engine.tracking.relocalisation import Relocaliser, depth_ratio, is
 from scopemap.engine.tracking.residuals import View
 from scopemap.engine.tracking.rtdl import Alignment
 from scopemap.engine.tracking.sharpness import SharpnessMonitor
-from scopemap.engine.tracking.track import FrameTracker, Track, TrackingLoss, unusable
+from scopemap.engine.tracking.track import FrameTracker, Track, TrackingLoss
+from scopemap.engine.tracking.usable import too_few_pixels
 
 _EARLIER_KEYFRAMES = 64  # of the current map, that are searched for one nearer than the current one
 _FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with less the pose hangs on a corner of it
@@ -122,10 +123,10 @@ class Tracker(FrameTracker):
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""
         self._choice.see(frame)
-        usable = float(frame.valid.mean())
-        if usable < self.settings.constants.min_valid_share:
+        usable, loss = float(frame.valid.mean()), too_few_pixels(frame, self.settings)
+        if loss is not None:
             self._sharp_frames_lost = 0
-            return replace(self._lost(frame, unusable(frame)), usable=usable)
+            return replace(self._lost(frame, loss), usable=usable)
         sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
         return replace(self._track(frame, sharpness), usable=usable, sharpness=sharpness)
 
