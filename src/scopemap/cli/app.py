@@ -39,9 +39,9 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _OWN = (
-    *(run, batch, live, view, report, demo, inspect, evaluate, export, measure, coverage, locate),
-    *(compare_exams, verify, calibrate, models.app),
-)
+    run, batch, live, view, report, demo, inspect, evaluate, export, measure, coverage, locate, compare_exams, verify,
+    calibrate, models.app,
+)  # fmt: skip
 _COMMANDS = {getattr(command, "__name__", "models").replace("_", "-"): command for command in _OWN} | dict(
     plugins("scopemap.commands")
 )

@@ -32,9 +32,9 @@ _FORMATS = (
 _SCARED = "camera-calibration"  # in frame_data*.json
 _KALIBR_CAMERA = re.compile(r"cam\d{1,3}")
 _MATRIX_NAMES = (
-    *("camera_matrix", "K", "K1", "M1", "M", "cam_K", "intrinsic_matrix", "KL", "mtx", "camera_matrix_1"),
-    *("intrinsics_matrix", "intrinsics", "intrinsic", "camera_intrinsics"),
-)
+    "camera_matrix", "K", "K1", "M1", "M", "cam_K", "intrinsic_matrix", "KL", "mtx", "camera_matrix_1",
+    "intrinsics_matrix", "intrinsics", "intrinsic", "camera_intrinsics",
+)  # fmt: skip
 # Under these names some files put what others have at their top.
 _INNER = ("intrinsics", "projection_parameters", "camera_intrinsics", "intrinsic")
 _NERFSTUDIO = "fl_x"
@@ -46,7 +46,13 @@ _INTRINSICS = {
 }
 _CORNER_TO_CENTRE_PX = 0.5
 _SIZES = ("image_size", "img_size", "im_size", "resolution", "image_resolution", "frame_size", "image_shape")
-_SIDES = (*((f"{of}_width", f"{of}_height") for of in ("image", "img", "im", "frame")), ("res_x", "res_y"))
+_SIDES = (
+    ("image_width", "image_height"),
+    ("img_width", "img_height"),
+    ("im_width", "im_height"),
+    ("frame_width", "frame_height"),
+    ("res_x", "res_y"),
+)
 # Of the image, or of the calibration board, whose number of corners or squares has the same names.
 _UNSURE_SIDES = (("width", "height"), ("w", "h"), ("cols", "rows"))
 
