@@ -13,8 +13,8 @@ from scopemap import Config
 from scopemap.engine.config import DepthSettings
 from scopemap.engine.depth.anchor import AnchoredDepth
 from scopemap.engine.depth.estimate import DepthEstimate
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
-from scopemap.engine.preprocessing import Estimators
 from scopemap.runner.estimators import create_estimators
 
 

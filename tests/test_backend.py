@@ -17,8 +17,7 @@ from scopemap.engine.flow.corners import detect_corners, sample_flow
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp, se3_log
-from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose
-from scopemap.engine.mapping import backend as backend_module
+from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose, adjusted_maps, other_starts
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
 from scopemap.engine.mapping.frame_correction import KeyframeStep
@@ -202,10 +201,10 @@ def test_an_adjustment_says_what_determines_the_shape() -> None:
 
 def test_poses_stay_as_tracked_where_the_starts_end_in_different_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     undetermined = ShapeTest("not determined", False, 0.2, 0.3, 0.30, 0.31)
-    monkeypatch.setattr(backend_module, "with_other_starts", lambda problem, found, is_rigid: (found, undetermined))
+    monkeypatch.setattr(adjusted_maps, "with_other_starts", lambda problem, found, is_rigid: (found, undetermined))
     kept = plane_scene.adjusted(map(_frame, range(5)))  # one rigid scene fits: the poses are the better ones
     assert [notice.code for notice in kept.notices][:2] == ["mapping-adjusted", "shape-not-determined"]
-    monkeypatch.setattr(backend_module, "RIGID_SIGMA_PX", 0.01)
+    monkeypatch.setattr(other_starts, "RIGID_SIGMA_PX", 0.01)
     correction = plane_scene.adjusted(map(_frame, range(5)))
     assert [notice.code for notice in correction.notices] == ["mapping-not-determined"]
     assert "depth network decides" in correction.notice.text

@@ -139,6 +139,13 @@ def test_ray_of_this_machine_is_reached_from_nowhere_else_and_tells_nobody(tmp_p
     assert {address for address in new if not address.startswith(loopback)} == set()
 
 
+@CLUSTER
+def test_a_ray_that_would_ask_others_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("ray._private.node.Node.start_api_server")
+    with pytest.raises(InputError, match=r"starting Ray \d.*asking which cloud this is; install the version in const"):
+        list(RayEngine(WorkerNeeds(1, 0.5))(act, [("work", tmp_path / "a")], ProcessLimits(1)))
+
+
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, dict[str, bytes]]]:
     """Four short videos, one of which is poisoned, and the content of the single runs of the others."""

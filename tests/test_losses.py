@@ -10,10 +10,10 @@ from drawn_run import placed_frames
 
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.config import Config
+from scopemap.engine.config import Config, TrackingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.tracking.causes import ADVICE, LossCause, causes_of_loss
-from scopemap.engine.tracking.track import unusable
+from scopemap.engine.tracking.usable import too_few_pixels
 from scopemap.result.frame_table import ELSEWHERE, LOST, NOT_USED
 from scopemap.result.losses import in_words, losses
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
@@ -51,8 +51,10 @@ def test_the_cause_of_the_first_lost_frame(judged: LossCause, motion: float, cau
 def test_why_hardly_a_pixel_is_usable(level: int, cause: str) -> None:
     camera = PinholeCamera(8.0, 8.0, 3.5, 3.5, 8, 8)
     rgb, valid = np.full((8, 8, 3), level, np.uint8), np.zeros((8, 8), bool)
-    found = unusable(Frame(0, 0.0, rgb, camera, valid))
+    found = too_few_pixels(Frame(0, 0.0, rgb, camera, valid), TrackingSettings())
+    assert found is not None
     assert (found.cause, found.reason[:8]) == (cause, "only 0% ")
+    assert too_few_pixels(Frame(0, 0.0, rgb, camera, ~valid), TrackingSettings()) is None
 
 
 def test_what_follows_a_loss_without_a_fault_of_its_own_is_not_found_again() -> None:

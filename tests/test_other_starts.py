@@ -158,16 +158,19 @@ def test_what_no_rigid_scene_explains_cannot_be_determined() -> None:
 
 
 @pytest.mark.parametrize(
-    ("outcome", "error_px", "contradicted"),
+    ("outcome", "error_px", "contradicted", "refuses_window"),
     [
-        ("not determined", 0.30, True),
-        ("not determined", 0.25, False),
-        ("decided", 0.30, False),
-        ("not tested", np.nan, False),
+        ("not determined", 0.30, True, True),
+        ("not determined", 0.25, False, True),
+        ("decided", 0.30, False, False),
+        ("not tested", np.nan, False, False),
     ],
 )
 def test_a_shape_is_contradicted_where_another_one_explains_the_views_as_well(
-    outcome: str, error_px: float, contradicted: bool
+    outcome: str, error_px: float, contradicted: bool, refuses_window: bool
 ) -> None:
     test = ShapeTest(outcome, error_px=error_px, other_px=0.31)  # type: ignore[arg-type]
     assert test.is_contradicted == contradicted
+    assert test.refuses_window == refuses_window
+    # In the end only poses that do not fit the views either stay as tracked.
+    assert [test.refuses(sigma_px) for sigma_px in (0.3, 0.6)] == [False, contradicted]

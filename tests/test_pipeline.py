@@ -18,9 +18,9 @@ from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth,
 from scopemap import Config, Result, open_sequence, reconstruct
 from scopemap.engine.config import PRESETS
 from scopemap.engine.errors import WeightsError
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
 from scopemap.engine.odometry import Step
-from scopemap.engine.preprocessing import Estimators
 from scopemap.engine.tracking.track import Track
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.estimators import create_estimators

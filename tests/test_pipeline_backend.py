@@ -13,9 +13,9 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.config import Config
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.odometry import Step
-from scopemap.engine.preprocessing import Estimators
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.result import Result
 from scopemap.runner.estimators import create_estimators

@@ -12,6 +12,7 @@ from tiny_phantom import write_tiny
 
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.config import Config
+from scopemap.engine.preprocessing import DepthTurns
 from scopemap.input.frame_choice import is_at_rest
 from scopemap.result.depth_maps import DepthReader
 
@@ -83,3 +84,16 @@ def test_noise_is_no_motion_and_a_small_motion_is_one() -> None:
     assert not is_at_rest(seen(0), seen(1))
     black = np.zeros((256, 320, 3), np.uint8)
     assert not is_at_rest(black, black)
+
+
+def test_the_network_looks_at_one_frame_in_three_and_where_nothing_can_be_propagated() -> None:
+    turns, looks = DepthTurns(3), []
+    for number in range(9):
+        if number == 5:  # a frame without depth
+            turns.interrupt()
+        looks.append(turns.propagated_kind() is None)
+        if looks[-1]:
+            turns.looked("depth")
+    assert [number for number, look in enumerate(looks) if look] == [0, 3, 5, 8]
+    assert [notice.values["frames"] for notice in turns.notices] == [5]
+    assert DepthTurns(1).notices == []

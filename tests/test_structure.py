@@ -144,7 +144,7 @@ def test_no_function_takes_keywords_it_does_not_name() -> None:
 
 
 CEILINGS = {
-    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 125),
+    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 130),
     "lines of pipeline.py": (lambda: _read(SOURCE / "engine" / "pipeline.py").lines, 106),
     "settings": (lambda: len(setting_names()), 46),
 }
@@ -224,8 +224,9 @@ def import_closure(start: str) -> set[str]:
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.engine.pipeline")
     assert "scopemap.engine.mapping.backend" in closure
-    # With notices, causes of losses, local adjustment, its lens, other starts, moving tissue, the skin of its states.
-    assert len(closure) <= 75, "\n".join(sorted(closure))
+    # With notices, causes of losses, local adjustment, its lens, other starts, moving tissue, the skin of its states,
+    # the judging of an adjustment, the parts of all stages, which frames can be tracked.
+    assert len(closure) <= 78, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

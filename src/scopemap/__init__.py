@@ -70,8 +70,9 @@ def _choose_kernel_cache() -> None:
     usual = [
         Path(__file__).parent / "engine" / "geometry" / "__pycache__",
         Path(caches) / "numba",
-        *([Path(named)] if named else []),
     ]
+    if named:
+        usual.append(Path(named))
     if os.name != "posix" or any(_may_write(folder) for folder in usual):
         return
     try:

@@ -42,9 +42,9 @@ app = typer.Typer(
 )
 _MEASURES = [one for _, added in plugins("scopemap.measures") for one in added]
 _OWN = (
-    *(run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage),
-    *(locate, compare_exams, verify, calibrate, models.app),
-)
+    run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage, locate,
+    compare_exams, verify, calibrate, models.app,
+)  # fmt: skip
 
 
 def commands() -> tuple[dict[str, Any], list[str]]:

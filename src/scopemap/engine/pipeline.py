@@ -6,7 +6,7 @@
                 -> smooth (WEMA)
     fuse        store, or fuse (TSDF)
     mapper.submaps    after the last frame: adjust all keyframes, close loops, merge maps
-    fusion.fuse       fuse the stored frames of a submap, corrected (TSDF)
+    finishing.py      of each submap: correct, triangulate, carve, fuse (TSDF), check
 
 A frame is tracked by the keyframe's corners, or by RTDL. The preset `paper` refines before it tracks.
 """
@@ -14,6 +14,7 @@ A frame is tracked by the keyframe's corners, or by RTDL. The preset `paper` ref
 from __future__ import annotations
 
 from scopemap.engine.config import Config, MappingSettings
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.faults import notices_of_faults
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import FrameStore
@@ -22,7 +23,7 @@ from scopemap.engine.mapping.local_adjustment import LocalAdjustment
 from scopemap.engine.mapping.submaps import Mapper
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Odometry, Step
-from scopemap.engine.preprocessing import Estimators, Matching, PreprocessedFrame, Preprocessing
+from scopemap.engine.preprocessing import Matching, PreprocessedFrame, Preprocessing
 from scopemap.engine.tracking.track import FrameTracker
 from scopemap.engine.tracking.tracker import Tracker
 
@@ -42,7 +43,6 @@ class Pipeline:
         tracker: FrameTracker | None = None,
     ) -> None:
         self.config = config
-        # An empty store counts as false.
         store = FrameStore() if store is None else store
         self.preprocessing, self.matching = Preprocessing(config, estimators), Matching(config, estimators)
         if tracker is None and estimators.tracker is not None:

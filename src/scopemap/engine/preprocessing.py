@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from scopemap.engine.config import Config
-from scopemap.engine.depth.anchor import AnchoredDepth, depth_downscale
-from scopemap.engine.depth.estimate import DepthEstimator, DepthKind, PerceptualDistance
+from scopemap.engine.depth.anchor import depth_downscale
+from scopemap.engine.depth.estimate import DepthKind
 from scopemap.engine.depth.mapis import DenseCorrespondence, DenseMatcher, Mapis
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.faults import StageFaults
-from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.warp import pull, resampled
-from scopemap.engine.masking.masker import Masker, StoredMasks, without_instruments
+from scopemap.engine.masking.masker import Masker, without_instruments
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.causes import LossCause
-from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures
-from scopemap.engine.tracking.pyramid import texture
 from scopemap.engine.tracking.sharpness import LEAST_QUALITY, PictureQuality
-from scopemap.engine.tracking.track import FrameTracker, TrackingLoss, unusable
-
-# So many frames in a row with too little texture are looked at: motion blur is shorter.
-_MOST_LOW_TEXTURE = 10
-
-
-@dataclass(frozen=True)
-class Estimators:
-    """The interchangeable parts that look at images; a flow is not thread-safe, so each thread has its own."""
-
-    depth: DepthEstimator
-    anchor: AnchoredDepth
-    flow: FlowEstimator  # between successive frames
-    corner_flow: FlowEstimator  # of the keyframe's corners, in tracking
-    keyframe_flow: FlowEstimator  # between keyframes, in mapping
-    perceptual: PerceptualDistance
-    masks: StoredMasks | None = None
-    features: FeatureDetector = field(default_factory=SiftFeatures)
-    tracker: Callable[[], FrameTracker] | None = None  # makes what tracks in place of `Tracker`
+from scopemap.engine.tracking.track import TrackingLoss
+from scopemap.engine.tracking.usable import TextureMonitor, covered_by, too_few_pixels
 
 
 @dataclass(frozen=True)
@@ -66,44 +45,60 @@ class PreprocessedFrame:
     propagated: bool = False
 
 
+class DepthTurns:
+    """Which frames the network looks at: one in `every`; flow propagates its depth to the frames in between."""
+
+    def __init__(self, every: int) -> None:
+        self._every = every
+        self.propagated = 0
+        """How many frames got the depth of the one before."""
+        self._since = 0  # frames since the network looked
+        self._kind: DepthKind | None = None  # of the depth that can be propagated; None: there is none
+
+    def propagated_kind(self) -> DepthKind | None:
+        """Return of which kind the depth is that the next frame gets from the one before; None: the network looks."""
+        if self._kind is None or self._since + 1 >= self._every:
+            return None
+        self._since, self.propagated = self._since + 1, self.propagated + 1
+        return self._kind
+
+    def looked(self, kind: DepthKind | None) -> None:
+        """Note that the network looked at a frame; kind : of its depth, None: the next frame cannot use it."""
+        self._since, self._kind = 0, kind
+
+    def interrupt(self) -> None:
+        """Note a frame without depth: nothing can be propagated from it."""
+        self._kind = None
+
+    @property
+    def notices(self) -> list[Notice]:
+        """How many frames got the depth of the one before, so far; [] where none did."""
+        values = {"frames": self.propagated, "every": self._every}
+        return [Notice("depth-propagated", values)] if self.propagated else []
+
+
 class Preprocessing:
     """Masks frames and estimates their raw depth, in order, each once."""
 
-    STATE: ClassVar = (
-        "_masker",
-        "_quality",
-        "estimators",
-        "faults",
-        "skipped",
-        "propagated",
-        "_low_texture",
-        "_turn",
-        "_kind",
-    )
+    STATE: ClassVar = ("_masker", "_quality", "_texture", "_turns", "estimators", "faults", "skipped")
     """What changes from frame to frame."""
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._config, self.estimators = config, estimators
         self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
-        self.faults, self._low_texture = StageFaults("depth"), 0
+        self._texture, self.faults = TextureMonitor(config.tracking), StageFaults("depth")
         self.skipped: Counter[str] = Counter()
         """How many frames were skipped, by the cause of their loss."""
-        self.propagated = 0
-        """How many frames got the depth of the one before."""
         from_files = config.depth.backend.startswith("files:") or config.mask.instruments == "auto"
-        self._every, self._needs_previous = config.depth.constants.network_every, Mapis(config.mapis).needs_previous
-        self._every = 1 if from_files else self._every
-        self._turn = 0
-        self._kind: DepthKind | None = None  # of what the network said last; None: it looks at the next frame
+        self._turns = DepthTurns(1 if from_files else config.depth.constants.network_every)
+        self._needs_previous = Mapis(config.mapis).needs_previous
 
     @property
     def notices(self) -> list[Notice]:
         """Which frames were skipped, and how many got the depth of the one before, so far."""
         causes = ", ".join(f"{count} {cause}" for cause, count in self.skipped.most_common())
-        found = [Notice("frames-skipped", {"frames": self.skipped.total(), "causes": causes})] if causes else []
-        return found + [Notice("depth-propagated", {"frames": self.propagated, "every": self._every})] * bool(
-            self.propagated
-        )
+        skipped = [Notice("frames-skipped", {"frames": self.skipped.total(), "causes": causes})] if causes else []
+        return skipped + self._turns.notices
 
     def estimate(self, frame: Frame) -> PreprocessedFrame:
         """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
@@ -115,39 +110,38 @@ class Preprocessing:
 
     def _estimate(self, frame: Frame) -> PreprocessedFrame:
         self.faults.frames += 1
-        frame, constants = self._masker(frame), self._config.tracking.constants
+        frame = self._masker(frame)
         # A frame that the tracker refuses must not fix the scale of depth, and is not worth the networks.
-        if frame.valid.mean() < constants.min_valid_share:
-            return self._skipped(frame, unusable(frame))
-        found = texture(frame, self._config.tracking) if constants.min_texture else math.inf
-        self._low_texture = self._low_texture + 1 if found < constants.min_texture else 0
-        if self._low_texture > _MOST_LOW_TEXTURE:
-            bare = TrackingLoss(LossCause.NO_TEXTURE, f"{found:.2f} of texture, noise has 0.32: contact, blur or fluid")
-            return self._skipped(without_depth(frame), bare)
+        if (loss := too_few_pixels(frame, self._config.tracking)) is not None:
+            return self._skipped(frame, loss)
+        if (loss := self._texture.too_little(frame)) is not None:
+            return self._skipped(without_depth(frame), loss)
         frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))
-        small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
-        if self._kind is not None and self._turn + 1 < self._every:
-            self._turn, self.propagated = self._turn + 1, self.propagated + 1
+        small = self._downscaled(frame)
+        if (kind := self._turns.propagated_kind()) is not None:
             frame, small = with_unknown_depth(frame), with_unknown_depth(small)
-            return PreprocessedFrame(frame, small, self._kind, None, False, propagated=True)
-        estimate = self.estimators.depth.estimate(small)
+            return PreprocessedFrame(frame, small, kind, None, False, propagated=True)
+        return self._by_network(frame, small)
+
+    def _by_network(self, frame: Frame, small: Frame) -> PreprocessedFrame:
+        """Return a frame with the network's depth in millimetres, without instruments; small : the same, downscaled."""
+        estimate, fault = self.estimators.depth.estimate(small), None
         if estimate.kind != "measured" and not np.isfinite(estimate.values).any():
             self.faults.has_no_depth(frame.index)
-        fault, instruments = None, self._masker.instruments(estimate.instruments)
+        instruments = self._masker.instruments(estimate.instruments)
         if instruments is not None:
             # An instrument's depth is of no use, and what is behind it is not known.
             unknown = np.where(instruments, np.float32(np.nan), np.float32(1))
             sigma = None if estimate.sigma is None else estimate.sigma * unknown
             estimate = replace(estimate, values=estimate.values * unknown, sigma=sigma)
             frame, small = (without_instruments(seen, instruments) for seen in (frame, small))
-            if frame.valid.mean() < constants.min_valid_share:
-                left = f"only {frame.valid.mean():.0%} of the image is usable"
-                fault = TrackingLoss(LossCause.VIEW_COVERED, f"{left}: instruments cover {instruments.mean():.0%}")
-        raw, is_followed = self.estimators.anchor.metric(estimate, small), self._needs_previous(estimate.kind)
-        self._turn, self._kind = 0, estimate.kind if is_followed and self.estimators.anchor.conversion else None
+            fault = covered_by(instruments, frame, self._config.tracking)
+        raw, anchor = self.estimators.anchor.metric(estimate, small), self.estimators.anchor
+        can_propagate = self._needs_previous(estimate.kind) and bool(anchor.conversion)
+        self._turns.looked(estimate.kind if can_propagate else None)
         small = replace(small, depth_mm=raw.depth_mm, depth_sigma_mm=raw.sigma_mm, views=None)
-        frame, fitted = with_depth(frame, raw.depth_mm, raw.sigma_mm), self.estimators.anchor.just_fitted
-        return PreprocessedFrame(frame, small, estimate.kind, None, fitted, raw.limit_note, fault)
+        frame = with_depth(frame, raw.depth_mm, raw.sigma_mm)
+        return PreprocessedFrame(frame, small, estimate.kind, None, anchor.just_fitted, raw.limit_note, fault)
 
     def _skipped(self, frame: Frame, why: TrackingLoss) -> PreprocessedFrame:
         self.skipped[str(why.cause)] += 1
@@ -155,10 +149,14 @@ class Preprocessing:
 
     def _without_estimate(self, frame: Frame, fault: TrackingLoss) -> PreprocessedFrame:
         self._masker.instruments(None)
-        self._kind = None
+        self._turns.interrupt()
         frame = replace(with_unknown_depth(frame), quality=LEAST_QUALITY)
-        small = frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
-        return PreprocessedFrame(frame, with_unknown_depth(small), "measured", None, False, fault=fault)
+        small = with_unknown_depth(self._downscaled(frame))
+        return PreprocessedFrame(frame, small, "measured", None, False, fault=fault)
+
+    def _downscaled(self, frame: Frame) -> Frame:
+        """Return a frame at the size of the depth estimate."""
+        return frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
 
 
 class Matching:

@@ -28,9 +28,9 @@ from scopemap.result.result import Result
 PAGE = "report.html"
 PICTURE = "summary.png"
 _SCRIPTS = (
-    *("matrices", "surface_view", "frame_panels", "curves", "words", "atlas"),
-    *("measuring", "measure_by_hand", "page", "gestures"),
-)
+    "matrices", "surface_view", "frame_panels", "curves", "words", "atlas", "measuring", "measure_by_hand", "page",
+    "gestures",
+)  # fmt: skip
 _LICENCES = (
     "Licences: scopemap and its depth network scopenet are under Apache-2.0. Weights of other networks have licences "
     "of their own, named by `scopemap models list`; some forbid commercial use. The video and its data set keep theirs."

@@ -89,7 +89,10 @@ def _handler(
                 self._answer(404, "text/plain", b"no such page")
                 return
             content = page()
-            self._answer(*((503, "text/plain", b"not there yet") if content is None else (200, *content)))
+            if content is None:
+                self._answer(503, "text/plain", b"not there yet")
+            else:
+                self._answer(200, *content)
 
         def do_POST(self) -> None:
             if not self._is_own():

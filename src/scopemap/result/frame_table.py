@@ -27,12 +27,29 @@ rotation."""
 _TEXTS = ("name", "reason")
 _FORMATS = {
     # "d": a whole number, -1 = unknown; NaN is unknown for the others. Empty: text.
-    **{"index": "d", "time_s": ".6f", "name": "", "status": "", "reason": "", "map": "d", "keyframe": "d"},
-    **dict.fromkeys(("residual", "inlier_share", "correlation", "overlap"), ".5g"),
-    **{"iterations": "d", "depth_scale": ".5g", "warped_share": ".3f"},
-    **dict.fromkeys(("usable", "sharpness", "motion", "quality"), ".4g"),
-    **{"cause": "", "orientation": ""},
-    **dict.fromkeys(("moving_share", "moving_x", "moving_y"), ".3f"),
+    "index": "d",
+    "time_s": ".6f",
+    "name": "",
+    "status": "",
+    "reason": "",
+    "map": "d",
+    "keyframe": "d",
+    "residual": ".5g",
+    "inlier_share": ".5g",
+    "correlation": ".5g",
+    "overlap": ".5g",
+    "iterations": "d",
+    "depth_scale": ".5g",
+    "warped_share": ".3f",
+    "usable": ".4g",
+    "sharpness": ".4g",
+    "motion": ".4g",
+    "quality": ".4g",
+    "cause": "",
+    "orientation": "",
+    "moving_share": ".3f",
+    "moving_x": ".3f",
+    "moving_y": ".3f",
 }
 COLUMNS = list(_FORMATS)
 """The columns of frames.csv."""

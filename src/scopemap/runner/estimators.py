@@ -14,12 +14,12 @@ from scopemap.engine.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOIN
 from scopemap.engine.depth.perceptual import create_perceptual
 from scopemap.engine.depth.stereo import StereoDepth
 from scopemap.engine.errors import WeightsError
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.flow.flows import create_flow
 from scopemap.engine.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
 from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.engine.models import weights
-from scopemap.engine.preprocessing import Estimators
 from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.at_rest import CameraAtRest
 from scopemap.engine.tracking.features import SiftFeatures

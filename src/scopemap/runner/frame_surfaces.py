@@ -7,11 +7,11 @@ from pathlib import Path
 from scopemap.engine.config import Config
 from scopemap.engine.depth.anchor import depth_downscale
 from scopemap.engine.errors import reporting
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.depth_mesh import depth_mesh
 from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.notices import scale_words
-from scopemap.engine.preprocessing import Estimators
 from scopemap.runner.provenance import scale_facts
 
 SURFACES = "surfaces"

@@ -7,9 +7,9 @@ from typing import Any
 
 from scopemap.engine.config import Config
 from scopemap.engine.depth.estimate import DepthEstimator
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import is_constant
 from scopemap.engine.notices import Notice
-from scopemap.engine.preprocessing import Estimators
 from scopemap.input.focal_length.from_motion import with_focal_from_motion
 from scopemap.input.sequence import Sequence
 from scopemap.runner.estimators import CustomEstimators, create_estimators

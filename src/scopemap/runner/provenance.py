@@ -14,9 +14,9 @@ from typing import Any
 from scopemap.engine.config import Config
 from scopemap.engine.depth.estimate import DepthEstimator, PerceptualDistance
 from scopemap.engine.errors import InputError
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.notices import Notice, of_input
-from scopemap.engine.preprocessing import Estimators
 from scopemap.engine.tracking.features import FeatureDetector
 from scopemap.input.sequence import Sequence
 from scopemap.result.frame_table import FrameTable
@@ -71,11 +71,12 @@ def notices_of_end(frames: FrameTable, interrupted_at: int | None, forgotten: in
 def refuse_own_input(out: Path, sequence: Sequence, config: Config) -> None:
     """Raise `InputError` where the result would replace what the run reads."""
     kind, _, folder = config.depth.backend.partition(":")
-    for source in [
-        sequence.path,
-        *([Path(folder)] if kind == "files" else []),
-        *filter(None, [config.input.second_view]),
-    ]:
+    sources = [sequence.path]
+    if kind == "files":
+        sources.append(Path(folder))
+    if config.input.second_view is not None:
+        sources.append(config.input.second_view)
+    for source in sources:
         if source.resolve().is_relative_to(out.resolve()):
             raise InputError(f"cannot write a run to {out}: its input {source} is in it; name another folder")
 

@@ -6,25 +6,17 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, nullcontext
-from dataclasses import dataclass, field, replace
+from contextlib import closing
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
-import numpy as np
 from numba.core.event import TimingListener, register
 
+from scopemap.engine.finishing import SubmapFinishing, SubmapSurface, TrackedFrames
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.agreement import surface_agreement, vertex_sigmas
-from scopemap.engine.fusion.finish import finished, with_normals_alone
 from scopemap.engine.fusion.frame_store import SpreadFrames
-from scopemap.engine.fusion.free_space import FreeSpace, views_among
-from scopemap.engine.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
-from scopemap.engine.fusion.reference_state import SurfaceState
-from scopemap.engine.fusion.surface_fusion import FusedSurface, depth_notices
-from scopemap.engine.mapping.multiview_depth import KeyframeDepths
-from scopemap.engine.mapping.submaps import FinalFrames, Submap
-from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.engine.mapping.submaps import Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.engine.pipeline import Pipeline
@@ -186,7 +178,7 @@ class _Finishing:
         if pipeline.config.mapping.at_end:
             self.run.progress("adjusting keyframes", 0, 0)
         submaps, notices = clock.timed("back end", pipeline.mapper.submaps)
-        results = [self._fused(number, submaps) for number in range(len(submaps))]
+        results = [self._submap_result(number, submaps) for number in range(len(submaps))]
         submapped = {index for submap in submaps for index in submap.frames}
         apart = set(frames["index"].tolist()) - submapped if pipeline.fusion.at_end else set()
         for frame in pipeline.fusion.store.frames(apart):
@@ -195,90 +187,51 @@ class _Finishing:
         results[0].others = results[1:]
         return results[0]
 
-    def _fused(self, number: int, submaps: list[Submap]) -> Result:
-        """Correct, write and fuse the frames of a submap."""
+    def _submap_result(self, number: int, submaps: list[Submap]) -> Result:
+        """Finish a submap; its final frames are written meanwhile."""
         trim_memory()
-        sequence, pipeline, submap = self.run.sequence, self.run.pipeline, submaps[number]
-        config, store = pipeline.config, pipeline.fusion.store
-        final = FinalFrames(submap, self._stored_poses(submap), store.frame)
-        frames, at_s = frames_of_submap(number, submaps, self.frames), config.fusion.surface_at_s
-        states = _states(submap, frames.only(frames.tracked), at_s)
-        depths = self._triangulated_depths(final, states)
-        with closing(depths) if depths is not None else nullcontext():
-            views = views_among(list(final.T_world_camera)) if config.fusion.constants.free_space else []
-            free_space: FreeSpace = self.run.clock.timed("free space", FreeSpace, final.frames(None, among=views))
-            triangulated = None if depths is None else depths.depth
-            corrected = in_thread(final.frames(triangulated, free_space.without), "correct")
-            # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
-            median_mm = store.median_depth_mm(submap.main_frames if pipeline.fusion.at_end else (), submap.depth_factor)
-            moving = MovingTissue(block_edge_mm(median_mm))
-            state, seen_at = None if states is None else SurfaceState(states), None
-            if at_s is not None:
-                # What one curve does not explain is as the frames around that second have it.
-                at_rest = final.frames(None) if state is None else map(state.fused, final.frames(None))
-                seen_at = SeenAt(at_rest, at_s, block_edge_mm(median_mm))
-            checked = self.run.checked.pop(submap.main, SpreadFrames())
-            all_frames = sum(len(submap.frames) for submap in submaps)
-            written = self._written(corrected, checked, moving, all_frames)
-            for part in (state, seen_at):
-                written = written if part is None else map(part.fused, written)
-            seen = in_thread(written, "write")
-            with closing(seen):
-                fused: FusedSurface = self.run.clock.timed("fuse", pipeline.fusion.fuse, seen, median_mm, submap.main)
-        fused = replace(fused, mesh=self.run.clock.timed("finish mesh", finished, fused.mesh, fused.settings))
-        fused.mesh.vertex_attributes["moving"] = moving.shares(fused.mesh.vertices).astype(np.float32)
-        looking, check = (checked.frames(store), states), partial(self.run.clock.timed, "check surface")
-        agreement = check(surface_agreement, fused.mesh, fused.settings, *looking)
-        fused.mesh.vertex_attributes["sigma_mm"] = check(vertex_sigmas, fused.mesh, *looking)
-        provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
-        adjusted = pipeline.odometry.notices(submap.main) if submap.correction is None else submap.correction.notices
-        confirmed = bool(adjusted) or pipeline.estimators.anchor.is_measured
-        notices = self.notices + motion_notices(frames, config, confirmed=confirmed) + adjusted
-        notices += [part.notice for part in (state, seen_at, depths) if part is not None] + fused.notices
-        notices += [] if free_space.notice is None else [free_space.notice]
-        masks, known_mm = pipeline.estimators.masks, self.frames["median_depth_mm"]
-        notices += [] if masks is None else masks.notices
-        medians_mm = known_mm[np.isfinite(known_mm)].tolist() if median_mm is None else [median_mm]
-        notices += depth_notices(medians_mm, fused.settings)
-        provenance["notices"] += [notice.as_json() for notice in notices]
-        provenance["surface"] = agreement
+        sequence, submap = self.run.sequence, submaps[number]
+        surface = self._surface(submap, sum(len(submap.frames) for submap in submaps))
+        frames, config = frames_of_submap(number, submaps, self.frames), self.run.pipeline.config
+        moving = motion_notices(frames, config, confirmed=surface.is_confirmed)
+        provenance = provenance_of(sequence, self.run.pipeline.estimators, self.run.clock.seconds, frames)
+        provenance["notices"] += [notice.as_json() for notice in self.notices + moving + surface.notices]
+        provenance["surface"] = surface.agreement
         provenance["loops"] = [] if submap.correction is None else submap.correction.loop_frames
-        config = config.model_copy(update={"fusion": fused.settings})
         return Result.in_memory(
             sequence.camera,
             frames.with_skipped(sequence.skipped),
-            with_normals_alone(fused.mesh),
-            config,
+            surface.mesh,
+            config.model_copy(update={"fusion": surface.settings}),
             provenance,
             source_camera=sequence.rectifier.source,
-            states=states,
+            states=surface.states,
         )
 
-    def _stored_poses(self, submap: Submap) -> dict[int, np.ndarray]:
-        """Return the poses (4, 4) as tracked, by number, of the submap's frames that wait for fusion."""
-        if not self.run.pipeline.fusion.at_end:
-            return {}
-        poses = zip(self.frames["index"].tolist(), self.frames["T_world_camera"], strict=True)
-        return {index: T_world_camera for index, T_world_camera in poses if index in submap.frames}
+    def _surface(self, submap: Submap, count: int) -> SubmapSurface:
+        """Return the surface of a submap; count : frames of all submaps."""
+        frames, timed = self.frames, self.run.clock.timed
+        finishing = SubmapFinishing(
+            self.run.pipeline,
+            submap,
+            TrackedFrames(frames["index"], frames["time_s"], frames["T_world_camera"], frames["median_depth_mm"]),
+            self.run.sequence.camera,
+            keeps_depth=bool(self.run.writers),
+            checked=self.run.checked.pop(submap.main, None),
+        )
+        with closing(finishing):
+            timed("free space", finishing.carve)
+            corrected = in_thread(finishing.frames(), "correct")
+            seen = in_thread(finishing.as_fused(self._written(corrected, count)), "write")
+            with closing(seen):
+                fused = timed("fuse", finishing.fuse, seen)
+        fused = timed("finish mesh", finishing.finish, fused)
+        surface: SubmapSurface = timed("check surface", finishing.check, fused)
+        return surface
 
-    def _triangulated_depths(self, final: FinalFrames, states: TissueStates | None) -> KeyframeDepths | None:
-        """Return what triangulates the depth of a submap's keyframes; None where nothing can."""
-        config, flow = self.run.pipeline.config, self.run.pipeline.estimators.keyframe_flow
-        used = bool(self.run.writers) or config.fusion.enabled
-        if not (used and config.mapping.constants.triangulate_depth and final.keyframes) or flow.name == "none":
-            return None
-        camera = self.run.sequence.camera
-        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow, states)
-
-    def _written(
-        self, frames: Iterator[Frame], checked: SpreadFrames, moving: MovingTissue, count: int
-    ) -> Iterator[Frame]:
-        """Yield the final frames of a submap, written; `checked` keeps some, `moving` counts; count : of all."""
+    def _written(self, frames: Iterator[Frame], count: int) -> Iterator[Frame]:
+        """Yield the final frames of a submap, written; count : of all submaps."""
         for frame in frames:
-            if frame.nonrigidity is not None and frame.T_world_camera is not None:
-                usable_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
-                moving.put(usable_mm, frame.nonrigidity, frame.camera, frame.T_world_camera)
-            checked.put(frame)
             self._write(frame)
             yield frame
             self._done += 1
@@ -287,17 +240,6 @@ class _Finishing:
     def _write(self, frame: Frame) -> None:
         for write in self.run.writers:
             write(frame)
-
-
-def _states(submap: Submap, tracked: FrameTable, at_s: float | None) -> TissueStates | None:
-    """Return the states of a submap's tissue at its frames where it moves, that of the surface next to a second."""
-    correction = submap.correction
-    if correction is None or correction.tissue is None:
-        return None
-    motion, index = correction.tissue.deformation, tracked["index"]
-    curves = np.column_stack([np.interp(index, correction.index, curve) for curve in motion.basis.T])
-    states = TissueStates(motion.nodes, motion.modes, index, tracked["time_s"], curves, curves[0])
-    return states.with_reference(at_s)
 
 
 class Clock:

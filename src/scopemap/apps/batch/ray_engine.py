@@ -20,13 +20,13 @@ from typing import Any
 import cv2
 
 from scopemap.apps.batch.engines import WorkerNeeds
+from scopemap.apps.batch.local_ray import keep_to_loopback, start_local_ray
 from scopemap.engine.errors import InputError, reporting
 from scopemap.runner.processes import NEW, THREADS, Outcome, ProcessLimits, attempt, threads_of_each
 
 _LONGEST_START_S = 300.0
 _LONGEST_CONNECT_S = 10.0
 _MOST_FAILED_STARTS = 3
-_OBJECTS_BYTES = 100 << 20  # videos and results go by files
 
 
 @dataclass(frozen=True)
@@ -90,11 +90,9 @@ class RayEngine:
     def _connected(self, processes: int) -> Iterator[Any]:
         """Yield the module ray, connected; all its actors end with the connection."""
         if self.address is None:
-            # Its word for a Ray of one machine, at 127.0.0.1; it is read where ray is imported.
-            os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
+            keep_to_loopback()
         try:
             import ray
-            from ray._private.node import Node
         except ImportError:
             raise InputError("--engine ray needs the extra `cluster`: pip install -e '.[cluster]'") from None
         place, needs = self.address, self.needs
@@ -104,20 +102,14 @@ class RayEngine:
             redirect_stdout(sys.stderr),
             tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder,
         ):
-            own: dict[str, Any] = {
-                "num_cpus": needs.cores * processes,
-                "_memory": int(needs.memory_gb * 1e9) * processes,
-                "object_store_memory": _OBJECTS_BYTES,
-                "include_dashboard": False,
-                "_temp_dir": folder,
-            }
             try:
                 with reporting(f"cannot {'start Ray' if place is None else f'connect to Ray at {place}'}"):
-                    _check_reached(place)
-                    options = own if place is None else {}
-                    # Without a dashboard it counts usage, and asks which cloud this is even if told not to.
-                    with _without(Node, "start_api_server"):
-                        ray.init(place or "local", log_to_driver=False, logging_level=logging.ERROR, **options)
+                    if place is None:
+                        memory_bytes = int(needs.memory_gb * 1e9) * processes
+                        start_local_ray(ray, folder, needs.cores * processes, memory_bytes)
+                    else:
+                        _check_reached(place)
+                        ray.init(place, log_to_driver=False, logging_level=logging.ERROR)
                 if threading.current_thread() is threading.main_thread():
                     signal.signal(signal.SIGTERM, handler)  # Ray's own would replace that of the command
                 yield ray
@@ -188,20 +180,9 @@ def _ready(ray: Any, workers: list[_Worker], limit_s: float | None) -> list[_Wor
     return [worker for worker in workers if worker.answer in found or worker in over]
 
 
-@contextmanager
-def _without(kind: Any, name: str) -> Iterator[None]:
-    """Let a method of a class do nothing meanwhile."""
-    method = getattr(kind, name, None)
-    setattr(kind, name, lambda *_, **__: None)
-    try:
-        yield
-    finally:
-        setattr(kind, name, method)
-
-
-def _check_reached(address: str | None) -> None:
+def _check_reached(address: str) -> None:
     """Raise `OSError` where nobody listens at HOST:PORT: Ray itself asks for minutes."""
-    host, _, port = (address or "").rpartition(":")
+    host, _, port = address.rpartition(":")
     if host and port.isdecimal() and "//" not in host:
         socket.create_connection((host, int(port)), timeout=_LONGEST_CONNECT_S).close()
 

@@ -12,7 +12,6 @@ import numpy as np
 from scopemap.apps.inspect.clip import VideoFinding, segments_of
 from scopemap.apps.inspect.field_shape import ShareBox, shares_of
 from scopemap.apps.inspect.frame_measures import InspectedFrame
-from scopemap.apps.inspect.letters import BESIDE_PX, LetterFinder
 from scopemap.engine.masking.masker import hull_of_largest
 from scopemap.engine.masking.overlays import OverlayFinder
 
@@ -38,18 +37,17 @@ _MOVED_SHARE = 0.004
 
 @dataclass(frozen=True)
 class Overlay:
-    """One overlay, whether it is in the field of view, and whether it has letters."""
+    """One overlay, and whether it is in the field of view."""
 
     box: ShareBox
     in_field: bool
-    is_text: bool
 
 
 class OverlayWatcher:
     """Finds overlays with the finder of the runs, in the field of view and outside, but not at its rim."""
 
     def __init__(self) -> None:
-        self._finder, self._letters = OverlayFinder(), LetterFinder()
+        self._finder = OverlayFinder()
         # Grows to (h, w) with the first frame; all frames of a video have one size.
         self._times = np.zeros((1, 1), np.int32)
         self._looked = 0
@@ -64,8 +62,6 @@ class OverlayWatcher:
         rim = _rim(item.field) | _rim(hull_of_largest(item.lit)) | (beside_black & item.field)
         found = self._finder(item.small, item.field, ~rim & ~item.field)
         self._times = self._times + (np.zeros_like(rim) if found is None else found & ~rim)
-        if found is not None:
-            self._letters.add(item.rgb, found)
         self._field, self._looked = item.field, self._looked + 1
 
     def overlays(self) -> list[Overlay]:
@@ -75,13 +71,8 @@ class OverlayWatcher:
         side = 2 * round(_JOIN_SHARE * self._times.shape[1]) + 1
         joined = cv2.morphologyEx(there, cv2.MORPH_CLOSE, np.ones((3, side), np.uint8))
         _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
-        letters = self._letters.letters() * self._times.shape[::-1]
         found = [
-            Overlay(
-                shares_of((x, y, w, h), self._times.shape),
-                bool(self._field[labels == label].mean() > 0.5),
-                bool((np.abs(letters - [x + w / 2, y + h / 2]) <= np.add(BESIDE_PX, [w / 2, h / 2])).all(1).any()),
-            )
+            Overlay(shares_of((x, y, w, h), self._times.shape), bool(self._field[labels == label].mean() > 0.5))
             for label, (x, y, w, h, _) in enumerate(stats[1:].tolist(), start=1)
             if min(w, h) >= _LEAST_BOX_PX
         ]
@@ -92,14 +83,14 @@ class OverlayWatcher:
         overlays = self.overlays()
         inside, outside = ([one for one in overlays if one.in_field is where] for where in (True, False))
         if inside:
-            message = f"{len(inside)} overlay(s) in the field of view ({_kinds(inside)}): {_places(inside)}"
+            kinds = "text, logos or an instrument that rests"
+            message = f"{len(inside)} overlay(s) in the field of view ({kinds}): {_places(inside)}"
             advice = "runs leave them out; where they miss some, give masks: --set mask.files=FOLDER"
             yield VideoFinding("warning", "overlay", message, advice)
         if outside:
-            message = f"{len(outside)} overlay(s) beside the field of view ({_kinds(outside)}): {_places(outside)}"
+            message = f"{len(outside)} overlay(s) beside the field of view (text or logos): {_places(outside)}"
             yield VideoFinding("info", "overlay-outside", message)
-        # Beside the field no instrument rests, but patients' data often stand: a name in letters that are not read.
-        if outside or any(one.is_text for one in overlays):
+        if overlays:
             message = "burned-in text may name a patient: look before you pass the video or pictures of it on"
             yield VideoFinding("info", "overlay-privacy", message)
 
@@ -114,11 +105,6 @@ def _rim(field: np.ndarray) -> np.ndarray:
     level = np.pad(field.astype(np.uint8), margin, mode="edge")
     out, near = cv2.dilate(level, _square(2 * margin + 1)), cv2.erode(level, _square(2 * _NEAR_PX + 1))
     return ((out > 0) & (near == 0))[margin:-margin, margin:-margin]
-
-
-def _kinds(overlays: list[Overlay]) -> str:
-    texts = sum(one.is_text for one in overlays)
-    return "text" if texts == len(overlays) else f"text in {texts} of them, else logos or an instrument that rests"
 
 
 def _places(overlays: list[Overlay]) -> str:

@@ -96,7 +96,8 @@ def load_pretrained(class_name: str, model: str, name: str) -> tuple[Any, Any, d
         raise WeightsError(f"the weights in {folder} do not fit the network: {unfit}. Pull them again")
     revision = "" if _is_local(model) else weights.recorded_revision(model)
     hashes = {f"sha256 {file.name}": weights.sha256_of(file) for file in sorted(folder.glob("*.safetensors"))}
-    return network, processor, {"model": model, **({"revision": revision} if revision else {}), **hashes}
+    origin = {"model": model, "revision": revision} if revision else {"model": model}
+    return network, processor, origin | hashes
 
 
 def _is_local(model: str) -> bool:

@@ -42,8 +42,13 @@ class StereoDepth:
         left, right = (one.resized(*self._size) for one in (pair.left, pair.right))
         # The lenses are in the maps below, whatever their model.
         R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-            *(left.central.matrix, np.zeros(4), right.central.matrix, np.zeros(4), self._size),
-            *(pair.T_right_left[:3, :3], pair.T_right_left[:3, 3]),
+            left.central.matrix,
+            np.zeros(4),
+            right.central.matrix,
+            np.zeros(4),
+            self._size,
+            R=pair.T_right_left[:3, :3],
+            T=pair.T_right_left[:3, 3],
             flags=cv2.CALIB_ZERO_DISPARITY,
         )
         self._maps = _map(left, R_left, P_left, self._size), _map(right, R_right, P_right, self._size)
@@ -84,8 +89,17 @@ def disparity_of(left: np.ndarray, right: np.ndarray, disparities: int) -> np.nd
     """
     area = _BLOCK_PX * _BLOCK_PX
     matcher = cv2.StereoSGBM.create(
-        *(0, disparities, _BLOCK_PX, 8 * area, 32 * area, -1, 31, 10, _SPECKLE_PIXELS, 2),
-        cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        minDisparity=0,
+        numDisparities=disparities,
+        blockSize=_BLOCK_PX,
+        P1=8 * area,
+        P2=32 * area,
+        disp12MaxDiff=-1,
+        preFilterCap=31,
+        uniquenessRatio=10,
+        speckleWindowSize=_SPECKLE_PIXELS,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
     # SGBM knows nothing of a margin on the left, as wide as the largest disparity; to the right in the mirror.
     blurred = [cv2.GaussianBlur(view, (0, 0), _BLUR_PX) for view in (left, right)]

@@ -16,28 +16,16 @@ from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame, RowTable, rows_in_memory
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse
-from scopemap.engine.mapping.bundle_adjustment import RIGID_SIGMA_PX, BundleSolution, adjust_in_windows, errors_px
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Points, Priors, State
-from scopemap.engine.mapping.depth_correction import (
-    DepthCorrectionField,
-    depth_grid,
-    fit_depth_corrections,
-    growth_of_disagreement,
-)
+from scopemap.engine.mapping.adjusted_maps import AdjustedMaps, MapKeyframes, adjust_maps
+from scopemap.engine.mapping.bundle_adjustment import errors_px
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State
+from scopemap.engine.mapping.depth_correction import depth_grid
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TissueMotion, TrackedPose
 from scopemap.engine.mapping.lens_residual import lens_residual
-from scopemap.engine.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
-from scopemap.engine.mapping.map_merging import (
-    AdjustedMaps,
-    Part,
-    errors_of_maps,
-    loop_support,
-    merge_maps,
-    split_maps,
-)
+from scopemap.engine.mapping.loop_closure import LOOP, Loop, LoopFinder
+from scopemap.engine.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.engine.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
-from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.engine.mapping.pose_graph import (
     PathWithoutDrift,
     optimise_pose_graph,
@@ -45,7 +33,6 @@ from scopemap.engine.mapping.pose_graph import (
     scale_by_network,
     tracked_pairs,
 )
-from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.features import FeatureDetector
 
 # Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
@@ -71,7 +58,7 @@ class Backend:
         features: FeatureDetector | None = None,
         anchored: bool = False,
     ) -> None:
-        self.settings, self._anchored = settings.constants, anchored
+        self._settings, self._anchored = settings, anchored
         self._frames: list[int] = []
         self._times_s: list[float] = []
         self._tracked: list[TrackedPose] = []
@@ -200,7 +187,7 @@ class Backend:
             if refused > len(merged) or number not in (S := self._merged(main, few)):
                 continue
             together = self._adjusted(S, main)
-            if not together.accepted(alone, self.settings.max_sigma_px):
+            if not together.accepted(alone, self._settings.constants.max_sigma_px):
                 refused += 1
                 continue
             merged.add(number)
@@ -209,7 +196,7 @@ class Backend:
         if len(worlds) < len(merged):
             S = self._merged(main, merged)
             together = self._adjusted(S, main)
-            if together.accepted(alone, self.settings.max_sigma_px):
+            if together.accepted(alone, self._settings.constants.max_sigma_px):
                 return together, S
         return found, worlds
 
@@ -255,67 +242,58 @@ class Backend:
 
     def _adjusted(self, worlds: Mapping[int, Similarity], main: int) -> AdjustedMaps:
         """Return the bundle adjustment of all keyframes of maps with these Sim(3) to the common world."""
+        problem, accepted = self._problem(worlds)
+        return adjust_maps(self._keyframes_of(worlds), problem, accepted, main)
+
+    def _chosen(self, worlds: Mapping[int, Similarity]) -> list[int]:
+        """Return the places of the keyframes of these maps."""
+        return [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
+
+    def _keyframes_of(self, worlds: Mapping[int, Similarity]) -> MapKeyframes:
+        """Return the keyframes of maps with these Sim(3) to the common world."""
         assert self._camera is not None
-        chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
-        map_of = np.array([self._tracked[k].map for k in chosen])
-        problem, accepted = self._problem(chosen, worlds, self._camera)
-        found, shape = adjust_in_windows(problem), ShapeTest()
-        if len(worlds) == 1 and self.settings.other_starts:
-            is_rigid = found.sigma_px <= self.settings.max_sigma_px
-            found, shape = with_other_starts(problem, found, is_rigid=is_rigid)
-        refused, fields = self._judged(chosen, problem, found, shape, worlds)
-        ends = map_of[problem.points.host[problem.observations.point]], map_of[problem.observations.keyframe]
-        within, between_px = errors_of_maps(errors_px(problem, found.state), *ends, [*worlds], main)
-        before, _ = errors_of_maps(errors_px(problem, problem.begin), *ends, [*worlds], main)
-        # A map of one keyframe has no observations: NaN.
-        largest_px, graph_px = float(np.fmax.reduce(within)), float(np.fmax.reduce(before))
-        index = np.array(self._frames)[chosen]
-        if not refused:
-            correction = self._correction(chosen, worlds, found)
-            correction = replace(correction, depth_fields=fields, shape=shape, loops=len(accepted))
-        elif len(worlds) > 1 and problem.start is not None:
-            by_graph = found._replace(state=problem.start._replace(sigma_px=found.sigma_px))
-            correction = replace(self._correction(chosen, worlds, by_graph), refused=refused, loops=len(accepted))
-            if self._depth_contradiction(chosen, by_graph, (), worlds):
-                graph_px = math.inf
-        else:
-            as_tracked = np.tile(np.eye(4), (len(chosen), 1, 1))
-            correction = FrameCorrection(index, as_tracked, np.zeros(len(index)), found.sigma_px, refused=refused)
-            correction = self._with_steps(replace(correction, shape=shape), chosen, worlds)
-        correction = replace(correction, loop_frames=index[accepted].tolist() if correction.loops else [])
-        main_px, support = within[list(worlds).index(main)], loop_support(accepted, map_of, main)
-        return AdjustedMaps(correction, problem, found.state, main_px, largest_px, between_px, graph_px, support)
+        chosen = self._chosen(worlds)
+        return MapKeyframes(
+            index=np.array(self._frames)[chosen],
+            poses=[self._tracked[k] for k in chosen],
+            steps=[self._steps[k] for k in chosen],
+            log_drift=self._path.drift[chosen],
+            grids_mm=self._depths_mm.read().reshape(-1, *self._grid_shape)[chosen],
+            S_common_map=worlds,
+            camera=self._camera,
+            settings=self._settings,
+        )
 
     def _with_moving_tissue(self, alone: AdjustedMaps, worlds: Mapping[int, Similarity]) -> FrameCorrection:
         """Return the correction with tissue that moves where left-out tracks confirm it, else the rigid one."""
         by_depth = alone.correction.refused and alone.rigid.sigma_px < RIGID_CORE_PX
-        if self._camera is None or not self.settings.moving_tissue or by_depth:
+        if self._camera is None or not self._settings.constants.moving_tissue or by_depth:
             return alone.correction
-        chosen = [k for k, pose in enumerate(self._tracked) if pose.map in worlds]
-        time_s = np.array(self._times_s)[chosen]
+        time_s = np.array(self._times_s)[self._chosen(worlds)]
         solution = adjust_moving_tissue(alone.problem, alone.rigid, time_s)
         if solution is None:
             return alone.correction
         found, deformation, left_out = solution
-        rate = deformation.rate_per_min(time_s)
-        fields, tissue = self._fields(chosen, alone.problem.points, found), TissueMotion(deformation, left_out, rate)
-        return replace(self._correction(chosen, worlds, found), depth_fields=fields, tissue=tissue)
+        keyframes = self._keyframes_of(worlds)
+        fields = keyframes.depth_fields(alone.problem.points, found)
+        tissue = TissueMotion(deformation, left_out, deformation.rate_per_min(time_s))
+        return replace(keyframes.correction(found), depth_fields=fields, tissue=tissue)
 
-    def _problem(
-        self, chosen: list[int], worlds: Mapping[int, Similarity], camera: PinholeCamera
-    ) -> tuple[BundleProblem, np.ndarray]:
-        """Return the bundle adjustment of chosen keyframes, from the pose graph, and its accepted loops (A, 2)."""
-        settings, poses = self.settings, [self._tracked[k] for k in chosen]
+    def _problem(self, worlds: Mapping[int, Similarity]) -> tuple[BundleProblem, np.ndarray]:
+        """Return the bundle adjustment of maps' keyframes, from the pose graph, and its accepted loops (A, 2)."""
+        assert self._camera is not None
+        constants, chosen = self._settings.constants, self._chosen(worlds)
+        poses = [self._tracked[k] for k in chosen]
         T_map_camera, to_common = self._path.T_world_camera[chosen], [worlds[pose.map] for pose in poses]
         T_world_camera = np.stack([S.transform_poses(T) for S, T in zip(to_common, T_map_camera, strict=True)])
         log_unit = np.log([S.scale for S in to_common]) - self._path.drift[chosen]
         points, observations = self._tracks.collected(chosen, self.most_observations)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
-        rotation_rad = math.radians(settings.rotation_sigma_deg)
-        priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
+        rotation_rad = math.radians(constants.rotation_sigma_deg)
+        priors = Priors(constants.scale_sigma, rotation_rad, constants.translation_sigma_share)
         pairs = tracked_pairs([self._frames[k] for k in chosen], poses)
-        T, correlated = inverse(T_world_camera), settings.correlated_observations
-        problem = BundleProblem(T, points, observations, priors, pairs, camera.fx, correlated=correlated)
+        T, correlated = inverse(T_world_camera), constants.correlated_observations
+        problem = BundleProblem(T, points, observations, priors, pairs, self._camera.fx, correlated=correlated)
         loops = self._loops_among(chosen, log_unit)
         if not loops:
             return problem, np.zeros((0, 2), int)
@@ -323,78 +301,3 @@ class Backend:
         log_depth = points.log_depth + graph.log_scale[points.host]
         start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
         return replace(problem, start=start), graph.accepted
-
-    def _as_tracked(self, chosen: list[int], worlds: Mapping[int, Similarity]) -> np.ndarray:
-        """Return the poses (C, 4, 4) of chosen keyframes as tracked, in the common world."""
-        poses = [self._tracked[k] for k in chosen]
-        return np.stack([worlds[pose.map].transform_poses(pose.T_world_camera) for pose in poses])
-
-    def _correction(
-        self, chosen: list[int], worlds: Mapping[int, Similarity], found: BundleSolution
-    ) -> FrameCorrection:
-        """Return the correction by a solution of chosen keyframes."""
-        state, index = found.state, np.array(self._frames)[chosen]
-        T_world_world = inverse(state.T_camera_world) @ inverse(self._as_tracked(chosen, worlds))
-        depth_mm = float(np.exp(np.median(state.log_depth))) if len(state.log_depth) else 1.0
-        log_scale = state.log_scale - self._path.drift[chosen]
-        correction = FrameCorrection(index, T_world_world, log_scale, found.sigma_px, depth_mm=depth_mm)
-        return self._with_steps(correction, chosen, worlds)
-
-    def _with_steps(
-        self, correction: FrameCorrection, chosen: list[int], worlds: Mapping[int, Similarity]
-    ) -> FrameCorrection:
-        """Return a correction that spreads the step of each keyframe over the frames that lead to it."""
-        return correction.with_steps([self._tracked[k] for k in chosen], [self._steps[k] for k in chosen], worlds)
-
-    def _judged(
-        self,
-        chosen: list[int],
-        problem: BundleProblem,
-        found: BundleSolution,
-        shape: ShapeTest,
-        worlds: Mapping[int, Similarity],
-    ) -> tuple[Notice | None, tuple[DepthCorrectionField, ...]]:
-        """Return why a solution is refused, None where it is not, and its depth correction fields."""
-        if not found.sigma_px <= self.settings.max_sigma_px:  # NaN: nothing was observed
-            return Notice("mapping-not-rigid", {"sigma_px": found.sigma_px, "merged": ""}), ()
-        if shape.is_contradicted and found.sigma_px > RIGID_SIGMA_PX:  # else poses fit the views all the same
-            errors = {"error_px": shape.error_px, "other_px": shape.other_px}
-            return Notice("mapping-not-determined", {**errors, "merged": ""}), ()
-        fields = self._fields(chosen, problem.points, found)
-        if shape.outcome != "not tested":  # the starts have judged the shape
-            return None, fields
-        return self._depth_contradiction(chosen, found, fields, worlds), fields
-
-    def _fields(self, chosen: list[int], points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
-        """Return the depth correction fields of chosen keyframes by a solution; () where depth is only scaled."""
-        if (step_sigma := self.settings.depth_step_sigma) <= 0:
-            return ()
-        assert self._camera is not None
-        drift = self._path.drift[chosen]
-        as_tracked = replace(points, log_depth=points.log_depth + drift[points.host])
-        change = found.state.log_depth - points.log_depth - found.state.log_scale[points.host]
-        return fit_depth_corrections(self._camera, as_tracked, len(drift), change, found.log_depth_sigma, step_sigma)
-
-    def _depth_contradiction(
-        self,
-        chosen: list[int],
-        found: BundleSolution,
-        fields: tuple[DepthCorrectionField, ...],
-        worlds: Mapping[int, Similarity],
-    ) -> Notice | None:
-        """Return that the depths of keyframes agree less than as tracked, None where they agree."""
-        assert self._camera is not None
-        grids = self._depths_mm.read().reshape(-1, *self._grid_shape)
-        before = [np.float32(worlds[self._tracked[k].map].scale) * grids[k] for k in chosen]
-        log_scale = found.state.log_scale - self._path.drift[chosen]
-        after = [np.exp(scale) * grid for scale, grid in zip(log_scale, before, strict=True)]
-        if fields:
-            factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
-            after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
-        # Farther apart two keyframes may have a few pixels in common, which prove nothing.
-        gaps = [gap for gap in self.settings.keyframe_gaps if gap <= MOST_RECENT]
-        both = (self._as_tracked(chosen, worlds), before), (inverse(found.state.T_camera_world), after)
-        grown = growth_of_disagreement(self._camera, *both, gaps)
-        if grown is None:
-            return None
-        return Notice("mapping-depth-disagrees", {"tracked": grown[0], "adjusted": grown[1], "merged": ""})

@@ -11,6 +11,7 @@ manipulation", SIGGRAPH 2007, with translations alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -63,13 +64,14 @@ class Deformation:
 
 def spread_nodes(points: np.ndarray, count: int) -> np.ndarray:
     """Return nodes (count, 3), far from each other, of points (P, 3) without the outermost: farthest-point sampling."""
-    outwards = np.linalg.norm(points - np.median(points, 0), axis=1)
-    inner = points[outwards <= np.percentile(outwards, _FARTHEST_SHARE)]
-    chosen = [int(outwards[outwards <= np.percentile(outwards, _FARTHEST_SHARE)].argmin())]
-    far = np.linalg.norm(inner - inner[chosen[0]], axis=1)
+    distance = np.linalg.norm(points - np.median(points, 0), axis=1)
+    is_inner = distance <= np.percentile(distance, _FARTHEST_SHARE)
+    inner = points[is_inner]
+    chosen = [int(distance[is_inner].argmin())]
+    to_nearest = np.linalg.norm(inner - inner[chosen[0]], axis=1)
     while len(chosen) < count:
-        chosen.append(int(far.argmax()))
-        far = np.minimum(far, np.linalg.norm(inner - inner[chosen[-1]], axis=1))
+        chosen.append(int(to_nearest.argmax()))
+        to_nearest = np.minimum(to_nearest, np.linalg.norm(inner - inner[chosen[-1]], axis=1))
     return inner[chosen]
 
 
@@ -85,19 +87,20 @@ class MotionPrior(NamedTuple):
     def normal_matrix(self, nodes: np.ndarray, basis: np.ndarray, unit_mm: float) -> sparse.csr_matrix:
         """Return the normal matrix (L N, L N) of one axis of modes, flattened; unit_mm : the typical depth."""
         count = len(nodes)
-        far, node = KDTree(nodes).query(nodes, k=min(_NEIGHBOURS + 1, count))
-        first, other = np.repeat(np.arange(count), node.shape[1] - 1), node[:, 1:].ravel()
-        rows, ones = np.arange(len(first)), np.ones(len(first))
-        between = sparse.csr_matrix(
-            (np.append(ones, -ones), (np.append(rows, rows), np.append(first, other))), shape=(len(rows), count)
+        distance_mm, neighbour = KDTree(nodes).query(nodes, k=min(_NEIGHBOURS + 1, count))  # itself is the first
+        first, second = np.repeat(np.arange(count), neighbour.shape[1] - 1), neighbour[:, 1:].ravel()
+        edge, ones = np.arange(len(first)), np.ones(len(first))
+        difference = sparse.csr_matrix(
+            (np.append(ones, -ones), (np.append(edge, edge), np.append(first, second))), shape=(len(edge), count)
         )
-        # Most pairs are there twice.
-        strain = between.T @ sparse.diags(0.5 / (self.strain * far[:, 1:].ravel()) ** 2) @ between
-        still = sparse.identity(count)
+        # Most edges are there twice.
+        weight = sparse.diags(0.5 / (self.strain * distance_mm[:, 1:].ravel()) ** 2)
+        strain = difference.T @ weight @ difference
+        identity = sparse.identity(count)
         steps = np.diff(basis, axis=0)
         return (
-            sparse.kron(basis.T @ basis, strain + still / (self.size * unit_mm) ** 2)
-            + sparse.kron(steps.T @ steps, still) / (self.step * unit_mm) ** 2
+            sparse.kron(basis.T @ basis, strain + identity / (self.size * unit_mm) ** 2)
+            + sparse.kron(steps.T @ steps, identity) / (self.step * unit_mm) ** 2
         ).tocsr()
 
 
@@ -119,16 +122,17 @@ def first_mode(displacement: np.ndarray) -> np.ndarray:
 def periodic_rate(time_s: np.ndarray, curve: np.ndarray) -> float:
     """Return the rate, 1/s, of the sinusoid that explains a curve (K,) best; NaN where it explains too little."""
     span, gap = float(np.ptp(time_s)), float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-    off = curve - curve.mean()
-    if not span > 0 or not gap > 0 or not off.any():
+    centred = curve - curve.mean()
+    if not span > 0 or not gap > 0 or not centred.any():
         return float("nan")
-    best, explained = float("nan"), _PERIODIC_SHARE
+    best, most_explained = float("nan"), _PERIODIC_SHARE
     for rate in np.linspace(_LEAST_PERIODS / span, 1 / (4 * gap), _RATES):
-        angle = 2 * np.pi * rate * time_s
-        waves = np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))])
-        left = curve - waves @ np.linalg.lstsq(waves, curve, rcond=None)[0]
-        if 1 - (left @ left) / (off @ off) > explained:
-            best, explained = float(rate), 1 - (left @ left) / (off @ off)
+        phase = 2 * np.pi * rate * time_s
+        sinusoids = np.column_stack([np.cos(phase), np.sin(phase), np.ones(len(phase))])
+        residual = curve - sinusoids @ np.linalg.lstsq(sinusoids, curve, rcond=None)[0]
+        explained = 1 - (residual @ residual) / (centred @ centred)
+        if explained > most_explained:
+            best, most_explained = float(rate), explained
     return best
 
 
@@ -149,34 +153,57 @@ def camera_without_curve(
     nodes : (N, 3) mm. mode : (N, 3) mm. size_mm : prior standard deviation of a displacement. To first order poses and
     mode with the motion explain the same pictures; it is the identity at the first keyframe.
     """
-    along, middle = curve - curve[0], nodes.mean(0)
-    twist = _common_twist(T_world_camera, time_s, along, nodes, mode / size_mm, size_mm)
-    about = np.eye(4)
-    about[:3, 3] = middle
-    T_world_world = np.stack([about @ se3_exp(share * twist) @ inverse(about) for share in along])
-    return T_world_world, mode + np.cross(twist[:3], nodes - middle) + twist[3:]
+    curve_change, centre = curve - curve[0], nodes.mean(0)
+    twist = _common_twist(T_world_camera, time_s, curve_change, nodes, mode / size_mm, size_mm)
+    T_world_centre = np.eye(4)
+    T_world_centre[:3, 3] = centre
+    T_world_world = np.stack(
+        [T_world_centre @ se3_exp(change * twist) @ inverse(T_world_centre) for change in curve_change]
+    )
+    return T_world_world, mode + np.cross(twist[:3], nodes - centre) + twist[3:]
 
 
 def _common_twist(
-    T: np.ndarray, time_s: np.ndarray, along: np.ndarray, nodes: np.ndarray, displaced: np.ndarray, size_mm: float
+    T_world_camera: np.ndarray,
+    time_s: np.ndarray,
+    curve_change: np.ndarray,
+    nodes: np.ndarray,
+    displacement: np.ndarray,
+    size_mm: float,
 ) -> np.ndarray:
-    """Return the twist (6,), about the nodes' mean, of camera and tissue where the curve is 1: linear least squares."""
-    gaps = np.maximum(np.diff(time_s), _LEAST_GAP_S)
-    slope = np.diff(np.identity(len(T)), axis=0) / gaps[:, None]
-    each = np.sqrt((gaps[1:] + gaps[:-1]) / 2)[:, None]
-    change = np.diff(slope, axis=0) / each  # of velocity, (K - 2, K)
-    turns = np.stack([so3_log(T[k + 1, :3, :3] @ T[k, :3, :3].T) for k in range(len(T) - 1)]) / gaps[:, None]
-    from_middle = T[:, :3, 3] - nodes.mean(0)
-    count, by = len(change), change @ along
-    levers = np.einsum("jk,k,kab->jab", change, along, -np.stack([hat(x) for x in from_middle]))
-    of_turn = np.concatenate([np.einsum("j,ab->jab", by, np.eye(3)), np.zeros((count, 3, 3))], axis=2)
-    of_way = np.concatenate([levers, np.einsum("j,ab->jab", by, np.eye(3))], axis=2)
-    of_nodes = np.stack([np.hstack([-hat(x), np.eye(3)]) for x in nodes - nodes.mean(0)]) / size_mm
-    rows = [(of_turn.reshape(-1, 6), (np.diff(turns, axis=0) / each).ravel())]
-    rows += [(of_way.reshape(-1, 6), (change @ T[:, :3, 3]).ravel()), (of_nodes.reshape(-1, 6), displaced.ravel())]
+    """Return the twist (6,), about the nodes' mean, of camera and tissue where the curve is 1: linear least squares.
+
+    curve_change : (K,) of the curve since the first keyframe. displacement : (N, 3) of the nodes, over size_mm. The
+    residuals J twist + r are, in three blocks,
+
+        rotation       angular acceleration of the camera
+        translation    acceleration of its position
+        nodes          displacements that the twist leaves to the nodes
+
+    of which the first two have the standard deviation that they turn out to have.
+    """
+    gaps_s = np.maximum(np.diff(time_s), _LEAST_GAP_S)
+    velocity = np.diff(np.identity(len(time_s)), axis=0) / gaps_s[:, None]
+    # Over the root of the time, so that the squares sum up to the integral of the squared acceleration.
+    root_s = np.sqrt((gaps_s[1:] + gaps_s[:-1]) / 2)[:, None]
+    acceleration = np.diff(velocity, axis=0) / root_s  # (K - 2, K), takes values at the keyframes to it
+    R, position, centre = T_world_camera[:, :3, :3], T_world_camera[:, :3, 3], nodes.mean(0)
+    angular_velocity = np.stack([so3_log(after @ before.T) for before, after in pairwise(R)])
+    angular_velocity /= gaps_s[:, None]
+    r_rotation, r_translation = np.diff(angular_velocity, axis=0) / root_s, acceleration @ position
+    # The twist moves a camera by its rotation x (position - centre) + its translation, times the curve.
+    by_translation = np.einsum("j,ab->jab", acceleration @ curve_change, np.eye(3))
+    cross = -np.stack([hat(x) for x in position - centre])
+    by_rotation = np.einsum("jk,k,kab->jab", acceleration, curve_change, cross)
+    J_rotation = np.concatenate([by_translation, np.zeros((len(acceleration), 3, 3))], axis=2)
+    J_translation = np.concatenate([by_rotation, by_translation], axis=2)
+    J_nodes = np.stack([np.hstack([-hat(x), np.eye(3)]) for x in nodes - centre]) / size_mm
+    blocks = [(J_rotation, r_rotation), (J_translation, r_translation), (J_nodes, displacement)]
+    stacked = [(J.reshape(-1, 6), r.ravel()) for J, r in blocks]
     twist = np.zeros(6)
     for _ in range(_REWEIGHTINGS):
-        sigmas = [*(float(np.sqrt(np.mean((A @ twist + b) ** 2))) + 1e-12 for A, b in rows[:2]), 1.0]
-        A, b = (np.concatenate([row[i] / sigma for row, sigma in zip(rows, sigmas, strict=True)]) for i in range(2))
-        twist = -np.linalg.lstsq(A, b, rcond=None)[0]
+        sigmas = [float(np.sqrt(np.mean((J @ twist + r) ** 2))) + 1e-12 for J, r in stacked[:2]] + [1.0]
+        J = np.concatenate([J / sigma for (J, _), sigma in zip(stacked, sigmas, strict=True)])
+        r = np.concatenate([r / sigma for (_, r), sigma in zip(stacked, sigmas, strict=True)])
+        twist = -np.linalg.lstsq(J, r, rcond=None)[0]
     return twist

@@ -110,10 +110,10 @@ class LocalAdjustment:
         if len(self._window) > 1:
             points, observations = self._tracks.collected(self._numbers)
             found = adjust(self._problem(points, observations, keyframe.camera.fx), max_iterations=_ITERATIONS)
-            found, is_determined = self._with_other_starts(points, observations, found, keyframe.camera.fx, map_number)
+            found, shape = self._with_other_starts(points, observations, found, keyframe.camera.fx, map_number)
             own_sigma = found.log_depth_sigma[points.host == len(self._window) - 1]
             is_seen = np.isfinite(own_sigma).sum() > _LEAST_SEEN * len(own_sigma)
-            if not (is_seen and found.sigma_px <= RIGID_SIGMA_PX and is_determined):
+            if not (is_seen and found.sigma_px <= RIGID_SIGMA_PX) or shape.refuses_window:
                 self._refused[map_number] += int(is_seen)
                 self._begin()
                 self._take(keyframe, reference)
@@ -189,17 +189,17 @@ class LocalAdjustment:
 
     def _with_other_starts(
         self, points: Points, observations: Observations, found: BundleSolution, focal_px: float, map_number: int
-    ) -> tuple[BundleSolution, bool]:
-        """Return the solution of the start that wins in the first full window that tells, and whether one does."""
+    ) -> tuple[BundleSolution, ShapeTest]:
+        """Return the solution of the start that wins in a full window, until one determines the shape; and the test."""
         is_due = len(self._window) == self._window.maxlen and not self._is_determined
         if not (is_due and self._settings.constants.other_starts):
-            return found, True
+            return found, ShapeTest()
         problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
         best, test = with_other_starts(problem, found, is_rigid=found.sigma_px <= RIGID_SIGMA_PX)
-        if test.outcome != "not tested":
-            self._is_determined = test.outcome != "not determined"
+        if test.is_tested:
+            self._is_determined = not test.refuses_window
             self._shapes[map_number] = test
-        return best, test.outcome != "not determined"
+        return best, test
 
     def _test_lens(self, points: Points, observations: Observations, state: State, focal_px: float) -> None:
         """Ask one full window in a few what its views tell of the lens, until they tell it."""

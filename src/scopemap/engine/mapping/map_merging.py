@@ -7,7 +7,7 @@ map to the world of p's has
     scale exp(-r),    rotation R_p R_n_p^T R_n^T,    and takes the position of n to the position of T_p T_n_p^-1
 
 A loop closure is accepted only if loop closures of other keyframes agree with it, and maps are merged only if they fit
-after an adjustment (`AdjustedMaps`).
+after an adjustment (`adjusted_maps.py`).
 
 Where the camera was lost and aligned again to a keyframe from before, the alignment may be wrong. If keyframes from
 before and after the loss observe no points in common, nothing supports it, and the map is split there.
@@ -15,7 +15,6 @@ before and after the loss observe no points in common, nothing supports it, and 
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from itertools import chain
@@ -24,10 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from scopemap.engine.geometry.align import Similarity
-from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.geometry.se3 import inverse
-from scopemap.engine.mapping.bundle_problem import BundleProblem, State
-from scopemap.engine.mapping.frame_correction import FrameCorrection, TrackedPose
+from scopemap.engine.mapping.frame_correction import TrackedPose
 from scopemap.engine.mapping.loop_closure import Loop
 
 _MIN_SUPPORT = 2  # agreeing keyframes in either map
@@ -37,49 +34,8 @@ _MAX_LOG_SCALE = 1.0  # between maps of one video
 # Observations of points in common that support a motion tracked across a loss: as many as relocalisation needs inliers.
 _MIN_COMMON = 20
 
-# Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
-_MAX_ERROR_FACTOR = 1.5
-_NOISE_PX = 0.05
-# Keyframes of either map with loops to the other, where errors between maps are larger than within or untested.
-_MIN_LOOPED = 4
-# Learned features are matched to about a pixel: errors between maps of one place were up to 0.96 px, of two from 1.38.
-_MAX_FEATURE_PX = 1.2
-
 Part = tuple[int, int]
 """A part of a map between two losses: number of the map, and segment as in `TrackedPose`."""
-
-
-class AdjustedMaps(NamedTuple):
-    """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
-
-    main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph,
-    infinite where the depths of keyframes agree less there than as tracked. between_px : the largest between another
-    map and all others. support : keyframes on either side of the accepted loops of the least supported map. problem,
-    rigid : what was solved, and the solution, refused or not.
-    """
-
-    correction: FrameCorrection
-    problem: BundleProblem
-    rigid: State
-    main_px: float
-    largest_px: float
-    between_px: float
-    graph_px: float
-    support: int
-
-    def accepted(self, alone: AdjustedMaps, max_sigma_px: float) -> bool:
-        """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone.
-
-        Where tissue moves, so that not even the main map is adjusted, the pose graph merges them: loops of several
-        keyframes agree with each other and with both maps as tracked, which fit as well as alone.
-        """
-        if alone.correction.refused and self.correction.refused:
-            fits = self.graph_px <= _MAX_ERROR_FACTOR * alone.graph_px + _NOISE_PX
-            return fits and self.support >= _MIN_LOOPED
-        rigid = not self.correction.refused and self.largest_px <= max_sigma_px
-        by_features = self.support >= _MIN_LOOPED and self.between_px <= _MAX_FEATURE_PX
-        connected = self.correction.loops > 0 and (self.between_px <= max_sigma_px or by_features)
-        return rigid and connected and self.main_px <= _MAX_ERROR_FACTOR * alone.main_px + _NOISE_PX
 
 
 class _Hypothesis(NamedTuple):
@@ -149,32 +105,6 @@ def merge_maps(
     motion = T_world_camera[first] @ inverse(S_common_map[map_of[first]].transform_poses(T_world_camera[first]))
     moved = Similarity(1.0, motion[:3, :3], motion[:3, 3])
     return {number: moved.after(S) for number, S in S_common_map.items()}
-
-
-def loop_support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
-    """Return the fewest keyframes, on either side, of the loops (A, 2) of a map with others; 0: a map has none."""
-    least = []
-    for number in sorted(set(map_of.tolist()) - {main}):
-        inside = map_of[loops] == number
-        ends = loops[inside.sum(1) == 1]
-        own = map_of[ends] == number
-        least.append(min(len(np.unique(ends[own])), len(np.unique(ends[~own]))))
-    return min(least, default=0)
-
-
-def errors_of_maps(
-    length_px: np.ndarray, host: np.ndarray, observer: np.ndarray, maps: Sequence[int], main: int
-) -> tuple[list[float], float]:
-    """Return the robust standard deviations of reprojection errors within each map, and the largest between maps.
-
-    length_px : (N,) of the observations. host, observer : (N,) maps of the point and of the keyframe that observes it.
-    Between: of each map but the main one with all others, for a wrong one hides among right ones that have more loops;
-    NaN where a map has no loop.
-    """
-    own = [(host == number).astype(int) + (observer == number) for number in maps]
-    some = [of == 2 for of in own] + [of == 1 for of, number in zip(own, maps, strict=True) if number != main]
-    sigma = [robust_sigma_2d(length_px[chosen]) if chosen.any() else math.nan for chosen in some]
-    return sigma[: len(own)], float(np.max(sigma[len(own) :] or math.nan))
 
 
 def _hypothesis(

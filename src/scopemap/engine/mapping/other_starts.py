@@ -21,6 +21,7 @@ import numpy as np
 
 from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.mapping.bundle_adjustment import (
+    RIGID_SIGMA_PX,
     BundleSolution,
     adjust_in_windows,
     adjust_one_by_one,
@@ -69,9 +70,26 @@ class ShapeTest(NamedTuple):
     other_px: float = float("nan")
 
     @property
+    def is_tested(self) -> bool:
+        """Whether the starts have judged the shape: the predicted depth, which it may contradict, does not then."""
+        return self.outcome != "not tested"
+
+    @property
+    def refuses_window(self) -> bool:
+        """Whether the keyframes of a window stay as tracked: a later one, with more motion, may determine the shape."""
+        return self.outcome == "not determined"
+
+    @property
     def is_contradicted(self) -> bool:
         """Whether another start, which ends elsewhere, explains the views about as well, or better."""
         return self.outcome == "not determined" and not self.error_px < _CLEARLY_LESS * self.other_px
+
+    def refuses(self, sigma_px: float) -> bool:
+        """Whether all keyframes stay as tracked in the end; sigma_px : robust, of the reprojection errors.
+
+        Where these are as small as those of a rigid scene the adjusted poses fit the views all the same.
+        """
+        return self.is_contradicted and sigma_px > RIGID_SIGMA_PX
 
     @property
     def notices(self) -> list[Notice]:

@@ -44,7 +44,11 @@ ADVICE = {
 """What can be done, by the cause of a loss."""
 
 _OF_ITS_OWN = {
-    *(LossCause.TOO_DARK, LossCause.OVEREXPOSED, LossCause.VIEW_COVERED, LossCause.CONTACT, LossCause.NO_TEXTURE)
+    LossCause.TOO_DARK,
+    LossCause.OVEREXPOSED,
+    LossCause.VIEW_COVERED,
+    LossCause.CONTACT,
+    LossCause.NO_TEXTURE,
 }
 
 

@@ -7,14 +7,12 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from scopemap.engine.frame import Frame, percentiles
+from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.tracking.causes import LossCause
 
 Status = Literal["initial", "ok", "lost"]
 
-_DARK_LEVEL = 40  # of the brightest channel, in an image with few usable pixels
-_BRIGHT_LEVEL = 200
 MOVING_SIGMAS = 2.0
 """Standard deviations of noise beyond which tissue moves on its own."""
 
@@ -81,17 +79,6 @@ class Track:
             return share, np.nan, np.nan
         y, x = (np.argwhere(moves).mean(0) + 0.5) / moves.shape
         return share, float(x), float(y)
-
-
-def unusable(frame: Frame) -> TrackingLoss:
-    """Return why few pixels of an image are usable: it is dark, overexposed, or something covers the view."""
-    low, middle = percentiles(frame.rgb[::2, ::2].max(axis=2), [20.0, 50.0])
-    reason = f"only {frame.valid.mean():.0%} of the image is usable"
-    if middle < _DARK_LEVEL:
-        return TrackingLoss(LossCause.TOO_DARK, f"{reason}, it is too dark")
-    if low > _BRIGHT_LEVEL:
-        return TrackingLoss(LossCause.OVEREXPOSED, f"{reason}, it is overexposed")
-    return TrackingLoss(LossCause.VIEW_COVERED, reason)
 
 
 class FrameTracker(Protocol):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +27,8 @@ from scopemap.engine.tracking.relocalisation import Relocaliser, depth_ratio, is
 from scopemap.engine.tracking.residuals import View
 from scopemap.engine.tracking.rtdl import Alignment
 from scopemap.engine.tracking.sharpness import SharpnessMonitor
-from scopemap.engine.tracking.track import FrameTracker, Track, TrackingLoss, unusable
+from scopemap.engine.tracking.track import FrameTracker, Track, TrackingLoss
+from scopemap.engine.tracking.usable import too_few_pixels
 
 _EARLIER_KEYFRAMES = 64  # of the current map, that are searched for one nearer than the current one
 _FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with less the pose hangs on a corner of it
@@ -35,6 +37,13 @@ _KEYFRAME_COVERAGE = 0.3  # a frame in which fewer corners are matched becomes a
 _REVISITED_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
 _CLEAR = 0.8  # of the best quality since the keyframe: below it the next one waits
 _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
+
+
+class _Failure(NamedTuple):
+    """Why an alignment gives no pose. is_obscured : by blur, smoke or fluid; such frames begin no new map."""
+
+    loss: TrackingLoss
+    is_obscured: bool
 
 
 class KeyframeChoice:
@@ -114,51 +123,69 @@ class Tracker(FrameTracker):
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""
         self._choice.see(frame)
-        usable = float(frame.valid.mean())
-        if usable < self.settings.constants.min_valid_share:
+        usable, loss = float(frame.valid.mean()), too_few_pixels(frame, self.settings)
+        if loss is not None:
             self._sharp_frames_lost = 0
-            return replace(self._lost(frame, unusable(frame)), usable=usable)
+            return replace(self._lost(frame, loss), usable=usable)
         sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
         return replace(self._track(frame, sharpness), usable=usable, sharpness=sharpness)
 
     def _track(self, frame: Frame, sharpness: float) -> Track:
+        """Return the track of a frame with enough usable pixels."""
         self._is_unsharp = sharpness < self.settings.constants.min_sharpness
-        unsharp = TrackingLoss(LossCause.UNSHARP, f"only {sharpness:.0%} of the usual sharpness: blur, smoke or fluid")
-        if self._keyframe is None:
-            if self._is_unsharp:
-                return self._lost(frame, unsharp)
-            return Track(frame.index, "initial", "first frame of the map", np.eye(4), frame.index, map=self._motion.map)
-        frames_lost = self._motion.frames_lost
-        if frames_lost > MAX_EXTRAPOLATION and frames_lost % self.settings.constants.search_every:
+        keyframe, was_lost = self._keyframe, self._motion.frames_lost > 0
+        if keyframe is None:
+            return self._lost(frame, _unsharp(sharpness)) if self._is_unsharp else self._first(frame)
+        if not self._is_searched():
             self._sharp_frames_lost += not self._is_unsharp
             skipped = f"not searched: one of {self.settings.constants.search_every} lost frames is"
             return self._lost(frame, TrackingLoss(LossCause.OTHER, skipped))
-        alignment, pyramid = self._aligner.align(self._keyframe, frame)
-        if self._choice.is_due(alignment) and not frames_lost and not self._rejection(alignment):
+        alignment, pyramid = self._aligner.align(keyframe, frame)
+        if self._choice.is_due(alignment) and not was_lost and not self._rejection(alignment):
             alignment = self._against_earlier_keyframe(frame, alignment)
-        obscured = is_obscured(sharpness, alignment, self.settings.constants.min_sharpness)
-        rejected, relocalised = self._rejection(alignment), False
-        failed, is_weak = obscured or bool(rejected), alignment.coverage < _WEAK_COVERAGE
-        if failed and is_close_up(frame, self._keyframe):
-            self._after_close_up, unsharp, rejected = True, _in_contact(unsharp), rejected and _in_contact(rejected)
-        elif self._after_close_up and not failed and self.settings.constants.relocalisation_keyframes:
-            failed, rejected = True, TrackingLoss(LossCause.VIEW_CHANGED, _UNCONFIRMED)
-        if failed or is_weak or frames_lost:
-            found = self._found(frame, pyramid, sharpness, failed=failed)
-            if found is not None and (failed or found[1].agreement > alignment.agreement):
-                relocalised = found[0].map != self._motion.map or frames_lost > 0
-                obscured, rejected = False, None
-                alignment = self._aligned_to(*found)
-        if obscured:
+        failure = self._failure(frame, alignment, sharpness)
+        if failure is not None or was_lost or alignment.coverage < _WEAK_COVERAGE:
+            found = self._found(frame, pyramid, sharpness, failed=failure is not None)
+            if found is not None and (failure is not None or found[1].agreement > alignment.agreement):
+                return self._accept_found(frame, *found)
+        if failure is not None:
+            return self._failed(frame, alignment, failure)
+        return self._accept(frame, alignment)
+
+    def _is_searched(self) -> bool:
+        """Whether a frame is looked for; of many in a row that are lost only some are."""
+        lost, every = self._motion.frames_lost, self.settings.constants.search_every
+        return lost <= MAX_EXTRAPOLATION or lost % every == 0
+
+    def _failure(self, frame: Frame, alignment: Alignment, sharpness: float) -> _Failure | None:
+        """Return why an alignment with the keyframe gives no pose; None where it does.
+
+        Tissue that the camera touches fills the picture without structure. What is aligned after that may be anywhere,
+        until features confirm it.
+        """
+        assert self._keyframe is not None
+        failure, rejection = None, self._rejection(alignment)
+        if is_obscured(sharpness, alignment, self.settings.constants.min_sharpness):
+            failure = _Failure(_unsharp(sharpness), is_obscured=True)
+        elif rejection is not None:
+            failure = _Failure(rejection, is_obscured=False)
+        if failure is not None and is_close_up(frame, self._keyframe):
+            self._after_close_up = True
+            return failure._replace(loss=_in_contact(failure.loss))
+        if failure is None and self._after_close_up and self.settings.constants.relocalisation_keyframes:
+            return _Failure(TrackingLoss(LossCause.VIEW_CHANGED, _UNCONFIRMED), is_obscured=False)
+        return failure
+
+    def _failed(self, frame: Frame, alignment: Alignment, failure: _Failure) -> Track:
+        """Return the track of a frame without a pose: it is lost, or after many sharp ones it begins a new map."""
+        if failure.is_obscured:
             self._sharp_frames_lost = 0
-            return self._lost(frame, unsharp, alignment)
-        if rejected:
-            self._sharp_frames_lost += 1
-            after = self.settings.constants.new_map_after * (2 if self._after_close_up else 1)
-            if self._sharp_frames_lost > after > 0 and not self._is_unsharp:
-                return self._new_map(frame)
-            return self._lost(frame, rejected._replace(reason=f"rejected: {rejected.reason}"), alignment)
-        return self._accept(frame, self._keyframe, alignment, relocalised)
+            return self._lost(frame, failure.loss, alignment)
+        self._sharp_frames_lost += 1
+        most = self.settings.constants.new_map_after * (2 if self._after_close_up else 1)
+        if self._sharp_frames_lost > most > 0 and not self._is_unsharp:
+            return self._new_map(frame)
+        return self._lost(frame, failure.loss._replace(reason=f"rejected: {failure.loss.reason}"), alignment)
 
     def remember(self, frame: Frame) -> bool:
         """Take the frame that was tracked last, with its refined depth and its pose: the next may be matched with it.
@@ -261,13 +288,15 @@ class Tracker(FrameTracker):
         self._aligner.set_keyframe(self._keyframe)
         return found
 
-    def _aligned_to(self, keyframe: Keyframe, alignment: Alignment) -> Alignment:
-        """Make the keyframe in which a frame was found the current one; return its alignment."""
+    def _accept_found(self, frame: Frame, keyframe: Keyframe, alignment: Alignment) -> Track:
+        """Return the track of a frame that features found in a keyframe, which becomes the current one."""
+        relocalised = keyframe.map != self._motion.map or self._motion.frames_lost > 0
         if self._last is not None and keyframe.frame.index == self._last.index:
             self._relocaliser.add(keyframe)
             self._choice.frames_since = 1
         self._use_keyframe(keyframe)
-        return replace(alignment, coverage=0.0)  # tracking by flow alone has failed: a keyframe is due
+        # Tracking by flow alone has failed: a keyframe is due.
+        return self._accept(frame, replace(alignment, coverage=0.0), relocalised=relocalised)
 
     def _use_keyframe(self, keyframe: Keyframe) -> None:
         self._keyframe, self._last = keyframe, None
@@ -279,7 +308,10 @@ class Tracker(FrameTracker):
         assert self._keyframe is not None
         return self._aligner.rejection(self._keyframe, alignment)
 
-    def _accept(self, frame: Frame, keyframe: Keyframe, alignment: Alignment, relocalised: bool) -> Track:
+    def _accept(self, frame: Frame, alignment: Alignment, *, relocalised: bool = False) -> Track:
+        """Return the track of a frame with the pose of its alignment with the current keyframe."""
+        keyframe = self._keyframe
+        assert keyframe is not None
         T_world_camera = keyframe.pose_by(alignment)
         if keyframe.map != self._motion.map:
             self._motion.enter_map(keyframe.map, T_world_camera)
@@ -304,12 +336,19 @@ class Tracker(FrameTracker):
         self._motion.begin_map()
         self._forget_map()
         self._keyframe, self._after_close_up, self._sharp_frames_lost = None, False, 0
-        return Track(frame.index, "initial", "new map", np.eye(4), frame.index, map=self._motion.map)
+        return self._first(frame, "new map")
+
+    def _first(self, frame: Frame, reason: str = "first frame of the map") -> Track:
+        return Track(frame.index, "initial", reason, np.eye(4), frame.index, map=self._motion.map)
 
     def _forget_map(self) -> None:
         self._earlier_keyframes.clear()
         self._last = None
         self._relocaliser.enter_map(self._motion.map)
+
+
+def _unsharp(sharpness: float) -> TrackingLoss:
+    return TrackingLoss(LossCause.UNSHARP, f"only {sharpness:.0%} of the usual sharpness: blur, smoke or fluid")
 
 
 def _in_contact(loss: TrackingLoss) -> TrackingLoss:

@@ -29,9 +29,9 @@ _SCARED = "camera-calibration"  # in frame_data*.json
 _KALIBR_CAMERA = re.compile(r"cam\d{1,3}")
 _BASALT = "value0"
 _MATRIX_NAMES = (
-    *("camera_matrix", "K", "K1", "M1", "M", "cam_K", "intrinsic_matrix", "KL", "mtx", "camera_matrix_1"),
-    *("intrinsics_matrix", "intrinsics", "intrinsic", "camera_intrinsics"),
-)
+    "camera_matrix", "K", "K1", "M1", "M", "cam_K", "intrinsic_matrix", "KL", "mtx", "camera_matrix_1",
+    "intrinsics_matrix", "intrinsics", "intrinsic", "camera_intrinsics",
+)  # fmt: skip
 _MATRIX_SHAPES = ((3, 3), (4, 4), (3, 4))
 # Under these names some files put what others have at their top.
 _INNER = ("intrinsics", "projection_parameters", "camera_intrinsics", "intrinsic")

@@ -36,12 +36,14 @@ _RATES = ("CineRate", "RecommendedDisplayFrameRate")
 _SLOWEST_HZ = 1e-3
 _FASTEST_HZ = 1e5
 _TAGS = (
-    *("Rows", "Columns", "NumberOfFrames", "SamplesPerPixel", "PhotometricInterpretation", "PlanarConfiguration"),
-    *("BitsAllocated", "BitsStored", "PixelRepresentation", "PixelAspectRatio", "BurnedInAnnotation"),
-    *("WindowCenter", "WindowWidth", "VOILUTFunction", "RescaleSlope", "RescaleIntercept"),
-    *("FrameTime", "FrameTimeVector", "CineRate", "RecommendedDisplayFrameRate", "InstanceNumber", "SeriesInstanceUID"),
-    *(f"{c}PaletteColorLookupTable{part}" for c in ("Red", "Green", "Blue") for part in ("Data", "Descriptor")),
-)
+    "Rows", "Columns", "NumberOfFrames", "SamplesPerPixel", "PhotometricInterpretation", "PlanarConfiguration",
+    "BitsAllocated", "BitsStored", "PixelRepresentation", "PixelAspectRatio", "BurnedInAnnotation", "WindowCenter",
+    "WindowWidth", "VOILUTFunction", "RescaleSlope", "RescaleIntercept", "FrameTime", "FrameTimeVector", "CineRate",
+    "RecommendedDisplayFrameRate", "InstanceNumber", "SeriesInstanceUID", "RedPaletteColorLookupTableData",
+    "RedPaletteColorLookupTableDescriptor", "GreenPaletteColorLookupTableData",
+    "GreenPaletteColorLookupTableDescriptor", "BluePaletteColorLookupTableData",
+    "BluePaletteColorLookupTableDescriptor",
+)  # fmt: skip
 _PREAMBLE = 128
 _MAGIC = b"DICM"
 _META_BYTES = 512

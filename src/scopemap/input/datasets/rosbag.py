@@ -254,7 +254,8 @@ class RosBag(Source):
         topics: dict[str, _Topic] = {}
         for (name, kind), count in counts.items():
             try:
-                for first in islice(self._messages(reader, [name]), int(count > 0)):
+                first = next(self._messages(reader, [name]), None) if count > 0 else None
+                if first is not None:
                     encoding = "" if kind == _CAMERA_INFO else encoding_of(first.content)
                     topics[name] = _Topic(name, kind, count, encoding, first)
             except InputError as error:
@@ -288,9 +289,11 @@ class RosBag(Source):
         """Return the `camera_info` beside an image topic, where `image_transport` has it."""
         parts = topic.name.split("/")
         # A transport, as in /camera/image_raw/compressed, is one level more.
-        names = ["/".join([*parts[:depth], "camera_info"]) for depth in (-1, -2) if len(parts) >= -depth]
-        topics = (self._topics.get(name) for name in names)
-        return next((found.name for found in topics if found and found.kind == _CAMERA_INFO), None)
+        for above in (parts[:-1], parts[:-2]):
+            info = self._topics.get("/".join([*above, "camera_info"]))
+            if info is not None and info.kind == _CAMERA_INFO:
+                return info.name
+        return None
 
     def _take_camera(self) -> None:
         infos = [topic.name for topic in self._topics.values() if topic.kind == _CAMERA_INFO]
@@ -299,7 +302,8 @@ class RosBag(Source):
             name = infos[0]
             self.notes.append(f"the only camera_info, {name}, is taken as that of {self._topic.name}")
         if name is None:
-            self.notes += [f"no camera_info beside {self._topic.name}; not used: {', '.join(infos)}"] * bool(infos)
+            if infos:
+                self.notes.append(f"no camera_info beside {self._topic.name}; not used: {', '.join(infos)}")
             return
         rectified = bool(_RECTIFIED.search(self._topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]))
         try:

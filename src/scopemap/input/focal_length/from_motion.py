@@ -58,8 +58,13 @@ def adjust_window(window: Window, assumed_focal_px: float) -> WindowFit | None:
     """Return the fit to a window from the best start, None where undetermined; ln f has a prior of deviation 1."""
     assumed, squeeze, count = np.array([math.log(assumed_focal_px), 0.0]), [1.0, window.aspect], len(window.start)
     free = Scene(
-        *(window.start / squeeze, window.seen / squeeze, np.zeros(count), np.full(count, _LOG_DEPTH_SIGMA)),
-        *(window.half_width_px, assumed, np.array([_LOG_FOCAL_SIGMA, _DISTORTION_SIGMA])),
+        window.start / squeeze,
+        window.seen / squeeze,
+        np.zeros(count),
+        np.full(count, _LOG_DEPTH_SIGMA),
+        window.half_width_px,
+        assumed,
+        np.array([_LOG_FOCAL_SIGMA, _DISTORTION_SIGMA]),
     )
     straight = free._replace(lens_sigma=np.array([_LOG_FOCAL_SIGMA, _NO_DISTORTION_SIGMA]))
     starts = [math.log(window.half_width_px / math.tan(math.radians(fov_deg) / 2)) for fov_deg in _START_FOV_DEG]

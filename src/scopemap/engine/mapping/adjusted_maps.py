@@ -1,0 +1,241 @@
+"""Maps in a common world: their keyframes are adjusted together, the solution is judged, and it becomes a correction.
+
+A solution is refused for the first of these reasons that holds:
+
+1. reprojection errors stay large: no rigid scene explains the observations
+2. another start ends in another shape, which explains them about as well (`ShapeTest.refuses`)
+3. other starts cannot tell, and the depths of keyframes agree less than as tracked
+
+The keyframes of a refused one are where the pose graph of loop closures has them if it merges maps, else as tracked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.config import MappingSettings
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.least_squares import robust_sigma_2d
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Points, State
+from scopemap.engine.mapping.depth_correction import (
+    DepthCorrectionField,
+    fit_depth_corrections,
+    growth_of_disagreement,
+)
+from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
+from scopemap.engine.mapping.loop_closure import MOST_RECENT
+from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
+from scopemap.engine.notices import Notice
+
+# Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
+_MAX_ERROR_FACTOR = 1.5
+_NOISE_PX = 0.05
+# Keyframes of either map with loops to the other, where errors between maps are larger than within or untested.
+_MIN_LOOPED = 4
+# Learned features are matched to about a pixel: errors between maps of one place were up to 0.96 px, of two from 1.38.
+_MAX_FEATURE_PX = 1.2
+
+
+@dataclass(frozen=True)
+class MapKeyframes:
+    """K keyframes of maps, as tracked, and the common world of these.
+
+    index : (K,) int, numbers of their frames. poses, steps : as tracked, and how far each was moved as it came.
+    log_drift : (K,) ln of the drift of their scale. grids_mm : (K, h, w) depths, as `depth_grid` gives them.
+    S_common_map : by number of each map, Sim(3) to the common world.
+    """
+
+    index: np.ndarray
+    poses: Sequence[TrackedPose]
+    steps: Sequence[KeyframeStep]
+    log_drift: np.ndarray
+    grids_mm: np.ndarray
+    S_common_map: Mapping[int, Similarity]
+    camera: PinholeCamera
+    settings: MappingSettings
+
+    @property
+    def map_of(self) -> np.ndarray:
+        """Number of each keyframe's map, (K,) int."""
+        return np.array([pose.map for pose in self.poses])
+
+    @cached_property
+    def T_world_camera(self) -> np.ndarray:
+        """Poses (K, 4, 4) as tracked, in the common world."""
+        return np.stack([self.S_common_map[pose.map].transform_poses(pose.T_world_camera) for pose in self.poses])
+
+    def correction(self, found: BundleSolution) -> FrameCorrection:
+        """Return the correction by a solution, without depth correction fields."""
+        state = found.state
+        T_world_world = inverse(state.T_camera_world) @ inverse(self.T_world_camera)
+        depth_mm = float(np.exp(np.median(state.log_depth))) if len(state.log_depth) else 1.0
+        log_scale = state.log_scale - self.log_drift
+        correction = FrameCorrection(self.index, T_world_world, log_scale, found.sigma_px, depth_mm=depth_mm)
+        return self._with_steps(correction)
+
+    def uncorrected(self, sigma_px: float) -> FrameCorrection:
+        """Return the correction that leaves keyframes as tracked; sigma_px : of the solution that was refused."""
+        count = len(self.index)
+        unmoved = np.tile(np.eye(4), (count, 1, 1))
+        return self._with_steps(FrameCorrection(self.index, unmoved, np.zeros(count), sigma_px))
+
+    def depth_fields(self, points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
+        """Return the depth correction field of each keyframe by a solution; () where depth is only scaled."""
+        step_sigma = self.settings.constants.depth_step_sigma
+        if step_sigma <= 0:
+            return ()
+        as_tracked = replace(points, log_depth=points.log_depth + self.log_drift[points.host])
+        change = found.state.log_depth - points.log_depth - found.state.log_scale[points.host]
+        count, sigma = len(self.index), found.log_depth_sigma
+        return fit_depth_corrections(self.camera, as_tracked, count, change, sigma, step_sigma)
+
+    def depth_contradiction(
+        self, found: BundleSolution, fields: tuple[DepthCorrectionField, ...] = ()
+    ) -> Notice | None:
+        """Return that the depths of keyframes agree less than as tracked; None: they agree about as well."""
+        scales = [np.float32(self.S_common_map[pose.map].scale) for pose in self.poses]
+        before = [scale * grid for scale, grid in zip(scales, self.grids_mm, strict=True)]
+        log_scale = found.state.log_scale - self.log_drift
+        after = [np.exp(log) * grid for log, grid in zip(log_scale, before, strict=True)]
+        if fields:
+            factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
+            after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
+        # Farther apart two keyframes may have a few pixels in common, which prove nothing.
+        gaps = [gap for gap in self.settings.constants.keyframe_gaps if gap <= MOST_RECENT]
+        adjusted = inverse(found.state.T_camera_world), after
+        grown = growth_of_disagreement(self.camera, (self.T_world_camera, before), adjusted, gaps)
+        if grown is None:
+            return None
+        return Notice("mapping-depth-disagrees", {"tracked": grown[0], "adjusted": grown[1], "merged": ""})
+
+    def _with_steps(self, correction: FrameCorrection) -> FrameCorrection:
+        return correction.with_steps(self.poses, self.steps, self.S_common_map)
+
+
+class AdjustedMaps(NamedTuple):
+    """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
+
+    main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph,
+    infinite where the depths of keyframes agree less there than as tracked. between_px : the largest between another
+    map and all others. support : keyframes on either side of the accepted loops of the least supported map. problem,
+    rigid : what was solved, and the solution, refused or not.
+    """
+
+    correction: FrameCorrection
+    problem: BundleProblem
+    rigid: State
+    main_px: float
+    largest_px: float
+    between_px: float
+    graph_px: float
+    support: int
+
+    def accepted(self, alone: AdjustedMaps, max_sigma_px: float) -> bool:
+        """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone.
+
+        Where tissue moves, so that not even the main map is adjusted, the pose graph merges them: loops of several
+        keyframes agree with each other and with both maps as tracked, which fit as well as alone.
+        """
+        if alone.correction.refused and self.correction.refused:
+            fits = self.graph_px <= _MAX_ERROR_FACTOR * alone.graph_px + _NOISE_PX
+            return fits and self.support >= _MIN_LOOPED
+        rigid = not self.correction.refused and self.largest_px <= max_sigma_px
+        by_features = self.support >= _MIN_LOOPED and self.between_px <= _MAX_FEATURE_PX
+        connected = self.correction.loops > 0 and (self.between_px <= max_sigma_px or by_features)
+        return rigid and connected and self.main_px <= _MAX_ERROR_FACTOR * alone.main_px + _NOISE_PX
+
+
+def adjust_maps(keyframes: MapKeyframes, problem: BundleProblem, loops: np.ndarray, main: int) -> AdjustedMaps:
+    """Return the bundle adjustment of keyframes, judged; loops : (A, 2) int, those of the accepted loop closures."""
+    found, shape = _solution(keyframes, problem)
+    fields: tuple[DepthCorrectionField, ...] = ()
+    refused = _refusal_by_views(keyframes, found, shape)
+    if refused is None:
+        fields = keyframes.depth_fields(problem.points, found)
+        # Other starts have judged the shape, where they could; else the depths do.
+        refused = None if shape.is_tested else keyframes.depth_contradiction(found, fields)
+    graph_contradicts = False
+    if refused is None:
+        correction = replace(keyframes.correction(found), depth_fields=fields, shape=shape, loops=len(loops))
+    elif len(keyframes.S_common_map) > 1 and problem.start is not None:
+        by_graph = found._replace(state=problem.start._replace(sigma_px=found.sigma_px))
+        correction = replace(keyframes.correction(by_graph), refused=refused, loops=len(loops))
+        graph_contradicts = keyframes.depth_contradiction(by_graph) is not None
+    else:
+        correction = replace(keyframes.uncorrected(found.sigma_px), refused=refused, shape=shape)
+    correction = replace(correction, loop_frames=keyframes.index[loops].tolist() if correction.loops else [])
+    within_px, between_px = _errors_of_maps(keyframes, problem, found.state, main)
+    before_px, _ = _errors_of_maps(keyframes, problem, problem.begin, main)
+    return AdjustedMaps(
+        correction,
+        problem,
+        found.state,
+        main_px=within_px[main],
+        largest_px=_largest(within_px),
+        between_px=between_px,
+        graph_px=math.inf if graph_contradicts else _largest(before_px),
+        support=_loop_support(loops, keyframes.map_of, main),
+    )
+
+
+def _solution(keyframes: MapKeyframes, problem: BundleProblem) -> tuple[BundleSolution, ShapeTest]:
+    """Return the solution; of one map that of the start that wins, and what the starts tell."""
+    found, constants = adjust_in_windows(problem), keyframes.settings.constants
+    if len(keyframes.S_common_map) > 1 or not constants.other_starts:
+        return found, ShapeTest()
+    return with_other_starts(problem, found, is_rigid=found.sigma_px <= constants.max_sigma_px)
+
+
+def _refusal_by_views(keyframes: MapKeyframes, found: BundleSolution, shape: ShapeTest) -> Notice | None:
+    """Return why the views refuse a solution; None where they do not."""
+    if not found.sigma_px <= keyframes.settings.constants.max_sigma_px:  # NaN: nothing was observed
+        return Notice("mapping-not-rigid", {"sigma_px": found.sigma_px, "merged": ""})
+    if shape.refuses(found.sigma_px):
+        errors = {"error_px": shape.error_px, "other_px": shape.other_px}
+        return Notice("mapping-not-determined", {**errors, "merged": ""})
+    return None
+
+
+def _errors_of_maps(
+    keyframes: MapKeyframes, problem: BundleProblem, state: State, main: int
+) -> tuple[dict[int, float], float]:
+    """Return the robust standard deviations of reprojection errors within each map, and the largest between maps.
+
+    Between: of each map but the main one with all others, for a wrong one hides among right ones that have more loops;
+    NaN where a map has no loop.
+    """
+    length_px, map_of, seen = errors_px(problem, state), keyframes.map_of, problem.observations
+    host, observer = map_of[problem.points.host[seen.point]], map_of[seen.keyframe]
+
+    def sigma_px(chosen: np.ndarray) -> float:
+        return robust_sigma_2d(length_px[chosen]) if chosen.any() else math.nan
+
+    maps = [*keyframes.S_common_map]
+    within_px = {number: sigma_px((host == number) & (observer == number)) for number in maps}
+    between_px = [sigma_px((host == number) != (observer == number)) for number in maps if number != main]
+    return within_px, float(np.max(between_px or math.nan))
+
+
+def _largest(within_px: Mapping[int, float]) -> float:
+    """Return the largest known error; NaN without any, as of a map of one keyframe."""
+    return float(np.fmax.reduce([*within_px.values()]))
+
+
+def _loop_support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
+    """Return the fewest keyframes, on either side, of the loops (A, 2) of a map with others; 0: a map has none."""
+    least = []
+    for number in sorted(set(map_of.tolist()) - {main}):
+        inside = map_of[loops] == number
+        ends = loops[inside.sum(1) == 1]
+        own = map_of[ends] == number
+        least.append(min(len(np.unique(ends[own])), len(np.unique(ends[~own]))))
+    return min(least, default=0)

@@ -1,0 +1,62 @@
+"""The engine without the runner: the same poses, depth and surface from a bare loop and the steps of `finishing`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_phantom import write_tiny
+
+from scopemap import Config, Reconstruction, open_sequence, reconstruct
+from scopemap.engine.finishing import SubmapFinishing, SubmapSurface, TrackedFrames
+from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.frame_store import FrameStore
+from scopemap.engine.pipeline import Pipeline
+from scopemap.result.frame_table import FrameTable
+from scopemap.runner.estimators import create_estimators
+
+SETTINGS = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 2}
+
+
+def _engine_alone(folder: Path, config: Config) -> tuple[SubmapSurface, list[Frame]]:
+    """The surface and the final frames of a clip that stays in one map."""
+    sequence, final = open_sequence(folder), list[Frame]()
+
+    def noted(frames: Iterator[Frame]) -> Iterator[Frame]:
+        for frame in frames:
+            final.append(frame)
+            yield frame
+
+    with closing(FrameStore()) as store:
+        pipeline = Pipeline(config, create_estimators(config, sequence), store)
+        table = FrameTable.of(pipeline.step(pipeline.preprocess(frame)).row for frame in sequence.frames())
+        tracked = TrackedFrames(*(table[name] for name in ("index", "time_s", "T_world_camera", "median_depth_mm")))
+        (submap,), _ = pipeline.mapper.submaps()
+        with closing(SubmapFinishing(pipeline, submap, tracked, sequence.camera)) as finishing:
+            finishing.carve()
+            fused = finishing.fuse(finishing.as_fused(noted(finishing.frames())))
+        return finishing.check(finishing.finish(fused)), final
+
+
+def _codes(result: Reconstruction) -> list[str]:
+    return [notice["code"] for notice in result.provenance["notices"]]
+
+
+@pytest.mark.parametrize("changes", [{}, {"mapping.method": "none"}], ids=["adjusted", "as tracked"])
+def test_a_bare_loop_gives_what_the_runner_gives(changes: dict[str, str], tmp_path: Path) -> None:
+    folder, config = write_tiny(tmp_path / "phantom", frames=8), Config.load(settings=SETTINGS | changes)
+    result = reconstruct(open_sequence(folder), config, out=tmp_path / "out")
+    surface, frames = _engine_alone(folder, config)
+    assert len(surface.mesh.faces) > 100
+    assert surface.mesh.vertices.tobytes() == result.mesh.vertices.tobytes()
+    assert surface.agreement == result.provenance["surface"]
+    poses = np.stack([np.asarray(frame.T_world_camera) for frame in frames])
+    assert poses.tobytes() == result.trajectory.T_world_camera.tobytes()
+    assert [frame.index for frame in frames] == result.trajectory.indices.tolist()
+    found = [notice.code for notice in surface.notices]
+    assert "fusion-scaled" in found
+    assert [code for code in _codes(result) if code in found] == found
+    assert surface.is_confirmed == ("mapping-none" not in _codes(result))
