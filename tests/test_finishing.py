@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_phantom import write_tiny
 
-from scopemap import Config, Reconstruction, open_sequence, reconstruct
+from scopemap import Config, Result, open_sequence, reconstruct
 from scopemap.engine.finishing import SubmapFinishing, SubmapSurface, TrackedFrames
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import FrameStore
@@ -41,7 +41,7 @@ def _engine_alone(folder: Path, config: Config) -> tuple[SubmapSurface, list[Fra
         return finishing.check(finishing.finish(fused)), final
 
 
-def _codes(result: Reconstruction) -> list[str]:
+def _codes(result: Result) -> list[str]:
     return [notice["code"] for notice in result.provenance["notices"]]
 
 

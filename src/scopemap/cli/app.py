@@ -42,8 +42,8 @@ app = typer.Typer(
 )
 _MEASURES = [one for _, added in plugins("scopemap.measures") for one in added]
 _OWN = (
-    run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage, locate,
-    compare_exams, verify, calibrate, models.app,
+    run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage,
+    locate, compare_exams, verify, calibrate, models.app,
 )  # fmt: skip
 
 
