@@ -48,7 +48,7 @@ def _codes(result: Result) -> list[str]:
 @pytest.mark.parametrize("changes", [{}, {"mapping.method": "none"}], ids=["adjusted", "as tracked"])
 def test_a_bare_loop_gives_what_the_runner_gives(changes: dict[str, str], tmp_path: Path) -> None:
     folder, config = write_tiny(tmp_path / "phantom", frames=8), Config.load(settings=SETTINGS | changes)
-    result = reconstruct(open_sequence(folder), config, out=tmp_path / "out")
+    result = reconstruct(open_sequence(folder), config)
     surface, frames = _engine_alone(folder, config)
     assert len(surface.mesh.faces) > 100
     assert surface.mesh.vertices.tobytes() == result.mesh.vertices.tobytes()
