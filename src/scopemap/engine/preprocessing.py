@@ -91,7 +91,7 @@ class Preprocessing:
         self.propagated = 0
         """How many frames got the depth of the one before."""
         from_files = config.depth.backend.startswith("files:") or config.mask.instruments == "auto"
-        self._every, self._needs_previous = config.depth.constants.network_every, Mapis(config.mapis).needs_previous
+        self._every, self._needs_previous = config.depth.network_every, Mapis(config.mapis).needs_previous
         self._every = 1 if from_files else self._every
         self._turn = 0
         self._kind: DepthKind | None = None  # of what the network said last; None: it looks at the next frame
@@ -115,12 +115,12 @@ class Preprocessing:
 
     def _estimate(self, frame: Frame) -> PreprocessedFrame:
         self.faults.frames += 1
-        frame, constants = self._masker(frame), self._config.tracking.constants
+        frame, settings = self._masker(frame), self._config.tracking
         # A frame that the tracker refuses must not fix the scale of depth, and is not worth the networks.
-        if frame.valid.mean() < constants.min_valid_share:
+        if frame.valid.mean() < settings.min_valid_share:
             return self._skipped(frame, unusable(frame))
-        found = texture(frame, self._config.tracking) if constants.min_texture else math.inf
-        self._low_texture = self._low_texture + 1 if found < constants.min_texture else 0
+        found = texture(frame, settings) if settings.min_texture else math.inf
+        self._low_texture = self._low_texture + 1 if found < settings.min_texture else 0
         if self._low_texture > _MOST_LOW_TEXTURE:
             bare = TrackingLoss(LossCause.NO_TEXTURE, f"{found:.2f} of texture, noise has 0.32: contact, blur or fluid")
             return self._skipped(without_depth(frame), bare)
@@ -140,7 +140,7 @@ class Preprocessing:
             sigma = None if estimate.sigma is None else estimate.sigma * unknown
             estimate = replace(estimate, values=estimate.values * unknown, sigma=sigma)
             frame, small = (without_instruments(seen, instruments) for seen in (frame, small))
-            if frame.valid.mean() < constants.min_valid_share:
+            if frame.valid.mean() < settings.min_valid_share:
                 left = f"only {frame.valid.mean():.0%} of the image is usable"
                 fault = TrackingLoss(LossCause.VIEW_COVERED, f"{left}: instruments cover {instruments.mean():.0%}")
         raw, is_followed = self.estimators.anchor.metric(estimate, small), self._needs_previous(estimate.kind)

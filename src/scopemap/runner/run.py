@@ -204,7 +204,7 @@ class _Finishing:
         states = _states(submap, frames.only(frames.tracked), at_s)
         depths = self._triangulated_depths(final, states)
         with closing(depths) if depths is not None else nullcontext():
-            views = views_among(list(final.T_world_camera)) if config.fusion.constants.free_space else []
+            views = views_among(list(final.T_world_camera)) if config.fusion.free_space else []
             free_space: FreeSpace = self.run.clock.timed("free space", FreeSpace, final.frames(None, among=views))
             triangulated = None if depths is None else depths.depth
             corrected = in_thread(final.frames(triangulated, free_space.without), "correct")
@@ -267,7 +267,7 @@ class _Finishing:
         """Return what triangulates the depth of a submap's keyframes; None where nothing can."""
         config, flow = self.run.pipeline.config, self.run.pipeline.estimators.keyframe_flow
         used = bool(self.run.writers) or config.fusion.enabled
-        if not (used and config.mapping.constants.triangulate_depth and final.keyframes) or flow.name == "none":
+        if not (used and config.mapping.triangulate_depth and final.keyframes) or flow.name == "none":
             return None
         camera = self.run.sequence.camera
         return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow, states)

@@ -50,7 +50,7 @@ class ShadingDepth:
         neighbours; everything, as long as no frame had usable pixels.
         """
         unit_z = 1 / np.linalg.norm(frame.camera.rays, axis=-1)
-        distance = relative_distance(frame, unit_z, self._settings.constants.shading_exponent)
+        distance = relative_distance(frame, unit_z, self._settings.shading_exponent)
         if self._scale_mm is None:
             seen = distance[frame.valid & np.isfinite(distance)]
             if seen.size >= _MIN_SHARE * distance.size:
@@ -63,7 +63,7 @@ class ShadingDepth:
         return {
             "depth": "near-field shading, embedded, no weights",
             "prior": f"median distance of the first frame {self._settings.shading_median_mm:g} mm",
-            "exponent": f"{self._settings.constants.shading_exponent:g}",
+            "exponent": f"{self._settings.shading_exponent:g}",
         }
 
 

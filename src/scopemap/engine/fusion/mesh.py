@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from numba import njit
 
-from scopemap.engine.config.mapping import FusionConstants
+from scopemap.engine.config.mapping import FusionSettings
 from scopemap.engine.fusion.albedo import displayed
 from scopemap.engine.fusion.tsdf import BLOCK, VoxelBlocks, Voxels, unpack
 
@@ -43,7 +43,7 @@ class _Chunk(NamedTuple):
 
 
 def extract_mesh(
-    blocks: VoxelBlocks, settings: FusionConstants, voxel_mm: float, median_level: float | None = None
+    blocks: VoxelBlocks, settings: FusionSettings, voxel_mm: float, median_level: float | None = None
 ) -> trimesh.Trimesh:
     """Return the zero level of the field as a mesh in world mm, its normals towards free space, with vertex colours.
 

@@ -71,7 +71,7 @@ class Backend:
         features: FeatureDetector | None = None,
         anchored: bool = False,
     ) -> None:
-        self.settings, self._anchored = settings.constants, anchored
+        self.settings, self._anchored = settings, anchored
         self._frames: list[int] = []
         self._times_s: list[float] = []
         self._tracked: list[TrackedPose] = []
@@ -80,7 +80,7 @@ class Backend:
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
         self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
         self._tracks = FeatureTracks(settings, flow, table)
-        self._finder = LoopFinder(settings, table, features) if settings.constants.min_loop_inliers > 0 else None
+        self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
         self._loops = table("loops", LOOP)
         self._all_weighed = False
         self._camera: PinholeCamera | None = None

@@ -105,7 +105,7 @@ class FeatureTracks:
         table: RowTable = rows_in_memory,
         gaps: Collection[int] | None = None,
     ) -> None:
-        self.settings, self._flow = settings.constants, flow
+        self.settings, self._flow = settings, flow
         self._gaps = gaps or self.settings.keyframe_gaps
         self._recent: dict[int, deque[_FlowKeyframe]] = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)

@@ -110,7 +110,7 @@ class LoopFinder:
     """Takes keyframes one by one and returns the loops that each closes, to long before and to other maps.
 
     Candidates are the keyframes with the most similar features. A loop is accepted if PnP places the new keyframe with
-    at least `settings.constants.min_loop_inliers` inliers and both look alike there (`is_verified`). table : where is
+    at least `settings.min_loop_inliers` inliers and both look alike there (`is_verified`). table : where is
     kept what only this needs. detector : of features; None: SIFT.
     """
 
@@ -122,7 +122,7 @@ class LoopFinder:
     ) -> None:
         self._detector = detector or SiftFeatures()
         self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
-        self._min_inliers, gaps = settings.constants.min_loop_inliers, settings.constants.keyframe_gaps
+        self._min_inliers, gaps = settings.min_loop_inliers, settings.keyframe_gaps
         self._max_gap = min(max(gaps), MOST_RECENT)
         self._features: dict[int, _KeptFeatures] = {}
         self._rows, self._views = table("features", self._kind), table("views", VIEW)

@@ -79,7 +79,7 @@ class Mapper:
         features: FeatureDetector | None = None,
         anchored: bool = False,
     ) -> None:
-        links = settings.constants.global_adjustment and flow.name != "none"
+        links = settings.global_adjustment and flow.name != "none"
         self._backend = Backend(settings, flow, table, features, anchored) if links else None
         self._rows = table("tracked_poses", _TRACKED)
         self._last: tuple[int, TrackedPose] | None = None

@@ -96,7 +96,7 @@ class Masker:
     def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
         self._field = FieldOfView()
-        self._overlays = OverlayFinder() if settings.constants.overlays else None
+        self._overlays = OverlayFinder() if settings.overlays else None
         self._from_file = False
         self._instruments: np.ndarray | None = None
 
@@ -108,11 +108,11 @@ class Masker:
         """
         darkest, middle = darker_channels(frame.rgb)
         clipped = middle >= BRIGHT_LEVEL
-        lit = is_lit(frame.rgb, self.settings.constants.dark_level)
-        valid = frame.valid & lit & ~clipped if self.settings.constants.exposure else frame.valid
-        field = self._field(lit, frame.valid) if self.settings.constants.field_of_view else frame.valid
+        lit = is_lit(frame.rgb, self.settings.dark_level)
+        valid = frame.valid & lit & ~clipped if self.settings.exposure else frame.valid
+        field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
         highlights = np.zeros_like(valid)
-        if self.settings.constants.highlights:
+        if self.settings.highlights:
             bright = clipped | specular(darkest, field)
             highlights = frame.valid & field & (cv2.dilate(bright.astype(np.uint8), disc(_HIGHLIGHT_GROW_PX)) > 0)
             valid &= ~highlights

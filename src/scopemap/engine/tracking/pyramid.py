@@ -35,8 +35,8 @@ def build_pyramid(
     depth = np.full(grey.shape, np.nan, np.float32)
     if frame.depth_mm is not None:
         depth = np.where(frame.valid, frame.depth_mm, np.float32(np.nan))
-    finest = min(settings.constants.finest_level, settings.constants.levels - 1)
-    count = settings.constants.levels if levels is None else finest + levels
+    finest = min(settings.finest_level, settings.levels - 1)
+    count = settings.levels if levels is None else finest + levels
     camera = frame.camera
     views: list[View] = []
     for level in range(count):

@@ -136,8 +136,8 @@ class Relocaliser:
 
     def __init__(self, settings: TrackingSettings, detector: FeatureDetector) -> None:
         self.settings, self.detector = settings, detector
-        self._keyframes: deque[Keyframe] = deque(maxlen=settings.constants.relocalisation_keyframes)
-        self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.constants.relocalisation_keyframes)
+        self._keyframes: deque[Keyframe] = deque(maxlen=settings.relocalisation_keyframes)
+        self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.relocalisation_keyframes)
         self._features: dict[int, Features] = {}
         self._frames_of_map: Counter[int] = Counter()
 
@@ -174,7 +174,7 @@ class Relocaliser:
         that are searched in any case. recent : whether the others of the current map are, too. other_maps : whether
         those of other maps are, where none of these is found.
         """
-        if self.settings.constants.relocalisation_keyframes == 0:
+        if self.settings.relocalisation_keyframes == 0:
             return None
         current = self.detector.detect(replace(frame, depth_mm=None))
         kept = {keyframe.frame.index for keyframe in (*self._keyframes, *self._of_other_maps, *near)}

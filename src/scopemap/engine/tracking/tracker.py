@@ -70,11 +70,11 @@ class KeyframeChoice:
     def is_due(self, alignment: Alignment | None = None) -> bool:
         """Return whether a frame with this alignment should become a keyframe; None: the one that was accepted last."""
         alignment = alignment or self._last
-        constants = self._settings.constants
-        patience = constants.keyframe_patience if self._quality < _CLEAR * self._best_quality else 0
+        settings = self._settings
+        patience = settings.keyframe_patience if self._quality < _CLEAR * self._best_quality else 0
         if self.frames_since >= self._settings.keyframe_every + patience and self._has_moved(alignment):
             return True
-        least = constants.min_keyframe_agreement * (self._first_agreement or 0.0)
+        least = settings.min_keyframe_agreement * (self._first_agreement or 0.0)
         return alignment is not None and (alignment.agreement < least or alignment.coverage < _KEYFRAME_COVERAGE)
 
     def _has_moved(self, alignment: Alignment | None) -> bool:
@@ -82,7 +82,7 @@ class KeyframeChoice:
             return True
         T = alignment.motion.T_current_reference
         moved = rotation_angle_rad(T[:3, :3]) + np.linalg.norm(T[:3, 3]) / self._depth_mm
-        return bool(moved >= self._settings.constants.min_keyframe_motion)
+        return bool(moved >= self._settings.min_keyframe_motion)
 
 
 class Tracker(FrameTracker):
@@ -115,33 +115,33 @@ class Tracker(FrameTracker):
         """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""
         self._choice.see(frame)
         usable = float(frame.valid.mean())
-        if usable < self.settings.constants.min_valid_share:
+        if usable < self.settings.min_valid_share:
             self._sharp_frames_lost = 0
             return replace(self._lost(frame, unusable(frame)), usable=usable)
         sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
         return replace(self._track(frame, sharpness), usable=usable, sharpness=sharpness)
 
     def _track(self, frame: Frame, sharpness: float) -> Track:
-        self._is_unsharp = sharpness < self.settings.constants.min_sharpness
+        self._is_unsharp = sharpness < self.settings.min_sharpness
         unsharp = TrackingLoss(LossCause.UNSHARP, f"only {sharpness:.0%} of the usual sharpness: blur, smoke or fluid")
         if self._keyframe is None:
             if self._is_unsharp:
                 return self._lost(frame, unsharp)
             return Track(frame.index, "initial", "first frame of the map", np.eye(4), frame.index, map=self._motion.map)
         frames_lost = self._motion.frames_lost
-        if frames_lost > MAX_EXTRAPOLATION and frames_lost % self.settings.constants.search_every:
+        if frames_lost > MAX_EXTRAPOLATION and frames_lost % self.settings.search_every:
             self._sharp_frames_lost += not self._is_unsharp
-            skipped = f"not searched: one of {self.settings.constants.search_every} lost frames is"
+            skipped = f"not searched: one of {self.settings.search_every} lost frames is"
             return self._lost(frame, TrackingLoss(LossCause.OTHER, skipped))
         alignment, pyramid = self._aligner.align(self._keyframe, frame)
         if self._choice.is_due(alignment) and not frames_lost and not self._rejection(alignment):
             alignment = self._against_earlier_keyframe(frame, alignment)
-        obscured = is_obscured(sharpness, alignment, self.settings.constants.min_sharpness)
+        obscured = is_obscured(sharpness, alignment, self.settings.min_sharpness)
         rejected, relocalised = self._rejection(alignment), False
         failed, is_weak = obscured or bool(rejected), alignment.coverage < _WEAK_COVERAGE
         if failed and is_close_up(frame, self._keyframe):
             self._after_close_up, unsharp, rejected = True, _in_contact(unsharp), rejected and _in_contact(rejected)
-        elif self._after_close_up and not failed and self.settings.constants.relocalisation_keyframes:
+        elif self._after_close_up and not failed and self.settings.relocalisation_keyframes:
             failed, rejected = True, TrackingLoss(LossCause.VIEW_CHANGED, _UNCONFIRMED)
         if failed or is_weak or frames_lost:
             found = self._found(frame, pyramid, sharpness, failed=failed)
@@ -154,7 +154,7 @@ class Tracker(FrameTracker):
             return self._lost(frame, unsharp, alignment)
         if rejected:
             self._sharp_frames_lost += 1
-            after = self.settings.constants.new_map_after * (2 if self._after_close_up else 1)
+            after = self.settings.new_map_after * (2 if self._after_close_up else 1)
             if self._sharp_frames_lost > after > 0 and not self._is_unsharp:
                 return self._new_map(frame)
             return self._lost(frame, rejected._replace(reason=f"rejected: {rejected.reason}"), alignment)
@@ -224,7 +224,7 @@ class Tracker(FrameTracker):
         assert frame.depth_mm is not None
         assert frame.T_world_camera is not None
         known = frame.valid & np.isfinite(frame.depth_mm)
-        if known.mean() < self.settings.constants.min_valid_share:
+        if known.mean() < self.settings.min_valid_share:
             return None
         pyramid = build_pyramid(frame, self.settings, use_slope=measured)
         mean_mm = float(frame.depth_mm[known].mean())
@@ -252,7 +252,7 @@ class Tracker(FrameTracker):
                 and alignment.overlap >= _FOUND_OVERLAP
                 # Of many keyframes one always fits a picture without texture.
                 and (keyframe.measured or alignment.texture >= MIN_TEXTURE)
-                and not is_obscured(sharpness, alignment, self.settings.constants.min_sharpness)
+                and not is_obscured(sharpness, alignment, self.settings.min_sharpness)
             ),
             near=near,
             recent=failed or self._motion.frames_lost > 0,
