@@ -27,7 +27,7 @@ from scopemap.engine.tracking.sharpness import LEAST_QUALITY, PictureQuality
 from scopemap.engine.tracking.track import FrameTracker, TrackingLoss, unusable
 
 # So many frames in a row with too little texture are looked at: motion blur is shorter.
-_MOST_LOW_TEXTURE = 10
+_MOST_LOW_TEXTURE = 10  # by hand
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.similarity import structural_similarity
 from scopemap.engine.mapping.tissue_states import TissueStates
 
-_SAME_SURFACE = 0.02  # between a vertex and what is rendered at its pixel, of its depth: it is not hidden
+_SAME_SURFACE = 0.02  # by hand: between a vertex and what is rendered at its pixel, of its depth: it is not hidden
 
 
 class FrameAgreement(NamedTuple):

@@ -33,24 +33,24 @@ from scopemap.engine.geometry.uncertainty import depth_trust
 from scopemap.engine.notices import Notice
 
 # Below this cosine a slanted wall cannot be distinguished from a depth edge, whatever the setting.
-_MIN_COSINE = 0.05
+_MIN_COSINE = 0.05  # by hand
 # Voxels of 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, truncation 5 mm); TSDF parameters that are
 # not set keep the proportions at other depths.
 _VOXELS_PER_MEDIAN_DEPTH = 60
-_VOXELS_PER_TRUNCATION = 5
+_VOXELS_PER_TRUNCATION = 5  # see above
 # At this depth a voxel is still larger than a pixel, and a narrowing tube is seen for most of its length.
-_VOXELS_PER_MAX_DEPTH = 200
+_VOXELS_PER_MAX_DEPTH = 200  # by hand
 # Weight of small highlights, where depth is interpolated.
-_MASKED_WEIGHT = 0.1
+_MASKED_WEIGHT = 0.1  # by hand
 # Weight of its colour, the one around it: it counts where no frame saw the tissue. Width of what is around over the
 # picture's, and the step of the pixels looked at.
-_MASKED_COLOUR = 0.01
-_SURROUNDINGS = 1 / 12
-_EVERY_PX = 4
+_MASKED_COLOUR = 0.01  # by hand
+_SURROUNDINGS = 1 / 12  # by hand
+_EVERY_PX = 4  # by hand, for time
 # Share of the picture up to which a highlight is that small.
-_LARGEST_MASKED = 0.02
+_LARGEST_MASKED = 0.02  # by hand
 # No endoscope resolves less; memory would be spent on noise.
-_MIN_VOXEL_MM = 0.01
+_MIN_VOXEL_MM = 0.01  # by hand
 
 
 class TsdfParameters(NamedTuple):

@@ -49,9 +49,9 @@ from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.features import FeatureDetector
 
 # Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
-_MAX_PART_ERROR = 0.05
+_MAX_PART_ERROR = 0.05  # by hand
 # Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
-MOST_OBSERVATIONS = 1_000_000
+MOST_OBSERVATIONS = 1_000_000  # by hand
 """Of an adjustment, unless memory is limited."""
 
 

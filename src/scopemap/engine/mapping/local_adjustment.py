@@ -27,13 +27,13 @@ from scopemap.engine.mapping.lens_residual import LensEvidence, LensResidual, le
 from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.engine.notices import Notice
 
-_FREE = 3  # last keyframes of the window that move
-_ITERATIONS = 10
-_LEAST_SEEN = 0.1  # of a keyframe's points that those before it must observe: else nothing corrects its depth
-_REMEMBERED = 1000  # keyframes whose correction is kept: the tracker returns to fewer
-_LENS_EVERY = 4  # adjusted keyframes: windows that have hardly a keyframe in common
-_LENS_SIGMA = 0.01  # of ln f, below which no further windows are asked
-_MOST_REFUSED = 0.1  # of the keyframes: with more, the scene is not rigid
+_FREE = 3  # by hand: last keyframes of the window that move
+_ITERATIONS = 10  # by hand: steps of a window's adjustment
+_LEAST_SEEN = 0.1  # by hand: of a keyframe's points that those before it must observe: else nothing corrects its depth
+_REMEMBERED = 1000  # by hand: keyframes whose correction is kept: the tracker returns to fewer
+_LENS_EVERY = 4  # by hand: adjusted keyframes: windows that have hardly a keyframe in common
+_LENS_SIGMA = 0.01  # by hand: of ln f, below which no further windows are asked
+_MOST_REFUSED = 0.1  # by hand: of the keyframes: with more, the scene is not rigid
 
 
 class KeyframeCorrection(NamedTuple):

@@ -30,18 +30,18 @@ from scopemap.engine.mapping.bundle_problem import BundleProblem, State
 from scopemap.engine.mapping.frame_correction import FrameCorrection, TrackedPose
 from scopemap.engine.mapping.loop_closure import Loop
 
-_MIN_SUPPORT = 2  # agreeing keyframes in either map
+_MIN_SUPPORT = 2  # by hand: agreeing keyframes in either map
 # Maps drift independently: two loops agree within these, rad, share of the scene's depth, ln.
-_MAX_DIFFERENCE = (0.2, 0.3, 0.3)
-_MAX_LOG_SCALE = 1.0  # between maps of one video
+_MAX_DIFFERENCE = (0.2, 0.3, 0.3)  # by hand
+_MAX_LOG_SCALE = 1.0  # by hand: between maps of one video
 # Observations of points in common that support a motion tracked across a loss: as many as relocalisation needs inliers.
 _MIN_COMMON = 20
 
 # Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
-_MAX_ERROR_FACTOR = 1.5
-_NOISE_PX = 0.05
+_MAX_ERROR_FACTOR = 1.5  # by hand
+_NOISE_PX = 0.05  # by hand
 # Keyframes of either map with loops to the other, where errors between maps are larger than within or untested.
-_MIN_LOOPED = 4
+_MIN_LOOPED = 4  # by hand
 # Learned features are matched to about a pixel: errors between maps of one place were up to 0.96 px, of two from 1.38.
 _MAX_FEATURE_PX = 1.2
 

@@ -34,7 +34,7 @@ _TRACKED = np.dtype(
 )
 """Number of a frame, and its `TrackedPose`."""
 
-LEAST_FRAMES = 10
+LEAST_FRAMES = 10  # by hand
 """Tracked frames that a submap needs to be a result beside the largest."""
 
 

@@ -21,12 +21,13 @@ from scopemap.engine.tracking.track import TrackingLoss
 
 MIN_TEXTURE = 0.5
 """Of an image that shows nothing but noise; tissue has 0.65 and more."""
-MAX_EXTRAPOLATION = 5
+MAX_EXTRAPOLATION = 5  # by hand
 """Frames for which the last motion is extrapolated after a loss."""
-_DOUBTFUL_INLIER_SHARE = 0.6  # below it an unsharp frame is lost, unless so many features match: by chance 20 at most
-_CLEAR_MATCHES = 40  # features that do not match by chance
-_MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them to support a pose
-_MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
+# By hand: below it an unsharp frame is lost, unless so many features match: by chance 20 at most.
+_DOUBTFUL_INLIER_SHARE = 0.6
+_CLEAR_MATCHES = 40  # by hand: features that do not match by chance
+_MIN_COVERAGE = 0.1  # by hand: of the keyframe's corners that must be matched for them to support a pose
+_MAX_SUPPORT_PX = 2.0  # by hand: median reprojection error of a supported pose
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,11 @@ from scopemap.engine.tracking.residuals import (
 )
 
 _LIT = np.array([True, False])  # grey, normalised: the channels of a pyramid
-_INLIER = 0.5
-_MIN_SIGMA = 1e-3  # avoids division by zero in flat images
-_MIN_DEPTH_SIGMA = 1e-3  # of the distance to measured depth, share of the keyframe's mean depth
-_GREY_SHARE = 0.3  # weight of the grey channel against the normalised one
-_RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth
+_INLIER = 0.5  # by hand: residual of an inlier, in units of the normalised channel
+_MIN_SIGMA = 1e-3  # guard: division by zero in flat images
+_MIN_DEPTH_SIGMA = 1e-3  # guard: of the distance to measured depth, share of the keyframe's mean depth
+_GREY_SHARE = 0.3  # by hand: weight of the grey channel against the normalised one
+_RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth; METHOD gives none, not searched
 
 
 class Motion(NamedTuple):

@@ -13,9 +13,9 @@ from scopemap.engine.tracking.causes import LossCause
 
 Status = Literal["initial", "ok", "lost"]
 
-_DARK_LEVEL = 40  # of the brightest channel, in an image with few usable pixels
-_BRIGHT_LEVEL = 200
-MOVING_SIGMAS = 2.0
+_DARK_LEVEL = 40  # by hand: of the brightest channel, in an image with few usable pixels
+_BRIGHT_LEVEL = 200  # by hand
+MOVING_SIGMAS = 2.0  # by hand
 """Standard deviations of noise beyond which tissue moves on its own."""
 
 

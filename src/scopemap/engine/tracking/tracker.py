@@ -28,12 +28,14 @@ from scopemap.engine.tracking.rtdl import Alignment
 from scopemap.engine.tracking.sharpness import SharpnessMonitor
 from scopemap.engine.tracking.track import FrameTracker, Track, TrackingLoss, unusable
 
-_EARLIER_KEYFRAMES = 64  # of the current map, that are searched for one nearer than the current one
-_FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with less the pose hangs on a corner of it
-_WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
-_KEYFRAME_COVERAGE = 0.3  # a frame in which fewer corners are matched becomes a keyframe
-_REVISITED_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
-_CLEAR = 0.8  # of the best quality since the keyframe: below it the next one waits
+_EARLIER_KEYFRAMES = 64  # by hand: of the current map, that are searched for one nearer than the current one
+# By hand: with the keyframe in which features find a frame: with less the pose hangs on a corner of it.
+_FOUND_OVERLAP = 0.25
+_WEAK_COVERAGE = 0.15  # by hand: of a pose that is compared with one by features
+_KEYFRAME_COVERAGE = 0.3  # by hand: a frame in which fewer corners are matched becomes a keyframe
+# By hand: of an earlier keyframe's corners that must be matched for it to be tracked against again.
+_REVISITED_COVERAGE = 0.5
+_CLEAR = 0.8  # by hand: of the best quality since the keyframe: below it the next one waits
 _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 
 

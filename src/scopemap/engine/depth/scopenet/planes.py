@@ -7,15 +7,15 @@ import numpy as np
 
 from scopemap.engine.errors import check_shape
 
-PLANES = 8
+PLANES = 8  # the network's input, as trained: colour, log brightness, rays and valid mask
 INSTRUMENTS = "instruments"  # name of that output
 STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
-_DARKEST = 1e-3
-_LEVEL = np.arange(256) / 255
+_DARKEST = 1e-3  # guard
+_LEVEL = np.arange(256) / 255  # 8-bit levels, 0..1
 LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4)
 """Linear brightness, 0..1, of each 8-bit level of sRGB (IEC 61966-2-1)."""
-_HALF_LINEAR = (0.5 * LINEAR).astype(np.float32)
+_HALF_LINEAR = (0.5 * LINEAR).astype(np.float32)  # brightness is the mean of red and green
 
 
 def input_planes(rgb: np.ndarray, unit_rays: np.ndarray | None, valid: np.ndarray) -> np.ndarray:
