@@ -146,6 +146,7 @@ def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_
         ("tracking.advanced.huber", 2, "unknown setting 'tracking.advanced.huber': did you mean 'tracking"),
         ("tracking.hubert", 2, "did you mean 'tracking.huber'"),
         ("tracking.huber", 0, "greater than 0"),
+        ("tracking.finest_level", 4, "less than or equal to 3"),
         ("tracking.solver", "lbfgs", "'dogleg' or 'gauss-newton'"),
         ("mapping.keyframe_gaps", [], "at least 1 item"),
         ("mapping.keyframe_gaps", [1, 0], "greater than 0"),
@@ -213,7 +214,7 @@ def test_the_page_of_settings_is_the_generated_one() -> None:
 def test_each_setting_is_read() -> None:
     named = {tuple(name.split(".")) for name in setting_names() if "." in name}
     # What a method is, is read where it chooses settings.
-    named -= {(stage, "method") for stage in STAGES if stage not in ("smoothing", "mapping")}
+    named -= {(stage, "method") for stage in STAGES if stage != "smoothing"}
     assert {group for group, _ in named} == set(READERS)
     for group, name in named:
         files = [file for pattern in READERS[group] for file in SOURCE.glob(pattern)]

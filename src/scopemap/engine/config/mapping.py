@@ -84,6 +84,11 @@ class MappingSettings(StageSettings):
     )
 
     @property
+    def adjusts(self) -> bool:
+        """Whether keyframes are adjusted at all, as they come or after the last frame."""
+        return self.local_window > 0 or self.global_adjustment
+
+    @property
     def at_end(self) -> bool:
         """Whether keyframes are adjusted after the last frame."""
         return self.global_adjustment

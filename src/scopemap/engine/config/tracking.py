@@ -86,7 +86,7 @@ class TrackingSettings(StageSettings):
         3, "frames that a keyframe waits longer where the picture is not clear", "by hand"
     )
     levels: PositiveInt = advanced(5, "levels of the image pyramid, factor 0.5", "METHOD section WEMA-RTDL")
-    finest_level: NonNegativeInt = advanced(1, "0: full working size, 1: half", _CHOSEN)
+    finest_level: Annotated[int, Field(ge=0, le=3)] = advanced(1, "0: full working size, 1: half", _CHOSEN)
     max_iterations: PositiveInt = advanced(30, "steps per pyramid level", "by hand")
     huber: PositiveFloat = advanced(
         1.0, "threshold of Huber's loss (1964), in robust standard deviations (MAD)", _CHOSEN

@@ -37,9 +37,10 @@ def with_normals_alone(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
     Angles, triangles and normals of faces take 60 MB of a submap, and an examination has dozens.
     """
+    if not len(mesh.faces):  # trimesh cannot copy the colours of no face
+        return mesh
     lean = mesh.copy()
-    if len(mesh.faces):
-        lean.vertex_normals = mesh.vertex_normals  # type: ignore[method-assign]  # a property
+    lean.vertex_normals = mesh.vertex_normals  # type: ignore[method-assign]  # a property
     return lean
 
 
