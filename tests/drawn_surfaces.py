@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import FusionSettings
-from scopemap.engine.config.mapping import FusionConstants
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import se3, so3_exp
 
 WIDE = PinholeCamera(46.0, 47.0, 59.3, 60.2, 120, 121)
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
 GREY = (120, 110, 100)
-LENIENT = FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, constants=FusionConstants(min_weight=0.2))
+
+
+def lenient(**changes: Any) -> FusionSettings:
+    """Settings of fusion with which one frame makes a surface."""
+    return FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, **{"min_weight": 0.2} | changes)
+
+
+LENIENT = lenient()
 AHEAD = np.array([0.0, 0.0, 1.0])
 
 

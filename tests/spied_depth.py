@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from chosen_settings import chosen
 
 from scopemap import Config
 from scopemap.engine.config import DepthSettings
@@ -47,7 +46,7 @@ def spied(monkeypatch: pytest.MonkeyPatch, anchor_too: bool = False, **spy: Any)
         parts = create(config, sequence)
         if anchor_too:
             spies.append(SpyDepth(parts.anchor.reference, **spy))
-            return replace(parts, anchor=AnchoredDepth(chosen(DepthSettings, anchor="depth-pro"), spies[-1]))
+            return replace(parts, anchor=AnchoredDepth(DepthSettings(anchor="depth-pro"), spies[-1]))
         spies.append(SpyDepth(parts.depth, **spy))
         return replace(parts, depth=spies[-1])
 

@@ -8,7 +8,6 @@ import trimesh
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import FusionSettings
-from scopemap.engine.config.mapping import FusionConstants
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.agreement import compare_with_frame
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
@@ -34,9 +33,7 @@ def _shot(x_mm: float = 0.0, exposure: float = 1.0, albedo: np.ndarray = PINK, s
 
 
 def _fused(frames: list[Frame], colours: str = "albedo") -> trimesh.Trimesh:
-    settings = FusionSettings(
-        voxel_mm=1.0, truncation_mm=4.0, max_depth_mm=200.0, colours=colours, constants=FusionConstants(min_weight=0.01)
-    )
+    settings = FusionSettings(voxel_mm=1.0, truncation_mm=4.0, max_depth_mm=200.0, colours=colours, min_weight=0.01)
     volume = TsdfVolume(settings)
     for frame in frames:
         volume.integrate(frame)

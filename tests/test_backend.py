@@ -12,7 +12,6 @@ import pytest
 from plane_scene import CAMERA
 
 from scopemap.engine.config import MappingSettings
-from scopemap.engine.config.mapping import MappingConstants
 from scopemap.engine.flow.corners import detect_corners, sample_flow
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.frame import Frame
@@ -51,7 +50,7 @@ def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
 
 
 def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
-    settings = MappingSettings(constants=MappingConstants(depth_sigma_share=0.05, scale_sigma=0.3))
+    settings = MappingSettings(depth_sigma_share=0.05, scale_sigma=0.3)
     frames = [_frame(number, factor=0.8 if number == 2 else 1.0) for number in range(6)]
     correction = plane_scene.adjusted(frames, settings)
     factors = np.array([correction.depth_factor(10 * number) for number in range(6)])
@@ -227,7 +226,7 @@ def test_an_adjustment_that_makes_depths_disagree_is_refused(zoom: float, monkey
     drift = [se3_exp(0.003 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
     tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
     # Where other starts confirm the shape, depth that was not used does not judge it.
-    settings = MappingSettings(constants=MappingConstants(other_starts=False))
+    settings = MappingSettings(other_starts=False)
     correction = plane_scene.adjusted((_frame(number, T) for number, T in enumerate(tracked)), settings)
     assert correction.sigma_px < 0.8
     assert (correction.notice.code == "mapping-depth-disagrees") == bool(zoom)

@@ -11,7 +11,6 @@ from drawn_bundle import FOCAL_PX, LINE, tracked, world
 from plane_scene import CAMERA
 
 from scopemap.engine.config import MappingSettings
-from scopemap.engine.config.mapping import MappingConstants
 from scopemap.engine.flow.corners import normalised_brightness, refined_corners
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.flow.estimator import FlowEstimator
@@ -44,7 +43,7 @@ class _FromZero(DisFlow):
 def _errors_px(flow: FlowEstimator, gap: int, step_mm: float, nearer_mm: float = 0.0) -> np.ndarray:
     """Errors (n,) of the observations at a gap between keyframes that slide along the plane, and come nearer."""
     poses = [plane_scene.pose(at_mm=(step_mm * n, 0.0, nearer_mm * n)) for n in range(gap + 1)]
-    tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(gap,))), flow)
+    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(gap,)), flow)
     for number, pose in enumerate(poses):
         tracks.add(plane_scene.frame(pose, number))
     points, observations = tracks.collected()
@@ -81,7 +80,7 @@ def test_distant_keyframes_are_matched_along_those_between() -> None:
 
 
 def test_a_map_that_the_camera_leaves_goes_on_when_it_comes_back() -> None:
-    tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2, 3))), DisFlow())
+    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2, 3)), DisFlow())
     poses = [plane_scene.pose(at_mm=(2.0 * n, 0.0, 0.0)) for n in range(4)]
     for number, (pose, map_number) in enumerate(zip(poses, (0, 0, 1, 0), strict=True)):
         tracks.add(plane_scene.frame(pose, number), map_number)
@@ -103,7 +102,7 @@ def test_keyframes_that_are_far_apart_are_matched_from_depth_and_poses_as_tracke
 @pytest.mark.parametrize(("step_mm", "tried"), [(2.0, 3), (80.0, 0)])
 def test_farther_keyframes_are_tried_only_where_nearer_ones_have_corners_in_common(step_mm: float, tried: int) -> None:
     flow = _FromZero()
-    tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2, 3))), flow)
+    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2, 3)), flow)
     for number in range(4):
         tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(step_mm * number, 0.0, 0.0)), number))
     assert flow.started == tried
@@ -136,7 +135,7 @@ def test_observations_that_share_their_errors_count_as_one() -> None:
 
 
 def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
-    tracks = FeatureTracks(MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2))), DisFlow())
+    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2)), DisFlow())
     for number in range(4):
         tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)), number))
     points, observations = tracks.collected()
@@ -167,7 +166,7 @@ class _Counted(DisFlow):
 
 def test_what_windows_have_matched_is_not_matched_again() -> None:
     frames = [plane_scene.frame(plane_scene.pose(at_mm=(1.5 * n, 0.5 * n, 0.0)), n) for n in range(5)]
-    settings, shared = MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2, 3))), _Counted()
+    settings, shared = MappingSettings(keyframe_gaps=(1, 2, 3)), _Counted()
     alone, far = FeatureTracks(settings, DisFlow()), FeatureTracks(settings, shared)
     near = FeatureTracks(settings, DisFlow(), gaps=(1, 2))
     for frame in frames:

@@ -24,7 +24,7 @@ from scopemap_bench.methods.baselines import ICP_METHODS, RGBD_METHODS, Open3dTr
 
 COLOUR, CLOUDS = list(RGBD_METHODS), list(ICP_METHODS)
 PLAIN = {
-    **{"mapis__advanced__frame_scale": "none", "mapis__paper__blend": "none", "networks__flow": "none"},
+    **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
     **{"mapping__method": "none", "fusion__enabled": False},
 }
 CAMERA = PinholeCamera(140.0, 140.0, 79.5, 63.5, 160, 128)

@@ -23,7 +23,7 @@ from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.methods.baselines import SETTINGS, StandingStill, create_endo_depth_and_motion
 
 PLAIN = {
-    **{"mapis__advanced__frame_scale": "none", "mapis__paper__blend": "none", "networks__flow": "none"},
+    **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
     **{"mapping__method": "none", "fusion__enabled": False},
 }
 CAMERA = PinholeCamera(40.0, 40.0, 31.5, 23.5, 64, 48)
@@ -70,12 +70,11 @@ def test_two_scales_and_grey_values_alone() -> None:
     assert [view.weight.shape for view in build_pyramid(frame, SETTINGS)] == [(48, 64), (24, 32)]
     # Of the settings that make our tracker what it is, none is left.
     ours = TrackingSettings()
-    advanced = SETTINGS.constants
     for name in ("channels", "lamp_gamma", "gain_bias", "solver", "start"):
-        assert getattr(advanced, name) != getattr(ours.constants, name)
-    assert advanced.depth_weight == advanced.min_keyframe_agreement == advanced.corner_depth_sigma == 0
-    assert (advanced.min_correlation, advanced.min_inlier_share) == (-1, 0)
-    assert advanced.min_sharpness == advanced.relocalisation_keyframes == advanced.new_map_after == 0
+        assert getattr(SETTINGS, name) != getattr(ours, name)
+    assert SETTINGS.depth_weight == SETTINGS.min_keyframe_agreement == SETTINGS.corner_depth_sigma == 0
+    assert (SETTINGS.min_correlation, SETTINGS.min_inlier_share) == (-1, 0)
+    assert SETTINGS.min_sharpness == SETTINGS.relocalisation_keyframes == SETTINGS.new_map_after == 0
 
 
 def test_a_black_frame_in_a_run_is_lost_and_tracking_goes_on(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from dataclasses import fields
+import re
 from functools import cache
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import scopemap.engine.config
 from docs.settings_page import settings_page
-from scopemap.engine.config import PRESETS, Config, setting_names
+from scopemap.engine.config import PRESETS, Config, TrackingSettings, setting_names
 from scopemap.engine.config.settings import StageSettings
 from scopemap.engine.errors import SettingsError
 
@@ -62,10 +62,20 @@ def test_the_preset_is_the_command_lines_before_the_files(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_runs_file_repeats_the_run_without_naming_its_preset(preset: str, tmp_path: Path) -> None:
-    config = Config.load(preset, settings={"tracking.method": "paper+gauss-newton"})  # type: ignore[arg-type]
-    again = Config.load(file=_write(tmp_path, config.toml()))
-    assert again == config
-    assert again.tracking.constants.solver == "gauss-newton"
+    changed = {"tracking.solver": "gauss-newton", "mapping.keyframe_gaps": [1, 4]}
+    config = Config.load(preset, settings=changed)  # type: ignore[arg-type]
+    assert Config.load(file=_write(tmp_path, config.toml())) == config
+    assert (config.tracking.solver, config.mapping.keyframe_gaps) == ("gauss-newton", (1, 4))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_file_without_advanced_settings_has_those_of_its_methods(preset: str, tmp_path: Path) -> None:
+    """As runs wrote it when these were no settings."""
+    config = Config.load(preset)  # type: ignore[arg-type]
+    names = {f"{stage}.{name}" for stage, part in STAGES.items() for name in part.sources()}
+    text = "".join(line for line in config.toml().splitlines(keepends=True) if line.split(" ")[0] not in names)
+    assert "tracking.huber" not in text
+    assert Config.load(file=_write(tmp_path, text)) == config
 
 
 @settings(max_examples=25, deadline=None)
@@ -85,22 +95,41 @@ def test_any_values_go_through_a_file(
 @pytest.mark.parametrize(
     ("stage", "method"), [(stage, name) for stage, part in STAGES.items() for name in part.METHODS]
 )
-def test_each_method_changes_constants_to_values_of_their_types(stage: str, method: str) -> None:
-    constants = getattr(Config.load(settings={f"{stage}.method": method}), stage).constants
-    default = type(constants)()
-    changed = {
-        field.name for field in fields(default) if getattr(constants, field.name) != getattr(default, field.name)
-    }
-    assert changed == set(STAGES[stage].METHODS[method])
-    for name in changed:
-        assert type(getattr(constants, name)) is type(getattr(default, name))
+def test_each_method_changes_advanced_settings_to_values_of_their_types(stage: str, method: str) -> None:
+    default, chosen = STAGES[stage], getattr(Config.load(settings={f"{stage}.method": method}), stage)
+    before, after = default.model_dump(exclude={"method"}), chosen.model_dump(exclude={"method"})
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed == set(default.METHODS[method]) <= set(default.sources())
+    assert all(type(after[name]) is type(before[name]) for name in changed)
+
+
+def test_each_method_is_named_by_a_preset_or_a_document() -> None:
+    """What only a benchmark's plan needs is a setting there."""
+    documents = [file.read_text(encoding="utf-8") for file in ROOT.glob("docs/*.md") if file.name != "settings.md"]
+    named = set(re.findall(r"([a-z]+)\.method ?= ?([a-z+-]+)", "\n".join(documents)))
+    for values in PRESETS.values():
+        named |= {(name.removesuffix(".method"), str(method)) for name, method in values.items()}
+    used = {(stage, method) for stage, joined in named for method in joined.split("+")}
+    defaults = {(stage, type(part).model_fields["method"].default) for stage, part in STAGES.items()}
+    assert {(stage, method) for stage, part in STAGES.items() for method in part.METHODS} - used <= defaults
 
 
 def test_of_joined_methods_the_later_one_wins() -> None:
-    paper = Config.load("paper").mapis.constants
-    both = Config.load("paper", settings={"mapis.method": "paper+no-blend"}).mapis.constants
-    assert (paper.blend, both.blend, both.order) == ("linear", "none", "refine-first")
-    assert Config.load(settings={"mapis.method": "no-blend+paper"}).mapis.constants == paper
+    both = Config.load("paper", settings={"tracking.method": "paper+realtime+least-squares"}).tracking
+    assert (both.max_iterations, both.start, both.huber) == (15, "identity", 1e6)
+    stricter = Config.load(settings={"tracking.method": "no-pose-checks+paper"}).tracking
+    assert (stricter.min_texture, stricter.max_step) == (0.0, 1e6)
+
+
+def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_another(tmp_path: Path) -> None:
+    single = {"tracking.huber": "2", "tracking.method": "paper"}
+    assert Config.load(settings=single).tracking == TrackingSettings(method="paper", huber=2.0)
+    assert Config.load("paper", settings={"tracking.huber": 2}).tracking.start == "identity"
+    file = _write(tmp_path, Config.load(settings=single | {"tracking.keyframe_every": 4}).toml())
+    assert Config.load(file=file, settings={"tracking.max_step": 1}).tracking.huber == 2.0
+    other = Config.load(file=file, settings={"tracking.method": "realtime"}).tracking
+    assert other == TrackingSettings(method="realtime", keyframe_every=4)
+    assert Config.load(file=file, settings={"mapping.method": "none"}).tracking.huber == 2.0
 
 
 @pytest.mark.parametrize(
@@ -116,6 +145,15 @@ def test_of_joined_methods_the_later_one_wins() -> None:
         ("qqqq", 1, "unknown setting 'qqqq': choose from preset, run"),
         ("tracking.method", "papper", "'tracking.method': unknown method 'papper': did you mean 'paper'"),
         ("tracking.method", "paper+", "unknown method '': choose from scopemap, paper"),
+        ("tracking.method", 7, "'tracking.method': Input should be a valid string"),
+        ("tracking.advanced.huber", 2, "unknown setting 'tracking.advanced.huber': did you mean 'tracking"),
+        ("tracking.hubert", 2, "did you mean 'tracking.huber'"),
+        ("tracking.huber", 0, "greater than 0"),
+        ("tracking.finest_level", 4, "less than or equal to 3"),
+        ("tracking.solver", "lbfgs", "'dogleg' or 'gauss-newton'"),
+        ("mapping.keyframe_gaps", [], "at least 1 item"),
+        ("mapping.keyframe_gaps", [1, 0], "greater than 0"),
+        ("smoothing.alpha", 0.9, r"alpha \+ beta \+ gamma must be 1, their sum is 1\.3"),
         ("tracking.keyframe_every", 0, "greater than or equal to 1"),
         ("tracking.keyframe_every", "wide", "valid integer"),
         ("fusion.voxel_mm", float("nan"), "'fusion.voxel_mm'.*finite number"),
@@ -176,11 +214,10 @@ def test_the_page_of_settings_is_the_generated_one() -> None:
     assert page == settings_page(), "docs/settings.md is out of date: python docs/settings_page.py writes it"
 
 
-def test_each_setting_and_each_constant_is_read() -> None:
+def test_each_setting_is_read() -> None:
     named = {tuple(name.split(".")) for name in setting_names() if "." in name}
-    named |= {(stage, field.name) for stage, part in STAGES.items() for field in fields(part.constants)}
-    # What a method is, is read where its constants are chosen.
-    named -= {(stage, "method") for stage in STAGES if stage not in ("smoothing", "mapping")}
+    # What a method is, is read where it chooses settings.
+    named -= {(stage, "method") for stage in STAGES if stage != "smoothing"}
     assert {group for group, _ in named} == set(READERS)
     for group, name in named:
         files = [file for pattern in READERS[group] for file in SOURCE.glob(pattern)]

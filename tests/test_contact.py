@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import plane_scene
 import pytest
-from chosen_settings import chosen
 from plane_scene import CAMERA, EVERYWHERE
 from result_files import through_checkpoint
 from tiny_phantom import with_true_depth, write_tiny
@@ -115,7 +114,7 @@ def _frames(depth_after: float) -> list[Frame]:
 
 
 def _tracked(frames: list[Frame], **changes: object) -> list[Track]:
-    tracker, tracks = Tracker(chosen(TrackingSettings, keyframe_every=3, finest_level=0, **changes)), []
+    tracker, tracks = Tracker(TrackingSettings(keyframe_every=3, finest_level=0, **changes)), []
     for frame in frames:
         track = tracker.track(frame)
         tracks.append(track)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -45,7 +44,7 @@ class Metric:
 
 
 def anchored(reference: Metric | None = None, **values: Any) -> AnchoredDepth:
-    return AnchoredDepth(chosen(DepthSettings, **({"backend": "depth-anything"} | values)), reference or Metric())
+    return AnchoredDepth(DepthSettings(**({"backend": "depth-anything"} | values)), reference or Metric())
 
 
 def depth_of(anchor: AnchoredDepth, estimate: DepthEstimate, frame: Frame) -> np.ndarray:

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.engine.config import MappingSettings
-from scopemap.engine.config.mapping import MappingConstants
 from scopemap.engine.frame import Frame
 from scopemap.engine.mapping import MAX_LOG_FACTOR, FrameCorrection
 from scopemap.engine.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthCorrectionField, fit_depth_correction
@@ -113,7 +112,7 @@ def test_distorted_depth_of_a_plane_seen_from_six_poses_is_corrected() -> None:
     frames = [_bent(number) for number in range(6)]
     results = {}
     for step_sigma in (0.0, 0.1):
-        settings = MappingSettings(constants=MappingConstants(depth_step_sigma=step_sigma))
+        settings = MappingSettings(depth_step_sigma=step_sigma)
         correction = plane_scene.adjusted(frames, settings)
         assert not correction.refused
         results[step_sigma] = [_shape_error(f, correction.depth_factors(f.index, f.depth_mm)) for f in frames]

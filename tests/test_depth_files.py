@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from chosen_settings import chosen
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.cameras.lenses import FisheyeCamera
@@ -31,7 +30,7 @@ def frame(index: int = 0, camera: PinholeCamera = TARGET) -> Frame:
 
 
 def files(folder: Path, scale_mm: float | None = None, rectifier: Rectifier = SAME, **settings: Any) -> FilesDepth:
-    return FilesDepth(folder, rectifier, chosen(DepthSettings, **settings), scale_mm)
+    return FilesDepth(folder, rectifier, DepthSettings(**settings), scale_mm)
 
 
 def write(folder: Path, name: str, array: np.ndarray) -> None:

@@ -151,8 +151,7 @@ def test_depth_pro_by_hand(
 
 @pytest.mark.parametrize("every", [0, 5])
 def test_the_anchors_network_is_freed_once_it_has_served(frame: Frame, every: int) -> None:
-    constants = replace(DepthSettings(backend="depth-anything").constants, reanchor_every=every)
-    settings = DepthSettings(backend="depth-anything", anchor="depth-pro").model_copy(update={"constants": constants})
+    settings = DepthSettings(backend="depth-anything", anchor="depth-pro", reanchor_every=every)
     anchor = AnchoredDepth(settings, DepthPro(*small_depth_pro(), device="cpu"))
     values = np.random.default_rng(1).uniform(1, 2, (HEIGHT, WIDTH)).astype(np.float32)
     before = anchor.metric(DepthEstimate(values, "depth"), frame)

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from chosen_settings import chosen
 from torch import nn
 
 from scopemap.engine.cameras.camera import PinholeCamera
@@ -129,7 +128,7 @@ def test_what_is_shipped_is_what_the_model_card_describes() -> None:
 
 @pytest.mark.parametrize(("calibrated", "rays"), [(True, "known"), (False, "assumed")])
 def test_provenance_says_whose_weights_and_whether_the_rays_were_known(file: Path, calibrated: bool, rays: str) -> None:
-    settings = chosen(DepthSettings, backend="scopenet", model=str(file))
+    settings = DepthSettings(backend="scopenet", model=str(file))
     origin = create_depth(settings, SAME, "cpu", calibrated=calibrated).provenance()
     averaged = create_depth(settings, SAME, "cpu", calibrated=calibrated, averaged=True).provenance()
     assert averaged == origin | {"answers": "mean of two"}

@@ -7,7 +7,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -41,7 +40,7 @@ def bowl() -> np.ndarray:
 @pytest.mark.parametrize("exponent", [0.5, 0.6])
 def test_depth_comes_back_from_the_law_of_the_lamp(exponent: float) -> None:
     truth_mm = bowl()
-    estimate = ShadingDepth(chosen(DepthSettings, shading_exponent=exponent)).estimate(
+    estimate = ShadingDepth(DepthSettings(shading_exponent=exponent)).estimate(
         lit_frame(truth_mm, exponent, power=0.4 * 18 ** (1 / exponent))
     )
     assert estimate.kind == "depth"
@@ -51,14 +50,14 @@ def test_depth_comes_back_from_the_law_of_the_lamp(exponent: float) -> None:
 
 
 def test_the_median_distance_of_the_first_frame_is_the_stated_prior() -> None:
-    estimate = ShadingDepth(chosen(DepthSettings, shading_median_mm=42.0)).estimate(lit_frame(bowl(), 0.5, power=150.0))
+    estimate = ShadingDepth(DepthSettings(shading_median_mm=42.0)).estimate(lit_frame(bowl(), 0.5, power=150.0))
     assert np.median(estimate.values / UNIT_Z) == pytest.approx(42.0, rel=1e-3)
 
 
 @settings(max_examples=10, deadline=None)
 @given(nearer=st.floats(0.5, 0.95))
 def test_the_scale_is_held_so_that_approach_makes_depth_smaller(nearer: float) -> None:
-    estimator = ShadingDepth(chosen(DepthSettings, shading_exponent=0.5))
+    estimator = ShadingDepth(DepthSettings(shading_exponent=0.5))
     first = estimator.estimate(lit_frame(bowl(), 0.5, power=60.0)).values
     second = estimator.estimate(lit_frame(nearer * bowl(), 0.5, power=60.0)).values
     assert np.median(second / first) == pytest.approx(nearer, rel=0.03)
@@ -98,7 +97,7 @@ def test_smoothing_removes_texture_and_keeps_a_step_in_depth() -> None:
     depth_mm = np.where(np.arange(160) < 80, 10.0, 40.0) * np.ones((128, 1))
     mottled = 1 + 0.2 * np.random.default_rng(0).standard_normal(depth_mm.shape)
     values = (
-        ShadingDepth(chosen(DepthSettings, shading_exponent=0.5))
+        ShadingDepth(DepthSettings(shading_exponent=0.5))
         .estimate(lit_frame(depth_mm, 0.5, np.clip(mottled, 0.5, 1.5), power=60.0))
         .values
     )

@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chosen_settings import chosen
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import DepthSettings, FusionSettings, MapisSettings
-from scopemap.engine.config.mapping import FusionConstants
 from scopemap.engine.depth.anchor import AnchoredDepth
 from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
@@ -77,7 +75,7 @@ def test_old_certainty_fades_towards_the_present_and_doubt_does_not() -> None:
 
 
 def _anchored(estimate: DepthEstimate, **changes: Any) -> Any:
-    values = chosen(DepthSettings, **({"backend": "depth-anything", "anchor": "factor", "factor": 25.0} | changes))
+    values = DepthSettings(**({"backend": "depth-anything", "anchor": "factor", "factor": 25.0} | changes))
     frame = Frame(0, 0.0, np.full((*SHAPE, 3), 90, np.uint8), CAMERA, np.ones(SHAPE, bool))
     return AnchoredDepth(values, ShadingDepth(values)).metric(estimate, frame)
 
@@ -108,7 +106,7 @@ def _link() -> DenseCorrespondence:
 
 
 def _refined(sigmas: tuple[Any, Any], motion: np.ndarray | None = None, **changes: Any) -> list[RefinedDepth]:
-    mapis = Mapis(chosen(MapisSettings, **({"filter_sigma_px": 0.0, "frame_scale": "none"} | changes)))
+    mapis = Mapis(MapisSettings(**({"filter_sigma_px": 0.0, "frame_scale": "none"} | changes)))
     results = [mapis.refine(DEPTH, "depth", CAMERA, None, None, sigma_mm=sigmas[0])]
     for raw in (OTHER, DEPTH):
         sigma = sigmas[1] if raw is OTHER else sigmas[0]
@@ -134,7 +132,7 @@ def test_without_sigma_the_blend_is_the_perceptual_one_to_the_last_bit() -> None
 
 
 def test_the_scale_of_a_frame_is_that_of_its_sigma() -> None:
-    mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
+    mapis = Mapis(MapisSettings(filter_sigma_px=0.0))
     mapis.refine(DEPTH, "depth", CAMERA, None, None, sigma_mm=SHARE * DEPTH)
     link = replace(_link(), distance=np.ones(SHAPE, np.float32))
     refined = mapis.refine(2 * DEPTH, "depth", CAMERA, link, None, sigma_mm=SHARE * 2 * DEPTH)
@@ -153,9 +151,7 @@ def _wall(sigma_mm: np.ndarray | None = None, depth_mm: np.ndarray | None = None
 
 
 def _field(*frames: Frame, **changes: Any) -> Any:
-    volume = TsdfVolume(
-        FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, constants=FusionConstants(min_weight=0.2, **changes))
-    )
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, min_weight=0.2, **changes))
     for frame in frames:
         volume.integrate(frame)
     return volume._blocks.dense(np.array([-1, 0, 6]), 2)

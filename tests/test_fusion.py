@@ -7,18 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from chosen_settings import chosen
-from drawn_surfaces import AHEAD, LENIENT, VIEW, all_around, frame_of, plane_frame, sphere_frame
+from drawn_surfaces import AHEAD, LENIENT, VIEW, all_around, frame_of, lenient, plane_frame, sphere_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.engine.config import FusionSettings
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
 from scopemap.engine.geometry.se3 import se3, so3_exp
-
-
-def _lenient(**advanced: float) -> FusionSettings:
-    return chosen(LENIENT, **advanced)
 
 
 def sphere_volume(radius_mm: float, centre_mm: np.ndarray | None = None) -> TsdfVolume:
@@ -80,7 +74,7 @@ def test_colours_come_from_the_pixels() -> None:
     plane = plane_frame(AHEAD, 40.0)
     picture = np.zeros((VIEW.height, VIEW.width, 3), np.uint8)
     picture[:, :80], picture[:, 80:] = (200, 20, 40), (10, 90, 250)
-    volume = TsdfVolume(LENIENT.model_copy(update={"colours": "raw"}))
+    volume = TsdfVolume(lenient(colours="raw"))
     for _ in range(2):
         volume.integrate(replace(plane, rgb=picture))
     mesh = volume.extract_mesh()
@@ -93,12 +87,12 @@ def test_floaters_go_and_the_largest_part_stays() -> None:
     depth = np.full((VIEW.height, VIEW.width), np.nan)
     depth[:, :100] = 40.0
     depth[50:70, 120:140] = 60.0
-    volume = TsdfVolume(_lenient(min_component_share=0.2))
+    volume = TsdfVolume(lenient(min_component_share=0.2))
     volume.integrate(frame_of(VIEW, np.eye(4), depth))
     assert np.allclose(volume.extract_mesh().vertices[:, 2], 40.0, atol=0.01)
-    volume.settings = _lenient(min_component_share=0.0)
+    volume.settings = lenient(min_component_share=0.0)
     assert (volume.extract_mesh().vertices[:, 2] > 50).any()
-    volume.settings = _lenient(min_component_share=1.0)
+    volume.settings = lenient(min_component_share=1.0)
     assert len(volume.extract_mesh().faces) > 100
 
 
@@ -117,7 +111,7 @@ def test_pixels_that_must_not_count_do_not() -> None:
         volume.integrate(frame)
     assert volume.block_count == 0
     assert volume.extract_mesh().vertices.shape == (0, 3)
-    strict = TsdfVolume(_lenient(min_incidence=0.5))
+    strict = TsdfVolume(lenient(min_incidence=0.5))
     strict.integrate(grazing)
     assert strict.block_count == 0
 
@@ -133,7 +127,7 @@ def test_a_highlight_that_stays_in_place_is_fused_with_little_weight() -> None:
 
     def fused(*, highlights: bool = True, **advanced: float) -> tuple[trimesh.Trimesh, np.ndarray]:
         """The mesh, and which vertices are under the highlight."""
-        volume = TsdfVolume(_lenient(**advanced))
+        volume = TsdfVolume(lenient(**advanced))
         for _ in range(5):
             volume.integrate(replace(frame, valid=valid, rgb=shown, highlights=~valid if highlights else None))
         mesh = volume.extract_mesh()

@@ -13,7 +13,6 @@ from tiny_phantom import with_true_depth, write_tiny
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import Config, FusionSettings
-from scopemap.engine.config.mapping import FusionConstants
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame, Rows
 from scopemap.engine.fusion.frame_store import FrameStore
@@ -102,15 +101,14 @@ def test_a_store_that_lost_bytes_is_refused(tmp_path: Path) -> None:
 def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
     corrected: bool, voxel_mm: float | None, at_end: bool
 ) -> None:
-    advanced = FusionConstants(min_weight=0.0)
-    settings = FusionSettings(voxel_mm=voxel_mm, every=2, constants=advanced)
+    settings = FusionSettings(voxel_mm=voxel_mm, every=2, min_weight=0.0)
     fusion = SurfaceFusion(settings, FrameStore(), corrected=corrected)
     frames = [wall(60.0, n) for n in range(3)]
     for frame in frames:
         fusion.put(frame)
     assert (fusion.at_end, fusion.at_once) == (at_end, not at_end)
     surface = fusion.fuse(fusion.store.frames(), fusion.store.median_depth_mm())
-    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, constants=advanced))
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, min_weight=0.0))
     for frame in frames[::2]:
         volume.integrate(frame)
     assert len(surface.mesh.vertices) == pytest.approx(len(volume.extract_mesh().vertices), rel=0.05)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from chosen_settings import chosen
 from tiny_phantom import write_tiny
 
 from scopemap import open_sequence
@@ -61,7 +60,7 @@ def test_the_runtime_finds_instruments_as_torch_does() -> None:
 # ---- from probabilities to a mask
 
 
-LOOKED_FOR = chosen(MaskSettings, instruments="auto")
+LOOKED_FOR = MaskSettings(instruments="auto")
 
 
 def _masked(masker: Masker, probability: np.ndarray | None) -> np.ndarray | None:
@@ -100,7 +99,7 @@ def test_nobody_looks_where_the_settings_or_the_network_do_not(tmp_path: Path) -
     assert _masked(Masker(LOOKED_FOR), None) is None
     assert _masked(Masker(MaskSettings()), _bar(0.9)) is None
     for way in ("off", "files"):
-        assert _masked(Masker(chosen(MaskSettings, instruments=way)), _bar(0.9)) is None
+        assert _masked(Masker(MaskSettings(instruments=way)), _bar(0.9)) is None
 
     class Files:
         warnings: list[str] = []  # noqa: RUF012
@@ -123,9 +122,9 @@ def test_settings_that_contradict_each_other_are_refused(tmp_path: Path) -> None
     (tmp_path / "masks").mkdir()
     same = Rectifier(CAMERA, CAMERA)
     with pytest.raises(SettingsError, match=r"mask\.instruments=off contradicts mask\.files"):
-        create_masks(chosen(MaskSettings, instruments="off", files=str(tmp_path / "masks")), same)
-    assert create_masks(chosen(MaskSettings, instruments="files"), same) is None
-    assert create_masks(chosen(MaskSettings, instruments="off"), same, tmp_path / "masks") is None
+        create_masks(MaskSettings(instruments="off", files=str(tmp_path / "masks")), same)
+    assert create_masks(MaskSettings(instruments="files"), same) is None
+    assert create_masks(MaskSettings(instruments="off"), same, tmp_path / "masks") is None
 
 
 def test_a_mask_of_another_size_takes_usable_pixels_and_highlights() -> None:

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import plane_scene
 import pytest
-from chosen_settings import chosen
 from plane_scene import CAMERA
 
 from scopemap.engine.config import TrackingSettings
@@ -91,7 +90,7 @@ class _Shifted(DisFlow):
 
 
 def _tracked(flow: FlowEstimator | None, *, measured: bool = False, **changes: object) -> Track:
-    tracker = Tracker(chosen(TrackingSettings, finest_level=0, **changes), flow)
+    tracker = Tracker(TrackingSettings(finest_level=0, **changes), flow)
     tracker.track(plane_scene.frame(HERE, 0))
     assert tracker.insert_keyframe(plane_scene.frame(HERE, 0), measured=measured)
     return tracker.track(plane_scene.frame(THERE, 1))
@@ -129,7 +128,7 @@ def test_a_frame_in_which_few_corners_are_matched_becomes_a_keyframe() -> None:
     narrow = plane_scene.EVERYWHERE.copy()
     narrow[:, 64:] = False
     for valid, wanted in ((plane_scene.EVERYWHERE, False), (narrow, True)):
-        tracker = Tracker(chosen(TrackingSettings, finest_level=0, min_keyframe_agreement=0.0), DisFlow())
+        tracker = Tracker(TrackingSettings(finest_level=0, min_keyframe_agreement=0.0), DisFlow())
         tracker.track(plane_scene.frame(HERE, 0))
         tracker.insert_keyframe(plane_scene.frame(HERE, 0), measured=False)
         assert tracker.track(replace(plane_scene.frame(THERE, 1), valid=valid)).status == "ok"
@@ -154,7 +153,7 @@ def _to_and_fro(tracker: Tracker) -> list[Track]:
 
 
 def test_a_camera_that_comes_back_is_tracked_against_the_keyframes_it_passed(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = chosen(TrackingSettings, keyframe_every=2)
+    settings = TrackingSettings(keyframe_every=2)
     again = _to_and_fro(Tracker(settings, DisFlow()))
     assert again[-1].keyframe == 0
     assert len({track.keyframe for track in again}) <= 6

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import plane_scene
 import pytest
-from chosen_settings import chosen
 from plane_scene import CAMERA
 
 from scopemap.engine.config import TrackingSettings
@@ -23,7 +22,7 @@ from scopemap.engine.tracking.tracker import Tracker
 
 # Each frame some 50 px and 14 degrees from the one before; the first and the fifth have hardly anything in common.
 FAST = [plane_scene.pose(at_mm=(14.0 * n, 6.0 * n, 0.0), turn_rad=(0.0, 0.0, 0.25 * n)) for n in range(5)]
-SETTINGS = chosen(TrackingSettings, finest_level=0, keyframe_every=100, min_keyframe_agreement=0.0)
+SETTINGS = TrackingSettings(finest_level=0, keyframe_every=100, min_keyframe_agreement=0.0)
 
 
 def _frame(index: int, T_world_camera: np.ndarray) -> Frame:
@@ -81,4 +80,4 @@ def test_flow_is_searched_from_the_guessed_motion() -> None:
 @pytest.mark.parametrize(("sharpness", "matches", "obscured"), [(0.5, 39, True), (0.5, 40, False), (0.2, 400, True)])
 def test_features_that_match_tell_a_bare_wall_from_smoke(sharpness: float, matches: int, obscured: bool) -> None:
     alignment = Alignment(Motion(np.eye(4), np.array([1.0, 0.0])), 1.0, 0.5, 0.3, 1.0, 0.9, 5, matches=matches)
-    assert is_obscured(sharpness, alignment, SETTINGS.constants.min_sharpness) == obscured
+    assert is_obscured(sharpness, alignment, SETTINGS.min_sharpness) == obscured

@@ -9,10 +9,8 @@ import cv2
 import numpy as np
 import plane_scene
 import pytest
-from chosen_settings import chosen
 
 from scopemap.engine.config import MappingSettings
-from scopemap.engine.config.mapping import MappingConstants
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.engine.mapping.loop_closure import Loop, LoopFinder, is_verified, small_view
@@ -23,7 +21,7 @@ OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 
 POSES = [*OUT, *OUT[-2::-1]]
 COUNT = len(POSES)
 LINE = np.column_stack([np.arange(COUNT - 1), np.arange(1, COUNT)])
-SETTINGS = MappingSettings(constants=MappingConstants(keyframe_gaps=(1, 2)))
+SETTINGS = MappingSettings(keyframe_gaps=(1, 2))
 
 
 def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0) -> Frame:
@@ -81,7 +79,7 @@ def test_all_keyframes_of_two_maps_are_compared_at_the_end(candidates: int, monk
 
 def test_memory_of_places_is_bounded_and_a_return_is_still_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.engine.mapping.loop_closure.MOST_SEARCHED", 6)
-    finder, kept, loops = LoopFinder(MappingSettings(constants=MappingConstants(keyframe_gaps=(1,)))), [], []
+    finder, kept, loops = LoopFinder(MappingSettings(keyframe_gaps=(1,))), [], []
     for number, x_mm in enumerate([*np.linspace(-60.0, 60.0, 17), -60.0]):
         loops = finder.add(_sideways(number, x_mm))
         kept.append(len(finder._features))
@@ -176,7 +174,7 @@ def test_one_false_loop_is_an_outlier() -> None:
 @pytest.mark.parametrize("closing", [True, False])
 def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
     tracked = _drifting()
-    settings = SETTINGS if closing else chosen(SETTINGS, min_loop_inliers=0)
+    settings = SETTINGS if closing else MappingSettings(keyframe_gaps=(1, 2), min_loop_inliers=0)
     correction = plane_scene.adjusted((_frame(number, T) for number, T in enumerate(tracked)), settings)
     _, before = _off(tracked[-1], POSES[-1])
     _, after = _off(correction.pose(10 * (COUNT - 1), tracked[-1]), POSES[-1])
@@ -188,7 +186,7 @@ def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
 
 
 def test_a_camera_at_rest_closes_few_loops_to_each_keyframe() -> None:
-    finder = LoopFinder(MappingSettings(constants=MappingConstants(keyframe_gaps=(1,))))
+    finder = LoopFinder(MappingSettings(keyframe_gaps=(1,)))
     loops = [loop for number in range(14) for loop in finder.add(replace(_frame(0), index=10 * number))]
     assert len(loops) > 10
     counts = np.bincount([loop.past for loop in loops])

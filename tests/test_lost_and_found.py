@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
 import plane_scene
 import pytest
-from chosen_settings import chosen
 from plane_scene import CAMERA
 
 from scopemap.engine.config import TrackingSettings
@@ -20,7 +20,12 @@ from scopemap.engine.tracking import keyframe_alignment, relocalisation
 from scopemap.engine.tracking.track import Track
 from scopemap.engine.tracking.tracker import Tracker
 
-SETTINGS = chosen(TrackingSettings, keyframe_every=3, finest_level=0)
+
+def _settings(**changes: Any) -> TrackingSettings:
+    return TrackingSettings(keyframe_every=3, finest_level=0, **changes)
+
+
+SETTINGS = _settings()
 # Slowly on, then, unseen, far away and turned.
 NEAR = [plane_scene.pose(at_mm=(1.0 * n, 0.3 * n, 0.0), turn_rad=(0.0, 0.0, 0.005 * n)) for n in range(8)]
 FAR = [plane_scene.pose(at_mm=(27.0 + n, 8.0, 4.0), turn_rad=(0.05, -0.1, 0.3)) for n in range(3)]
@@ -72,7 +77,7 @@ def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int
         dark,
         *(plane_scene.frame(T, 9 + n) for n, T in enumerate(FAR)),
     ]
-    tracks = _tracked(frames, chosen(SETTINGS, relocalisation_keyframes=remembered))
+    tracks = _tracked(frames, _settings(relocalisation_keyframes=remembered))
     assert tracks[8].status == "lost"
     turn, way_mm = _off(tracks[9], FAR[0])
     if remembered:
@@ -95,7 +100,7 @@ def test_a_new_map_begins_where_clear_frames_stay_lost_and_the_old_one_is_known_
     frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n) for n in range(9)]
     back = [plane_scene.frame(T, 17 + n) for n, T in enumerate(NEAR[:3])]
-    tracks = _tracked([*frames, *there, *back], chosen(SETTINGS, new_map_after=3))
+    tracks = _tracked([*frames, *there, *back], _settings(new_map_after=3))
     assert [track.status for track in tracks[8:12]] == ["lost"] * 3 + ["initial"]
     assert tracks[11].reason == "new map"
     assert [track.map for track in tracks] == [0] * 11 + [1] * 6 + [0] * 3
@@ -114,7 +119,7 @@ def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_f
     frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n % 9) for n in range(12)]
     back = [plane_scene.frame(T, 20 + n) for n, T in enumerate(NEAR[:4])]
-    tracks = _tracked([*frames, *there, *back], chosen(SETTINGS, new_map_after=0, search_every=3))
+    tracks = _tracked([*frames, *there, *back], _settings(new_map_after=0, search_every=3))
     searched = ["not searched" not in track.reason for track in tracks[8:20]]
     # The first five, and every third after these.
     assert searched == [True] * 6 + [True, False, False] * 2
@@ -136,7 +141,7 @@ def test_a_lost_frame_is_not_aligned_by_light_and_one_keyframe_finds_it(monkeypa
     count(relocalisation, "relative_pose_pnp")
     frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n) for n in range(3)]
-    tracker = Tracker(chosen(SETTINGS, min_keyframe_motion=0.0), DisFlow())
+    tracker = Tracker(_settings(min_keyframe_motion=0.0), DisFlow())
     tracks = _tracked([*frames, *there], tracker=tracker)
     assert [track.status for track in tracks] == ["initial"] + ["ok"] * 7 + ["lost"] * 3
     # Of the keyframes 0, 3 and 6.
@@ -152,7 +157,7 @@ def test_frames_that_show_nothing_begin_no_map(unseen: str) -> None:
     last = frames[-1]
     nothing = replace(last, valid=np.zeros_like(last.valid)) if unseen == "dark" else _smoked(last)
     spoilt = [replace(nothing, index=8 + n) for n in range(12)]
-    tracks = _tracked([*frames, *spoilt, replace(last, index=20)], chosen(SETTINGS, new_map_after=2))
+    tracks = _tracked([*frames, *spoilt, replace(last, index=20)], _settings(new_map_after=2))
     assert {track.map for track in tracks} == {0}
     assert tracks[-1].status == "ok"
 

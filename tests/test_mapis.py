@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chosen_settings import chosen
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import Config, MapisSettings
@@ -25,7 +24,7 @@ APPROACH = se3(np.eye(3), np.array([0.0, 0.0, -5.0]))
 def _mapis(**changes: Any) -> Mapis:
     """Plain settings: no filter, no scale, so that a formula can be seen through."""
     plain = {"filter_sigma_px": 0.0, "frame_scale": "none", "blend": "constant"}
-    return Mapis(chosen(MapisSettings, **(plain | changes)))
+    return Mapis(MapisSettings(**(plain | changes)))
 
 
 def _link(distance: np.ndarray | float = 0.0, flow_x: float = 0.0) -> DenseCorrespondence:
@@ -86,7 +85,7 @@ def test_measured_depth_is_left_alone(motion: np.ndarray | None) -> None:
 @pytest.mark.parametrize("kind", ["depth", "disparity"])
 @pytest.mark.parametrize("factor", [0.2, 0.97, 1.0, 3.5])
 def test_frame_scale_corrects_a_wrong_factor_exactly(kind: Any, factor: float) -> None:
-    mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
+    mapis = Mapis(MapisSettings(filter_sigma_px=0.0))
     mapis.refine(DEPTH, kind, CAMERA, None, None)
     refined = mapis.refine(DEPTH * np.float32(factor), kind, CAMERA, _link(DISTANCE), None)
     assert refined.scale == pytest.approx(1 / factor, rel=1e-5)
@@ -122,7 +121,7 @@ def test_a_chain_that_all_holds_is_left_alone(round_view: bool) -> None:
 def test_scale_with_the_motion_keeps_an_approach_and_without_cancels_it() -> None:
     flat = np.full(SHAPE, 40.0, np.float32)
     for motion, depth_mm in ((APPROACH, 35.0), (None, 40.0)):
-        mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
+        mapis = Mapis(MapisSettings(filter_sigma_px=0.0))
         mapis.refine(flat, "depth", CAMERA, None, None)
         refined = mapis.refine(1.7 * (flat - 5), "depth", CAMERA, _link(), motion)
         np.testing.assert_allclose(refined.depth_mm, depth_mm, rtol=1e-5)
@@ -146,7 +145,7 @@ def test_what_is_carried_on(recursive: bool) -> None:
 
 
 def test_forget_cuts_the_chain_and_holds_the_scale() -> None:
-    mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
+    mapis = Mapis(MapisSettings(filter_sigma_px=0.0))
     mapis.refine(DEPTH, "depth", CAMERA, None, None)
     mapis.refine(2 * DEPTH, "depth", CAMERA, _link(), None)
     mapis.reset()
@@ -157,7 +156,7 @@ def test_forget_cuts_the_chain_and_holds_the_scale() -> None:
 
 
 def test_an_anchored_frame_starts_the_chain_anew() -> None:
-    mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
+    mapis = Mapis(MapisSettings(filter_sigma_px=0.0))
     mapis.refine(DEPTH, "depth", CAMERA, None, None)
     assert mapis.refine(2 * DEPTH, "depth", CAMERA, _link(), None).scale == pytest.approx(0.5, rel=1e-5)
     anchored = mapis.refine(3 * OTHER, "depth", CAMERA, _link(), None, anchored=True)
@@ -167,7 +166,7 @@ def test_an_anchored_frame_starts_the_chain_anew() -> None:
 
 
 def test_without_a_warped_value_the_scaled_raw_depth_stands() -> None:
-    mapis = Mapis(chosen(MapisSettings, filter_sigma_px=0.0))
+    mapis = Mapis(MapisSettings(filter_sigma_px=0.0))
     holed = DEPTH.copy()
     holed[:10] = np.nan
     mapis.refine(holed, "depth", CAMERA, None, None)

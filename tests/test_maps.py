@@ -12,14 +12,12 @@ import numpy as np
 import plane_scene
 import pytest
 import trimesh
-from chosen_settings import configured
 from front_door import said, warned
 from result_files import frame_rows
 from tiny_phantom import SIZE, true_poses, with_true_depth
 
 from scopemap import open_sequence, reconstruct
-from scopemap.engine.config import MappingSettings
-from scopemap.engine.config.mapping import MappingConstants
+from scopemap.engine.config import Config, MappingSettings
 from scopemap.engine.depth.mapis import Mapis
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.frame import Frame
@@ -213,7 +211,7 @@ def test_the_pose_graph_merges_no_maps_whose_depths_then_disagree(zoom: float, m
 
     monkeypatch.setattr("scopemap.engine.mapping.backend.optimise_pose_graph", with_other_scales)
     # No adjustment is so exact: all are refused, as where tissue moves.
-    backend = Backend(MappingSettings(constants=MappingConstants(max_sigma_px=1e-3)), DisFlow())
+    backend = Backend(MappingSettings(max_sigma_px=1e-3), DisFlow())
     for number in range(10):
         frame, pose = _keyframe(number, (2.0 * number, 0.5 * number, 0.0), Similarity.identity(), 1.0)
         backend.add(frame, pose._replace(map=number % 2))
@@ -268,9 +266,8 @@ def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
     monkeypatch.setattr(TsdfVolume, "integrate", integrate)
     # Features would find the camera at once: no map would begin.
     monkeypatch.setattr(Relocaliser, "find", lambda *_, **__: None)
-    config = configured(
-        {key.replace("__", "."): value for key, value in LIGHT.items()} | {"tracking.keyframe_every": 3}
-    )
+    light = {key.replace("__", "."): value for key, value in LIGHT.items()}
+    config = Config.load(settings=light | {"tracking.keyframe_every": 3})
     result = reconstruct(open_sequence(cut), config, out=tmp_path / "out")
     status = result.frames["status"].tolist()
     assert status == ["initial"] + ["ok"] * 53

@@ -8,12 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from chosen_settings import chosen, configured
 from drawn_inputs import frames_of, picture, save
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.cameras.rectification import Rectifier, working_camera
-from scopemap.engine.config import MaskSettings
+from scopemap.engine.config import Config, MaskSettings
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.engine.frame import Frame
 from scopemap.engine.masking.masker import Masker
@@ -119,7 +118,7 @@ def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> N
     for i in range(3):
         save(images / f"{i}.png", picture(i, (640, 480)))
     masks = write_masks(tmp_path / "masks", {f"{i}.png": left_half() for i in range(3)})
-    config = configured({"mask.files": str(masks), "mask.files_grow_px": 0, "depth.backend": "shading"})
+    config = Config.load(settings={"mask.files": str(masks), "mask.files_grow_px": 0, "depth.backend": "shading"})
     sequence = open_sequence(images)
     estimators = create_estimators(config, sequence)
     assert estimators_provenance(estimators)["masks"].startswith("3 files")
@@ -133,7 +132,7 @@ def test_the_data_sets_own_masks_are_used_unless_others_or_none_are_asked_for(tm
     own, others = (write_masks(tmp_path / name, {"0.png": left_half()}) for name in ("own", "others"))
 
     def used(files: str) -> str:
-        masks = create_masks(chosen(MaskSettings, files=files), RECTIFIER, own)
+        masks = create_masks(MaskSettings(files=files), RECTIFIER, own)
         return "" if masks is None else masks.provenance()["masks"]
 
     assert used("").endswith("own")

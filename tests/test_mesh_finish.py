@@ -10,6 +10,7 @@ import trimesh
 from front_door import call
 from tiny_phantom import write_tiny
 
+from scopemap import open_sequence, reconstruct
 from scopemap.engine.config import Config, FusionSettings
 from scopemap.engine.fusion.finish import finished, simplified, smoothed, with_normals_alone, without_small_holes
 from scopemap.engine.fusion.mesh_files import ply_bytes
@@ -152,6 +153,15 @@ def test_the_options_of_a_run(tmp_path: Path) -> None:
     fusion = Config.load(file=tmp_path / "run" / "config.toml").fusion
     assert (fusion.mesh_faces, fusion.mesh_smooth, fusion.colours, fusion.holes) == (900, 2, "raw", "small")
     assert 500 < len(trimesh.load(tmp_path / "run" / "mesh.ply", process=False).faces) <= 900
+
+
+@pytest.mark.parametrize("setting", ["fusion.max_depth_mm", "fusion.min_incidence"])
+def test_a_run_whose_frames_have_no_surface_ends_with_an_empty_mesh(tmp_path: Path, setting: str) -> None:
+    phantom = write_tiny(tmp_path / "phantom", frames=4)
+    config = Config.load(settings={"depth.backend": f"files:{phantom}", "fusion.voxel_mm": 1.0, setting: 0.999})
+    result = reconstruct(open_sequence(phantom), config, out=tmp_path / "run")
+    assert result.frames.tracked.all()
+    assert (len(result.mesh.faces), (tmp_path / "run" / "mesh.glb").exists()) == (0, False)
 
 
 def test_a_result_keeps_the_normals_of_its_mesh_and_none_of_their_computation() -> None:

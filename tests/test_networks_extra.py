@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from chosen_settings import chosen
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.cameras.rectification import Rectifier
@@ -42,7 +41,7 @@ CAMERA = PinholeCamera(40.0, 42.0, 28.0, 26.0, 61, 50)
 
 
 def _depth(backend: str) -> Callable[[], object]:
-    return lambda: create_depth(chosen(DepthSettings, backend=backend), Rectifier(CAMERA, CAMERA), "cpu")
+    return lambda: create_depth(DepthSettings(backend=backend), Rectifier(CAMERA, CAMERA), "cpu")
 
 
 @pytest.mark.parametrize(

@@ -105,10 +105,10 @@ def test_no_frame_is_called_lost_for_fitting_badly(fault: str) -> None:
     assert [_second(config, *shown).status for config in (PAPER, STRICT)] == ["lost", "ok"]
 
 
-@pytest.mark.parametrize(("method", "expected_mm"), [("paper", 50.0), ("paper+no-blend", 100.0)])
-def test_without_flow_the_previous_depth_is_blended_where_it_was(method: str, expected_mm: float) -> None:
-    """The ablation "- Optical Flow": the previous depth is blended unwarped, unless `mapis.method = paper+no-blend`."""
-    settings = Config.load("paper", settings={"mapis.method": method}).mapis
+@pytest.mark.parametrize(("blend", "expected_mm"), [("linear", 50.0), ("none", 100.0)])
+def test_without_flow_the_previous_depth_is_blended_where_it_was(blend: str, expected_mm: float) -> None:
+    """The ablation "- Optical Flow": the previous depth is blended unwarped, unless `mapis.blend = none`."""
+    settings = Config.load("paper", settings={"mapis.blend": blend}).mapis
     matcher, mapis, rgb = DenseMatcher(settings, create_flow("none", "cpu"), _Alike()), Mapis(settings), see(pose()).rgb
     for raw_mm in (50.0, 100.0):
         link = matcher.match(rgb, EVERYWHERE)

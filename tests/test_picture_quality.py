@@ -9,12 +9,10 @@ import cv2
 import numpy as np
 import plane_scene
 import pytest
-from chosen_settings import chosen
-from drawn_surfaces import LENIENT, plane_frame
+from drawn_surfaces import lenient, plane_frame
 from plane_scene import CAMERA, EVERYWHERE
 
 from scopemap.engine.config import MaskSettings, TrackingSettings
-from scopemap.engine.config.tracking import TRACKING
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
 from scopemap.engine.masking.masker import Masker
@@ -46,7 +44,7 @@ def _dark(much: float) -> np.ndarray:
 
 def _after_clear(rgb: np.ndarray) -> float:
     """The quality of a picture, masked as in a run, after ten clear ones."""
-    masker, quality = Masker(chosen(MaskSettings, overlays=False)), PictureQuality()
+    masker, quality = Masker(MaskSettings(overlays=False)), PictureQuality()
     frames = [masker(Frame(n, n / 30, shown, CAMERA, EVERYWHERE)) for n, shown in enumerate([TISSUE] * 10 + [rgb])]
     return [quality(frame.rgb, frame.valid) for frame in frames][-1]
 
@@ -85,7 +83,7 @@ def test_a_picture_without_a_usable_pixel_has_the_least_worth_and_is_no_measure_
 @pytest.mark.parametrize(("weighted", "mean_mm"), [(True, 4 * 0.1 / 3.1), (False, 1.0)])
 def test_an_unclear_frame_moves_the_surface_little(weighted: bool, mean_mm: float) -> None:
     """Three frames see the plane where it is; the depth of an unclear one is 4 mm off."""
-    settings = chosen(LENIENT, weighted=weighted)
+    settings = lenient(weighted=weighted)
     volume, ahead = TsdfVolume(settings), np.array([0.0, 0.0, 1.0])
     for _ in range(3):
         volume.integrate(plane_frame(ahead, 50.0))
@@ -106,13 +104,13 @@ def test_a_camera_at_rest_needs_no_other_keyframe() -> None:
 
 
 def test_every_nth_frame_is_a_keyframe_in_the_paper() -> None:
-    paper = {name: TRACKING["paper"][name] for name in ("min_keyframe_motion", "keyframe_patience")}
+    paper = {name: TrackingSettings.METHODS["paper"][name] for name in ("min_keyframe_motion", "keyframe_patience")}
     assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5], step_mm=0.02, **paper) == [0, 3, 6]
 
 
-def keyframes(qualities: list[float], step_mm: float = 0.5, **constants: float) -> list[int]:
+def keyframes(qualities: list[float], step_mm: float = 0.5, **settings: float) -> list[int]:
     """Return the frames that become keyframes, of every third, where the camera moves by `step_mm` a frame."""
-    tracker, found = Tracker(chosen(TrackingSettings, keyframe_every=3, **constants)), list[int]()
+    tracker, found = Tracker(TrackingSettings(keyframe_every=3, **settings)), list[int]()
     for n, quality in enumerate(qualities):
         view = plane_scene.see(plane_scene.pose(at_mm=(step_mm * n, 0.0, 0.0)))
         frame = Frame(n, n / 30, view.rgb, CAMERA, EVERYWHERE, view.depth_mm, quality=quality)

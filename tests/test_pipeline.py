@@ -137,7 +137,7 @@ def test_truth_changes_nothing(folder: Path, tmp_path: Path) -> None:
 def test_a_black_frame_is_lost_and_tracking_resumes(interrupted: Path, tmp_path: Path) -> None:
     steps: list[Step] = []
     # Measured depth alone needs no correspondence.
-    config = with_true_depth(interrupted, mapis__advanced__frame_scale="robust")
+    config = with_true_depth(interrupted, mapis__frame_scale="robust")
     result = reconstruct(open_sequence(interrupted), config, observers=(steps.append,), out=tmp_path / "out")
     assert _status(result) == ["initial", *OK[1:4], "lost", *OK[5:]]
     rows = (tmp_path / "out" / "frames.csv").read_text().splitlines()
@@ -200,8 +200,8 @@ def test_every_preset_tracks_all_frames(preset: str, folder: Path) -> None:
 def test_the_warped_depth_is_moved_only_where_the_motion_is_known(order: str, moved: bool, tmp_path: Path) -> None:
     """A wall that the camera approaches by 2 mm a frame: without the motion its values are warped as they are."""
     sequence = open_sequence(_approach(tmp_path / "wall", step_mm=2.0))
-    depth = {"depth__files_kind": "depth", "mapis__paper__blend": "constant", "mapis__paper__constant_weight": 1.0}
-    plain = {"mapis__paper__order": order, "mapis__advanced__frame_scale": "none", "mapping__method": "none"}
+    depth = {"depth__files_kind": "depth", "mapis__blend": "constant", "mapis__constant_weight": 1.0}
+    plain = {"mapis__order": order, "mapis__frame_scale": "none", "mapping__method": "none"}
     config = with_true_depth(tmp_path / "wall", **(WITHOUT_NETWORKS | depth | plain))
     steps: list[Step] = []
     assert _status(reconstruct(sequence, config, observers=(steps.append,))) == ["initial", "ok", "ok"]

@@ -47,7 +47,7 @@ def test_depth_that_mapis_changed_is_not_compared_with_what_is_measured(
         return real(self, frame, measured=measured)
 
     monkeypatch.setattr(Tracker, "insert_keyframe", insert_keyframe)
-    changes = {"depth__files_kind": "measured", "mapis__advanced__frame_scale": scaled}
+    changes = {"depth__files_kind": "measured", "mapis__frame_scale": scaled}
     reconstruct(open_sequence(phantom), with_true_depth(phantom, **SETTINGS | changes))
     assert inserted
     assert set(inserted) == {speaks}

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scopemap.engine.config import MappingSettings
-from scopemap.engine.config.mapping import MappingConstants
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import se3, so3_exp
@@ -53,8 +52,8 @@ def test_each_map_keeps_its_first_keyframe_and_has_a_drift_of_its_own() -> None:
 @pytest.mark.parametrize("refused", [False, True])
 def test_every_map_gets_the_millimetres_of_the_network(anchored: bool, refused: bool) -> None:
     """Two maps apart: the chain of scales has come to 1.3 in the first, and begins with 6 in the second."""
-    constants = MappingConstants(max_sigma_px=1e-3 if refused else MappingConstants().max_sigma_px)
-    backend = Backend(MappingSettings(constants=constants), DisFlow(), anchored=anchored)
+    settings = MappingSettings(max_sigma_px=1e-3) if refused else MappingSettings()
+    backend = Backend(settings, DisFlow(), anchored=anchored)
     chained, poses = (1.3, 6.0), []
     for n in range(12):
         number = n // 6
@@ -85,7 +84,7 @@ def test_the_adjustment_does_not_bring_the_drift_back() -> None:
             T, factor = T_true.copy(), float(np.exp(log_scale[n]))
             T[:3, 3] = true[0][:3, 3] + steps[:n].sum(0)
             frames.append(replace(plane_scene.frame(T_true, n, T, factor), depth_scale=factor if known else 1.0))
-        correction = plane_scene.adjusted(frames, MappingSettings(constants=MappingConstants(keyframe_gaps=(1,))))
+        correction = plane_scene.adjusted(frames, MappingSettings(keyframe_gaps=(1,)))
         assert not correction.refused
         factor = np.log([correction.depth_factor(n) for n in range(40)]) + log_scale
         spread.append(np.ptp(factor))

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chosen_settings import chosen
 from drawn_inputs import number_in, poses, write_sevenscenes
 
 from scopemap.engine.config import DepthSettings
@@ -21,7 +20,7 @@ def test_sevenscenes_bring_depth_and_poses_to_the_colour_camera(tmp_path: Path) 
     assert sequence.source.name == "7-scenes"
     assert sequence.camera.fx == pytest.approx(525 / 2)
     assert any("depth camera" in note for note in sequence.notes)
-    files = create_depth(chosen(DepthSettings, backend=f"files:{folder}"), sequence.depth_rectifier, "cpu")
+    files = create_depth(DepthSettings(backend=f"files:{folder}"), sequence.depth_rectifier, "cpu")
     for (frame, truth), T_world_depth in zip(sequence, poses(3), strict=True):
         assert number_in(frame.rgb) == frame.index
         # The colour camera sits 25 mm to the depth camera's right.

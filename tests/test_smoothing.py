@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chosen_settings import chosen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,7 +15,7 @@ ALPHA, BETA, GAMMA = 0.5, 0.3, 0.2
 
 
 def _wema(dynamic: bool = True, omega: float = 0.1) -> SmoothingSettings:
-    return chosen(SmoothingSettings, method="wema", alpha=ALPHA, beta=BETA, gamma=GAMMA, omega=omega, dynamic=dynamic)
+    return SmoothingSettings(method="wema", alpha=ALPHA, beta=BETA, gamma=GAMMA, omega=omega, dynamic=dynamic)
 
 
 def _at(position_mm: np.ndarray) -> np.ndarray:

@@ -7,7 +7,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from chosen_settings import chosen
 
 from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
@@ -21,7 +20,7 @@ from scopemap_bench.phantom.spec import PhantomSpec
 SPEC = PhantomSpec(scene="colon", frames=12, width=160, height=128, seed=4)
 # By what is seen alone: measured depth of the frames would hide what these tests look at.
 PLAIN = {"finest_level": 0, "depth_weight": 0.0}
-SETTINGS = chosen(TrackingSettings, **PLAIN)
+SETTINGS = TrackingSettings(**PLAIN)
 
 
 @cache
@@ -78,7 +77,7 @@ def test_alignment_finds_the_true_motion() -> None:
 def test_every_ablation_tracks_and_changes_the_result(changes: dict[str, object]) -> None:
     frames, truth = _sequence()
     plain = _track_all(SETTINGS, frames)
-    poses = _track_all(chosen(TrackingSettings, **PLAIN | changes), frames)
+    poses = _track_all(TrackingSettings(**PLAIN | changes), frames)
     moved_mm, turned_deg = _errors(poses[-1], truth[-1])
     assert moved_mm < 0.6
     assert turned_deg < 1.0
@@ -111,7 +110,7 @@ def test_a_jump_is_believed_only_where_many_features_confirm_it() -> None:
     frames, truth = _sequence()
     tracks = []
     for searched in (0, 10):
-        tracker = Tracker(chosen(TrackingSettings, **PLAIN, max_step=1e-4, relocalisation_keyframes=searched))
+        tracker = Tracker(TrackingSettings(**PLAIN, max_step=1e-4, relocalisation_keyframes=searched))
         first = tracker.track(frames[0])
         tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
         tracks.append(tracker.track(frames[4]))
@@ -124,7 +123,7 @@ def test_a_jump_is_believed_only_where_many_features_confirm_it() -> None:
 @pytest.mark.parametrize(("share", "wanted"), [(0.7, True), (0.0, False)])
 def test_a_fading_keyframe_is_replaced_before_its_turn(share: float, wanted: bool) -> None:
     frames, _ = _sequence()
-    tracker = Tracker(chosen(TrackingSettings, **PLAIN, min_keyframe_agreement=share))
+    tracker = Tracker(TrackingSettings(**PLAIN, min_keyframe_agreement=share))
     first = tracker.track(frames[0])
     tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
     tracker.track(frames[1])

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from chosen_settings import configured
 
 from scopemap.engine.config import Config
 from scopemap.engine.geometry.se3 import inverse
@@ -27,7 +26,7 @@ def write_tiny(folder: Path, events: str = "", frames: int = FRAMES) -> Path:
 def with_true_depth(folder: Path, preset: str = "default", **changes: object) -> Config:
     """Settings that take the depth of `folder`; `tracking__keyframe_every=2` is tracking.keyframe_every=2."""
     given = {key.replace("__", "."): value for key, value in changes.items()}
-    return configured({"depth.backend": f"files:{folder}", **given}, preset)  # type: ignore[arg-type]
+    return Config.load(preset, settings={"depth.backend": f"files:{folder}", **given})  # type: ignore[arg-type]
 
 
 def true_poses(folder: Path, first: int = 0) -> np.ndarray:

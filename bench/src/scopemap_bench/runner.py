@@ -109,7 +109,7 @@ def _seconds(entry: Entry, frames: int) -> float:
     flow, networks, mapis = config.networks.flow, config.networks, config.mapis
     per_frame = _TRACKING_S + _SCORING_S + _DEPTH_S.get(config.depth.backend, 0.0)
     per_frame += _FLOW_S.get(networks.keyframe_flow, 0.0)
-    if (mapis.constants.blend, mapis.constants.frame_scale) != ("none", "none"):
+    if (mapis.blend, mapis.frame_scale) != ("none", "none"):
         per_frame += _FLOW_S.get(flow, 0.0) + _PERCEPTUAL_S[networks.perceptual]
     once = _START_S + (_DEPTH_S["depth-pro"] if config.depth.anchor == "depth-pro" else 0.0)
     return once + frames * per_frame + _SURFACE_S * entry.protocol.surface

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from scopemap.engine.errors import ScopemapError
 from scopemap.engine.notices import Notice
 
-_MOST_FAULTS = 3  # frames that may fail
-_MOST_FAULTS_SHARE = 0.05  # more are no accident
+_MOST_FAULTS = 3  # by hand: frames that may fail
+_MOST_FAULTS_SHARE = 0.05  # by hand: more are no accident
 
 
 class StageFaults:

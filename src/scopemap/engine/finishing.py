@@ -110,7 +110,7 @@ class SubmapFinishing:
 
     def carve(self) -> None:
         """Find what frames look through; the pixels that show it are left out."""
-        if self._fusion.settings.constants.free_space:
+        if self._fusion.settings.free_space:
             some = views_among(list(self._final.T_world_camera))
             self._free_space = FreeSpace(self._final.frames(None, among=some))
 
@@ -158,7 +158,7 @@ class SubmapFinishing:
     def _triangulation(self, camera: PinholeCamera) -> KeyframeDepths | None:
         """Return what triangulates the depth of keyframes; None where nothing can."""
         final, flow = self._final, self._pipeline.estimators.keyframe_flow
-        wanted = self._pipeline.config.mapping.constants.triangulate_depth
+        wanted = self._pipeline.config.mapping.triangulate_depth
         if not (wanted and final.keyframes) or flow.name == "none":
             return None
         return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow, self._states)

@@ -17,12 +17,12 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import check_shape
 
-REGIONS = 6, 8
+REGIONS = 6, 8  # by hand
 """Rows and columns of the regions of a picture whose tissue is looked at for motion of its own."""
 
-_CONSTANT_RANGE = 4
+_CONSTANT_RANGE = 4  # by hand: grey levels by which a picture of one colour varies, for lossy coding
 # Width of the box filter that leaves little of a sensor's noise.
-_NOISE_WIDTH_PX = 9
+_NOISE_WIDTH_PX = 9  # by hand
 TruthQuality = Literal["exact", "registered", "kinematic", "sfm", "stereo", "predicted"]
 
 

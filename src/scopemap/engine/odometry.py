@@ -86,7 +86,7 @@ class Odometry:
         return step
 
     def _track(self, preprocessed: PreprocessedFrame) -> Step:
-        refined = self._refine(preprocessed, None) if self._config.mapis.constants.order == "refine-first" else None
+        refined = self._refine(preprocessed, None) if self._config.mapis.order == "refine-first" else None
         track, last = self._tracker.track(preprocessed.frame), self._last_track
         if preprocessed.skipped and track.status == "lost":
             return self._without_pose(preprocessed, track)

@@ -52,7 +52,7 @@ class Pipeline:
         mapping = MappingSettings(method="none") if config.tracking.camera_at_rest else config.mapping
         features, anchored = estimators.features, config.depth.is_anchored
         mapper = Mapper(mapping, estimators.keyframe_flow, store.table, features, anchored)
-        local = mapping.constants.local_window and estimators.keyframe_flow.name != "none"
+        local = mapping.local_window and estimators.keyframe_flow.name != "none"
         # In the tracker's thread, so with its flow: that between keyframes is the back end's.
         adjustment = LocalAdjustment(mapping, estimators.corner_flow) if local else None
         self.odometry = Odometry(config, tracker, mapper, adjustment)

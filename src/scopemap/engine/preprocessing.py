@@ -90,7 +90,7 @@ class Preprocessing:
         self.skipped: Counter[str] = Counter()
         """How many frames were skipped, by the cause of their loss."""
         from_files = config.depth.backend.startswith("files:") or config.mask.instruments == "auto"
-        self._turns = DepthTurns(1 if from_files else config.depth.constants.network_every)
+        self._turns = DepthTurns(1 if from_files else config.depth.network_every)
         self._needs_previous = Mapis(config.mapis).needs_previous
 
     @property

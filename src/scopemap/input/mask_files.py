@@ -32,7 +32,7 @@ def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None 
         raise SettingsError(f"mask.instruments=off contradicts mask.files={settings.files}: leave one of them out")
     if folder is None or settings.instruments == "off":
         return None
-    return MaskFiles(folder, rectifier, settings.constants.files_grow_px)
+    return MaskFiles(folder, rectifier, settings.files_grow_px)
 
 
 class MaskFiles:

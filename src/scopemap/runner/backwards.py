@@ -26,7 +26,7 @@ def track_backwards(pipeline: Pipeline, frames: FrameTable) -> None:
     lost cameras not looked for.
     """
     config, rows = pipeline.config, frames.rows
-    looked_for = config.tracking.constants.relocalisation_keyframes > 0 and config.smoothing.method == "none"
+    looked_for = config.tracking.relocalisation_keyframes > 0 and config.smoothing.method == "none"
     if not (looked_for and pipeline.fusion.at_end and pipeline.mapper.adjusts):
         return
     for place in range(1, len(rows)):
@@ -74,7 +74,7 @@ def _tracked_from(pipeline: Pipeline, start: np.void, earlier: np.ndarray) -> It
         track = tracker.track(replace(frame, T_world_camera=None))
         failed = failed + 1 if track.status == "lost" else 0
         # A new map would have nothing to do with the first frame.
-        if track.map or failed > pipeline.config.tracking.constants.new_map_after or (failed and was_tracked):
+        if track.map or failed > pipeline.config.tracking.new_map_after or (failed and was_tracked):
             return
         if failed:
             continue

@@ -86,4 +86,4 @@ def create_anchor(settings: DepthSettings, device: str) -> AnchoredDepth:
 def _depth_pro(model: str, settings: DepthSettings, device: str) -> DepthEstimator:
     from scopemap.engine.depth.depth_pro import DepthPro
 
-    return DepthPro.from_folder_or_hub(model, device, use_known_focal=settings.constants.depth_pro_focal == "camera")
+    return DepthPro.from_folder_or_hub(model, device, use_known_focal=settings.depth_pro_focal == "camera")

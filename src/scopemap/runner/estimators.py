@@ -99,7 +99,7 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
     """
     if isinstance(estimators.depth, FilesDepth | StereoDepth) and estimators.depth.measured_max_mm:
         return estimators.depth.measured_max_mm
-    mapping, log_factor = config.mapping.constants, 0.0
-    if config.mapping.method != "none":
+    mapping, log_factor = config.mapping, 0.0
+    if mapping.adjusts:
         log_factor = 3 * mapping.scale_sigma + (MAX_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
     return math.exp(log_factor) * max_depth_mm(config.depth)

@@ -32,7 +32,7 @@ class SurfaceWriter:
         if frame.T_world_camera is None:
             return
         step_px = depth_downscale(self._config.depth, max(frame.valid.shape))
-        mesh = depth_mesh(frame, step_px, max(self._config.fusion.constants.min_incidence, 0.05))
+        mesh = depth_mesh(frame, step_px, max(self._config.fusion.min_incidence, 0.05))
         with reporting(f"cannot write to {self._folder}"):
             self._folder.mkdir(parents=True, exist_ok=True)
             scale = scale_words(scale_facts(self._estimators))

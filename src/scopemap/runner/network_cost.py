@@ -6,7 +6,6 @@ pixels of an eighth of the working size: a part of its time, and nearly all of i
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from scopemap.engine.config import Config
@@ -29,9 +28,9 @@ _DEPTH_GB = {"depth-anything": 0.4, "depth-pro": 6.0}
 
 def network_cost(config: Config, sequence: Sequence) -> str:
     """Return about how much time and memory a run will need; "" without such networks, and with them on a GPU."""
-    networks, mapis, depth = config.networks, config.mapis.constants, config.depth
+    networks, mapis, depth = config.networks, config.mapis, config.depth
     refines = (mapis.blend, mapis.frame_scale) != ("none", "none")
-    flows = [networks.flow] * (1 if math.isinf(mapis.consistency_px) else 2) * refines + [networks.keyframe_flow] * 2
+    flows = [networks.flow] * (2 if mapis.consistency_px else 1) * refines + [networks.keyframe_flow] * 2
     anchor, every_frame = [depth.anchor] * (depth.anchor != depth.backend), [depth.backend]
     perceptual = [networks.perceptual] * refines
     used = {*flows, *anchor, *every_frame, *perceptual} & {*_FLOW_S, *_DEPTH_S, *_PERCEPTUAL_S}

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from scopemap.engine.config.tracking import TrackingConstants, TrackingSettings
+from scopemap.engine.config.tracking import TrackingSettings
 from scopemap.engine.errors import SettingsError
 from scopemap.engine.frame import Frame
 from scopemap.engine.tracking.track import FrameTracker, Track
@@ -41,14 +41,29 @@ ICP_METHODS = {
 }
 """Open3D's classes by the name of the method."""
 
-_CONSTANTS: dict[str, Any] = {
-    **{"min_sharpness": 0.0, "relocalisation_keyframes": 0, "search_every": 1, "new_map_after": 0},
-    **{"corner_depth_sigma": 0.0, "min_keyframe_agreement": 0.0, "levels": 2, "finest_level": 0, "max_iterations": 30},
-    **{"huber": 1.345, "depth_weight": 0.0, "min_inlier_share": 0.0, "min_correlation": -1.0},
-    **{"max_step": 1e9, "solver": "gauss-newton", "rotation_first": True, "start": "identity"},  # no step is that long
-    **{"channels": "grey", "lamp_gamma": 0.0, "gain_bias": False},
-}
-SETTINGS = TrackingSettings(keyframe_every=2, constants=TrackingConstants(**_CONSTANTS))
+SETTINGS = TrackingSettings(
+    keyframe_every=2,
+    min_sharpness=0.0,
+    relocalisation_keyframes=0,
+    search_every=1,
+    new_map_after=0,
+    corner_depth_sigma=0.0,
+    min_keyframe_agreement=0.0,
+    levels=2,
+    finest_level=0,
+    max_iterations=30,
+    huber=1.345,
+    depth_weight=0.0,
+    min_inlier_share=0.0,
+    min_correlation=-1.0,
+    max_step=1e9,  # no step is that long
+    solver="gauss-newton",
+    rotation_first=True,
+    start="identity",
+    channels="grey",
+    lamp_gamma=0.0,
+    gain_bias=False,
+)
 """Settings of our tracker for this method; all others have no effect or only detect empty images."""
 _MIN_USABLE_SHARE = 0.1  # of the image, the default of our own tracker
 

@@ -22,8 +22,12 @@ from scopemap_bench.methods.imported import ImportedTrajectory
 from scopemap_bench.plan import MethodPlan
 
 # Baselines get depth as it is and keep poses as tracked: consistency over time is a part of our method alone.
-PLAIN = {"smoothing.method": "none", "mapping.method": "none"}
-_PLAIN_DEPTH = "+no-frame-scale+no-blend"
+PLAIN = {
+    "smoothing.method": "none",
+    "mapping.method": "none",
+    "mapis.frame_scale": "none",
+    "mapis.blend": "none",
+}
 
 BASELINES: dict[str, Callable[[], FrameTracker]] = {
     "endo-depth-and-motion": create_endo_depth_and_motion,
@@ -44,10 +48,7 @@ class PipelineMethod:
 
     def config(self, settings: Mapping[str, Any]) -> Config:
         """Return the preset, then the shared `settings` (it cannot replace a depth that they name), then its own."""
-        config = Config.load(self.plan.preset, settings={**settings, **self.plan.settings})
-        if self.plan.use == "scopemap":
-            return config
-        plain = PLAIN | {"mapis.method": config.mapis.method + _PLAIN_DEPTH}
+        plain = {} if self.plan.use == "scopemap" else PLAIN
         return Config.load(self.plan.preset, settings={**settings, **self.plan.settings, **plain})
 
     def missing(self, settings: Mapping[str, Any]) -> str:

@@ -23,11 +23,11 @@ from scopemap_bench.scripts.clinical_phantoms import FRAMES, PHANTOMS, SEED
 from scopemap_bench.scripts.real import depth_figures
 
 NAME = "dark omentum before a lit wall, narrow beam, 45 degrees, sideways"
-ROWS = {
-    "neither": "no-windows+one-start",
-    "windows": "one-start",
-    "other starts": "no-windows",
-    "both (default)": "full",
+ROWS: dict[str, tuple[str, ...]] = {
+    "neither": ("--set", "mapping.local_window=0", "--set", "mapping.other_starts=false"),
+    "windows": ("--set", "mapping.other_starts=false"),
+    "other starts": ("--set", "mapping.local_window=0"),
+    "both (default)": (),
 }
 SHOWN = 60  # frame of the picture
 
@@ -61,8 +61,8 @@ def main() -> None:
         source = measuring.phantom(out / "inside-out", "--frames", FRAMES, "--seed", SEED, *PHANTOMS[NAME])
         measuring.print_head("used", "AbsRel / correlation", "ATE RMSE mm", "said")
         runs = {name: out / f"inside-out-{place}" for place, name in enumerate(ROWS)}
-        for name, method in ROWS.items():
-            run = measuring.run_once(source, runs[name], "--set", f"mapping.method={method}")
+        for name, settings in ROWS.items():
+            run = measuring.run_once(source, runs[name], *settings)
             depth = depth_figures(Result(run), source, None)
             path = measuring.evaluated(run, "--truth", source, "--align", "sim3")
             said = [n.code for n in notices_of(measuring.provenance(run)) if n.code.startswith(("shape", "mapping"))]

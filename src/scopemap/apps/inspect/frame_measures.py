@@ -77,7 +77,7 @@ class FrameInspector:
     def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> InspectedFrame:
         """Return the picture (H, W, 3) uint8 at a position, with the frame that a run makes of it, measured."""
         small = shrunk(rgb, _SMALL_PX)
-        lit = is_lit(small, _MASK.constants.dark_level)
+        lit = is_lit(small, _MASK.dark_level)
         field, masked = self._field(lit, np.ones_like(lit)), self._masker(frame)
         inside = field if field.any() else np.ones_like(field)
         darkest, middle = darker_channels(small)

@@ -20,9 +20,9 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 
 # Rays are written with z = 1, so a field must end before 90 deg: here at 88.9 deg.
 _WIDEST_RAD = float(np.arctan(50.0))
-_ANGLES_RAD = np.linspace(0, _WIDEST_RAD, 1024)
-_MAX_STEPS = 60
-_SMALL_STEP = 1e-9  # of the grid, to see whether a function increases
+_ANGLES_RAD = np.linspace(0, _WIDEST_RAD, 1024)  # where inversions look: every tenth of a degree, by hand
+_MAX_STEPS = 60  # guard: of an inversion that does not end
+_SMALL_STEP = 1e-9  # guard: of the grid, to see whether a function increases
 
 _Function = Callable[[np.ndarray], np.ndarray]
 

@@ -12,8 +12,8 @@ import numpy as np
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera, source_pixel
 from scopemap.engine.errors import CalibrationError, check_shape
 
-LONGEST_SIDE_PX = 400
-_BLUR_PER_SHRINK = 0.4
+LONGEST_SIDE_PX = 400  # by hand: the default of `input.longest_side_px`
+_BLUR_PER_SHRINK = 0.4  # by hand: sigma of the blur against aliasing, px per factor of shrinking
 
 
 def working_size(width: int, height: int, longest_side_px: int = LONGEST_SIDE_PX) -> tuple[int, int]:

@@ -3,7 +3,8 @@
 Order of precedence: defaults < preset < TOML file < single settings (`--set fusion.every=2`); the preset itself may be
 named by any of them. A range of depth (`depth.near_far_mm`) becomes the anchor unless the same source names another
 one, and another `depth.backend` than the preset's does not get the preset's `depth.model`. An unknown key is an error
-that names the nearest key. Each stage's `method` names a set of its constants.
+that names the nearest key. Each stage's `method` chooses its advanced settings; one that is given itself counts before
+the method, but a later source that names a method replaces what earlier ones have for these.
 
 METHOD below is arXiv 2508.11282. It publishes none of its constants (section "WEMA-RTDL"): those of the tracker were
 chosen by trial on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are
@@ -23,7 +24,7 @@ from scopemap.engine.config.depth import DepthSettings, MapisSettings, NetworkSe
 from scopemap.engine.config.input import InputSettings, MaskSettings
 from scopemap.engine.config.mapping import FusionSettings, MappingSettings
 from scopemap.engine.config.presets import PRESETS
-from scopemap.engine.config.settings import Settings, hint
+from scopemap.engine.config.settings import Settings, StageSettings, hint
 from scopemap.engine.config.tracking import SmoothingSettings, TrackingSettings
 from scopemap.engine.errors import SettingsError
 
@@ -77,8 +78,7 @@ class Config(Settings):
         try:
             return cls.model_validate(tree)
         except ValidationError as error:
-            found = [item for item in error.errors() if item["type"] != "default_factory_not_called"]
-            raise SettingsError("; ".join(map(explain, found))) from None
+            raise SettingsError("; ".join(map(explain, error.errors()))) from None
 
     @classmethod
     def chosen(cls, config: Config | str | None) -> Config:
@@ -118,9 +118,10 @@ def _flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of a preset and of other sources, of which later ones win.
 
-    Another backend does not get the preset's weights, a range of depth replaces an earlier anchor, and the use of two
-    views an earlier backend.
+    Another backend does not get the preset's weights, a range of depth replaces an earlier anchor, the use of two views
+    an earlier backend, and a method what earlier sources have for the advanced settings of its stage.
     """
+    methods_advanced = _advanced_of_methods()
     flat = dict(preset)
     for source in others:
         if str(source.get("input.stereo", "")).startswith("use"):
@@ -128,11 +129,18 @@ def _merged(preset: dict[str, Any], *others: dict[str, Any]) -> dict[str, Any]:
         other_network = source.get("depth.backend") not in (None, preset.get("depth.backend"))
         if other_network and flat.get("depth.model") == preset.get("depth.model"):
             flat.pop("depth.model", None)
-        flat |= source
+        replaced = {name for method in source.keys() & methods_advanced.keys() for name in methods_advanced[method]}
+        flat = {name: value for name, value in flat.items() if name not in replaced} | source
         has_range = source.get("depth.near_far_mm") is not None and "depth.anchor" not in source
         if has_range and flat.get("depth.anchor", "auto") != "auto":
             flat["depth.anchor"] = "near-far"
     return flat
+
+
+def _advanced_of_methods() -> dict[str, frozenset[str]]:
+    """Return the dotted names of the advanced settings that each stage's method chooses, by that of the method."""
+    stages = [(stage, part) for stage, part in Config() if isinstance(part, StageSettings)]
+    return {f"{stage}.method": frozenset(f"{stage}.{name}" for name in part.sources()) for stage, part in stages}
 
 
 def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:

@@ -2,48 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from scopemap.engine.config.settings import Settings, StageSettings, constants_of
-
-
-@dataclass(frozen=True)
-class DepthConstants:
-    """Constants of the metric anchor and of shading depth."""
-
-    reanchor_every: int = 0  # fit the metric anchor every n-th frame, best a multiple of keyframe_every; 0: once
-    shading_exponent: float = 0.6  # distance = k * brightness^-exponent
-    fit_shift: bool = True  # fit scale and shift to the anchor; False: the pseudo-stereo baseline
-    # Pixels below this share of the largest disparity (the far end) are left out of the fit of the pseudo-stereo
-    # baseline; 0: only those without disparity (the paper).
-    disparity_floor: float = 0.1
-    # Focal length that scales Depth Pro's depth: of the frames' camera, or the one that Depth Pro finds (the paper).
-    depth_pro_focal: Literal["camera", "network"] = "camera"
-    network_every: int = 1  # the network looks at every n-th frame; flow carries its depth to those between
-    factor: float = 30.0  # anchor = factor: the nearest tissue of frame 1 is at 1000 mm / factor
-
-
-DEPTH: dict[str, dict[str, Any]] = {
-    "scopemap": {},
-    "paper": {"fit_shift": False},
-    "no-disparity-floor": {"disparity_floor": 0.0},
-    "network-focal": {"depth_pro_focal": "network"},
-    "factor-100": {"factor": 100.0},
-    "factor-1000": {"factor": 1000.0},
-    "reanchored": {"reanchor_every": 10},
-    "realtime": {"network_every": 2},
-}
+from scopemap.engine.config.settings import Methods, Settings, Share, StageSettings, advanced
 
 
 class DepthSettings(StageSettings):
     """Where depth comes from and what fixes its scale."""
 
-    METHODS = DEPTH
-    method: str = Field("scopemap", description="constants of the metric anchor")
+    METHODS: ClassVar[Methods] = {
+        "scopemap": {},
+        "paper": {"fit_shift": False},
+        "no-disparity-floor": {"disparity_floor": 0.0},
+        "network-focal": {"depth_pro_focal": "network"},
+        "realtime": {"network_every": 2},
+    }
+    method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, realtime, paper, ...")
     backend: str = Field(
         "scopenet",
         description="scopenet | shading | depth-anything | depth-pro | files:FOLDER | stereo (of input.stereo=use)",
@@ -72,7 +48,35 @@ class DepthSettings(StageSettings):
     max_depth_mm: float = Field(
         300.0, gt=0, description="predicted depth beyond this is unknown, unless near-far names a farther one, mm"
     )
-    constants: DepthConstants = constants_of(DepthConstants(), DEPTH)
+
+    reanchor_every: NonNegativeInt = advanced(
+        0, "fit the metric anchor every n-th frame, best a multiple of keyframe_every; 0: once", "METHOD: once"
+    )
+    shading_exponent: Annotated[float, Field(gt=0, le=1)] = advanced(
+        0.6,
+        "depth from shading: distance = k * brightness^-exponent",
+        "chosen on the real frames of scopemap_bench.scripts.depth_without_download; an inverse square gives 0.5",
+    )
+    fit_shift: bool = advanced(
+        True, "fit scale and shift to the anchor; false: the pseudo-stereo baseline (the paper)", "by hand"
+    )
+    disparity_floor: Annotated[float, Field(ge=0, lt=1)] = advanced(
+        0.1,
+        "pixels below this share of the largest disparity (the far end) are left out of the fit of the pseudo-stereo "
+        "baseline; 0: only those without disparity (the paper)",
+        "by hand",
+    )
+    depth_pro_focal: Literal["camera", "network"] = advanced(
+        "camera",
+        "focal length that scales Depth Pro's depth: the camera's, or the one that Depth Pro finds (the paper)",
+        "Depth Pro's formula, depth = f / (W c)",
+    )
+    network_every: PositiveInt = advanced(
+        1, "the network looks at every n-th frame; flow carries its depth to those between", "METHOD: every frame"
+    )
+    factor: PositiveFloat = advanced(
+        30.0, "anchor = factor: the nearest tissue of frame 1 is at 1000 mm / factor", "table 3 of the paper"
+    )
 
     @property
     def is_anchored(self) -> bool:
@@ -80,53 +84,70 @@ class DepthSettings(StageSettings):
         return self.near_far_mm is not None or self.anchor not in ("auto", self.backend)
 
 
-@dataclass(frozen=True)
-class MapisConstants:
-    """Constants of depth consistency."""
-
-    # Scale of each frame's depth: robust: median ratio to the warped previous depth; none: 1; auto: robust for
-    # predicted depth, none for measured.
-    frame_scale: Literal["auto", "none", "robust"] = "auto"
-    # Share of ln of that scale removed per frame where no pixel has a warped depth; decreases with the square of the
-    # warped share; 0: off.
-    scale_pull: float = 0.1
-    sigma_fading: float = 0.3  # growth of the warped depth's variance per frame, share of its gap to the frame's
-    filter_sigma_px: float = 2.0  # sigma_d of the bilateral filter; 0: off
-    filter_sigma_mm: float = 2.0  # sigma_r of the bilateral filter
-    consistency_px: float = 1.0  # largest forward-backward error of flow; inf: not checked (the paper)
-    # refine-first: warp depth values unchanged, then track (the paper).
-    order: Literal["track-first", "refine-first"] = "track-first"
-    # Weight of the warped depth; auto: linear for predicted depth, none for measured.
-    blend: Literal["auto", "none", "exponential", "linear", "constant", "paper-equation"] = "auto"
-    tau: float = 0.15  # exponential blend: LPIPS distance at which the weight is 1/e
-    constant_weight: float = 0.5  # constant blend: weight of the warped depth
-    recursive: bool = True  # warp the refined previous depth; False: the raw one (the paper)
-    compare_warped: bool = True  # perceptual distance to the warped previous image; False: as it is (the paper)
-    perceptual_score: bool = False  # one perceptual score per pair instead of a map (the paper)
-
-
-MAPIS: dict[str, dict[str, Any]] = {
-    "scopemap": {},
-    "paper": {
-        **{"frame_scale": "none", "order": "refine-first", "blend": "linear"},
-        **{"recursive": False, "compare_warped": False, "perceptual_score": True},
-    },
-    "no-flow-check": {"consistency_px": math.inf},
-    "no-frame-scale": {"frame_scale": "none"},
-    "no-blend": {"blend": "none"},
-    "exponential-blend": {"blend": "exponential"},
-    "constant-blend": {"blend": "constant"},
-    "paper-equation": {"blend": "paper-equation"},
-    "refine-first": {"order": "refine-first"},
-}
-
-
 class MapisSettings(StageSettings):
     """Depth consistency over time (METHOD section MAPIS-Depth)."""
 
-    METHODS = MAPIS
-    method: str = Field("scopemap", description="constants of depth consistency")
-    constants: MapisConstants = constants_of(MapisConstants(), MAPIS)
+    METHODS: ClassVar[Methods] = {
+        "scopemap": {},
+        "paper": {
+            "frame_scale": "none",
+            "order": "refine-first",
+            "blend": "linear",
+            "recursive": False,
+            "compare_warped": False,
+            "perceptual_score": True,
+        },
+        "no-flow-check": {"consistency_px": 0.0},
+    }
+    method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, paper, ...")
+
+    frame_scale: Literal["auto", "none", "robust"] = advanced(
+        "auto",
+        "scale of each frame's depth, robust: median ratio to the warped previous depth; none: 1 (the paper); auto: "
+        "robust for predicted depth, none for measured",
+        "by hand: a network's scale changes from frame to frame",
+    )
+    scale_pull: Share = advanced(
+        0.1,
+        "share of ln of that scale removed per frame where no pixel has a warped depth; decreases with the square of "
+        "the warped share; 0: off",
+        "by hand",
+    )
+    sigma_fading: Share = advanced(
+        0.3, "growth of the warped depth's variance per frame, share of its gap to the frame's", "by hand"
+    )
+    filter_sigma_px: NonNegativeFloat = advanced(
+        2.0, "sigma_d of the bilateral filter; 0: off", "plausible, not searched; METHOD gives none"
+    )
+    filter_sigma_mm: PositiveFloat = advanced(
+        2.0, "sigma_r of the bilateral filter", "plausible, not searched; METHOD gives none"
+    )
+    consistency_px: NonNegativeFloat = advanced(
+        1.0, "largest forward-backward error of flow; 0: not checked (the paper)", "by hand"
+    )
+    order: Literal["track-first", "refine-first"] = advanced(
+        "track-first",
+        "refine-first: warp depth values unchanged, then track (the paper); track-first: move the warped depth by the "
+        "tracked motion",
+        "by hand: values change with the motion along the axis",
+    )
+    blend: Literal["auto", "none", "exponential", "linear", "constant", "paper-equation"] = advanced(
+        "auto",
+        "weight of the warped depth, with the perceptual distance S; linear: 1 - S; exponential: exp(-S / tau); "
+        "paper-equation: S; auto: linear for predicted depth, none for measured",
+        "linear: METHOD section MAPIS-Depth, by its text; better than exponential wherever it was tried",
+    )
+    tau: PositiveFloat = advanced(
+        0.15, "exponential blend: distance at which the weight is 1/e", "plausible, not searched; METHOD gives none"
+    )
+    constant_weight: Share = advanced(
+        0.5, "constant blend: weight of the warped depth", "by hand, for the ablation without LPIPS"
+    )
+    recursive: bool = advanced(True, "warp the refined previous depth; false: the raw one (the paper)", "by hand")
+    compare_warped: bool = advanced(
+        True, "perceptual distance to the warped previous image; false: to the image as it is (the paper)", "by hand"
+    )
+    perceptual_score: bool = advanced(False, "one perceptual score per pair instead of a map (the paper)", "by hand")
 
 
 class NetworkSettings(Settings):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast, get_args
+from typing import Annotated, ClassVar, Literal, cast, get_args
 
-from pydantic import Field
+from pydantic import Field, NonNegativeInt
 
-from scopemap.engine.config.settings import Settings, StageSettings, constants_of
+from scopemap.engine.config.settings import Methods, Settings, StageSettings, advanced
 
 Box = tuple[
     Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
@@ -82,32 +81,19 @@ class InputSettings(Settings):
         return Path(self.stereo.partition(":")[2]) if self.uses_both_views and self.layout == "none" else None
 
 
-@dataclass(frozen=True)
-class MaskConstants:
-    """Constants of masking."""
-
-    field_of_view: bool = True  # find the circular or octagonal field of view and black borders
-    highlights: bool = True  # find specular highlights and mask them
-    overlays: bool = True  # find burned-in text and logos, which stay while the rest moves
-    exposure: bool = True  # mask under-exposed and over-exposed pixels
-    dark_level: int = 12  # grey level up to which a pixel counts as under-exposed
-    files_grow_px: int = 3  # by which masks from files are widened
-
-
-MASK: dict[str, dict[str, Any]] = {
-    "scopemap": {},
-    "no-overlays": {"overlays": False},
-    "no-field-of-view": {"field_of_view": False},
-    "no-highlights": {"highlights": False},
-    "no-exposure": {"exposure": False},
-}
-
-
 class MaskSettings(StageSettings):
     """Which pixels count as usable tissue."""
 
-    METHODS = MASK
-    method: str = Field("scopemap", description="what is found in the picture itself and masked")
+    METHODS: ClassVar[Methods] = {
+        "scopemap": {},
+        "no-overlays": {"overlays": False},
+        "no-field-of-view": {"field_of_view": False},
+        "no-highlights": {"highlights": False},
+        "no-exposure": {"exposure": False},
+    }
+    method: str = Field(
+        "scopemap", description="what is found in the picture itself and masked; chooses advanced settings"
+    )
     files: str = Field(
         "",
         description="folder of masks, one image per frame, found by the number in its name: non-zero pixels are masked "
@@ -119,4 +105,16 @@ class MaskSettings(StageSettings):
         "without one the depth network, where it can (scopenet), which misses some and takes pale tissue for others; "
         "off: nobody, masks from files are not read either",
     )
-    constants: MaskConstants = constants_of(MaskConstants(), MASK)
+
+    field_of_view: bool = advanced(
+        True, "find the circular or octagonal field of view and black borders", "by hand; METHOD has none"
+    )
+    highlights: bool = advanced(True, "find specular highlights and mask them", "by hand; METHOD has none")
+    overlays: bool = advanced(
+        True, "find burned-in text and logos, which stay while the rest moves", "by hand; METHOD has none"
+    )
+    exposure: bool = advanced(True, "mask under-exposed and over-exposed pixels", "by hand; METHOD has none")
+    dark_level: Annotated[int, Field(ge=0, le=255)] = advanced(
+        12, "grey level up to which a pixel counts as under-exposed", "by hand"
+    )
+    files_grow_px: NonNegativeInt = advanced(3, "by which masks from files are widened, px", "by hand")

@@ -1,13 +1,16 @@
-"""What all groups of settings have in common, and the named methods that choose a stage's constants."""
+"""What all groups of settings have in common, advanced settings, and the named methods that choose these."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Methods = Mapping[str, Mapping[str, Any]]
+"""The methods of a stage by name, each with the advanced settings that it changes."""
 
 
 class Settings(BaseModel):
@@ -15,16 +18,31 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    @classmethod
+    def sources(cls) -> dict[str, str]:
+        """Return the advanced settings by name, with where their defaults come from."""
+        extras = {name: field.json_schema_extra for name, field in cls.model_fields.items()}
+        return {name: str(extra["source"]) for name, extra in extras.items() if isinstance(extra, dict)}
+
 
 class StageSettings(Settings):
-    """Settings of a stage whose `constants` follow from `method`.
+    """Settings of a stage, whose `method` chooses its advanced ones where these are not given themselves.
 
-    A method is one entry of METHODS, or several joined by "+", of which later ones win: "paper+gauss-newton".
+    A method is one entry of METHODS, or several joined by "+", of which later ones win: "paper+least-squares".
     """
 
-    METHODS: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
-    """The constants that each method changes."""
+    METHODS: ClassVar[Methods] = {}
     method: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_method(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        chosen: dict[str, Any] = {}
+        for name in str(given.get("method", cls.model_fields["method"].default)).split("+"):
+            chosen |= cls.METHODS.get(name, {})
+        return chosen | given
 
     @field_validator("method")
     @classmethod
@@ -35,16 +53,9 @@ class StageSettings(Settings):
         return method
 
 
-def constants_of(default: Any, methods: Mapping[str, Mapping[str, Any]]) -> Any:
-    """Return the field of a stage's constants: `default`, changed by the stage's method; it is no setting."""
-
-    def chosen(validated: dict[str, Any]) -> Any:
-        found = default
-        for name in validated.get("method", "").split("+"):
-            found = replace(found, **methods.get(name, {}))
-        return found
-
-    return Field(default_factory=chosen, exclude=True, repr=False)
+def advanced(default: Any, description: str, source: str) -> Any:
+    """Return the field of an advanced setting: few users need it. `source` says where its default comes from."""
+    return Field(default, description=description, json_schema_extra={"source": source})
 
 
 def hint(wrong: str, names: Mapping[str, Any] | list[str]) -> str:

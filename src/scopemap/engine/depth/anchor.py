@@ -14,10 +14,10 @@ from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.frame import Frame
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
-_MIN_SHARE = 0.02
-_MIN_SHARE_NOTED = 0.005
-_MAX_SHARE_BEYOND = 0.5  # of the depth that may be beyond the limit without a note
-_FACTOR_MM = 1000.0
+_MIN_SHARE = 0.02  # by hand
+_MIN_SHARE_NOTED = 0.005  # by hand: a smaller share beyond the largest depth is not mentioned
+_MAX_SHARE_BEYOND = 0.5  # by hand: of the depth that may be beyond the limit without a note
+_FACTOR_MM = 1000.0  # `depth.factor` divides it, as in table 3 of METHOD's paper
 # Longest side of most images that scopenet was trained on: at twice the size it needs four times as long, and surfaces
 # are less consistent.
 _SCOPENET_PX = 160
@@ -53,7 +53,7 @@ class AnchoredDepth:
 
     `settings.anchor` chooses the target of the fit to the first frame with enough usable pixels: a range (`near-far`),
     `depth-pro`, the `shading` prior, an arbitrary `factor`, or (`auto`) the range if given, else the estimate's own
-    millimetres, else shading. `settings.constants.reanchor_every` repeats the fit. Measured depth is not changed.
+    millimetres, else shading. `settings.reanchor_every` repeats the fit. Measured depth is not changed.
     Raises `SettingsError` where `near-far` has no valid range.
 
     reference : metric estimator for anchors other than the range and the estimate itself. conversion : of the sequence;
@@ -86,7 +86,7 @@ class AnchoredDepth:
         first_mm, limit_note = self._anchor(estimate, frame) if self._is_due(estimate) else (None, "")
         if self.conversion is None:
             return MetricDepth(np.full(estimate.values.shape, np.nan, dtype=np.float32), None, limit_note)
-        if isinstance(self.reference, Releasable) and not self._settings.constants.reanchor_every:
+        if isinstance(self.reference, Releasable) and not self._settings.reanchor_every:
             self.reference.release()  # a resumed run has it anew
         depth_mm = self.conversion.depth_mm(estimate.values) if first_mm is None else first_mm
         sigma_mm = self.conversion.sigma_mm(estimate.sigma) if first_mm is None else None
@@ -108,7 +108,7 @@ class AnchoredDepth:
     def _is_due(self, estimate: DepthEstimate) -> bool:
         if self.conversion is None:
             return True
-        every = self._settings.constants.reanchor_every
+        every = self._settings.reanchor_every
         return every > 0 and self._frames_held >= every and self._source(estimate) == "reference"
 
     def _anchor(self, estimate: DepthEstimate, frame: Frame) -> tuple[np.ndarray | None, str]:
@@ -138,7 +138,7 @@ class AnchoredDepth:
             focal_px = reference.focal_px or frame.camera.fx
             self.conversion = self._fitted(estimate.kind, estimate.values[known], reference.values[known], focal_px)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
-            first_mm = None if self._settings.constants.fit_shift else reference.values
+            first_mm = None if self._settings.fit_shift else reference.values
         self._frames_held = 0
         self.description = self._describe(source, estimate, frame) + details
         network = (
@@ -160,7 +160,7 @@ class AnchoredDepth:
 
     def _from_factor(self, estimate: DepthEstimate, usable: np.ndarray) -> AffineDisparity | DepthScale:
         """Put the nearest tissue at 1000 mm / factor, without shift: the paper's ablation."""
-        values, nearest_mm = estimate.values[usable], _FACTOR_MM / self._settings.constants.factor
+        values, nearest_mm = estimate.values[usable], _FACTOR_MM / self._settings.factor
         positive = values[values > 0]
         if not positive.size:
             raise InputError("anchoring depth by a factor: no pixel of the first usable frame has a positive value")
@@ -182,9 +182,9 @@ class AnchoredDepth:
         """Return the conversion of estimated values (N,) to their metric depth (N,), mm."""
         if kind == "depth":
             return DepthScale(float(np.exp(np.median(np.log(depth_mm / values)))))
-        if self._settings.constants.fit_shift:
+        if self._settings.fit_shift:
             return fit_affine_disparity(depth_mm, values, max_depth_mm(self._settings))
-        baseline_mm = fit_baseline_lbfgsb(depth_mm, values, focal_px, self._settings.constants.disparity_floor)
+        baseline_mm = fit_baseline_lbfgsb(depth_mm, values, focal_px, self._settings.disparity_floor)
         return AffineDisparity.from_baseline(baseline_mm, focal_px)
 
     def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:
@@ -193,7 +193,7 @@ class AnchoredDepth:
         if source == "near-far":
             return "near-far {:g}:{:g} mm".format(*self._settings.near_far_mm or ())
         if source == "factor":
-            return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.constants.factor:g}"
+            return f"arbitrary: nearest tissue of frame {frame.index} at 1000 mm / {self._settings.factor:g}"
         name = self._settings.backend if source == "estimate" else self.reference.name
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
@@ -204,7 +204,7 @@ class AnchoredDepth:
         if reference.focal_px is None:
             return ""
         found_px, known_px = reference.focal_px, frame.camera.fx
-        if self._settings.constants.depth_pro_focal == "network" or np.isclose(known_px, found_px, rtol=1e-3):
+        if self._settings.depth_pro_focal == "network" or np.isclose(known_px, found_px, rtol=1e-3):
             return f", by the focal length that it finds, {found_px:.0f} px"
         ratio = known_px / found_px
         return f", times {ratio:.3f}: the camera's focal length is {known_px:.0f} px, it finds {found_px:.0f} px"

@@ -52,14 +52,12 @@ class DenseMatcher:
         if previous is None or not wanted:
             return None
         rgb_previous, valid_previous = previous
-        flow = pair_flow(self._flow, rgb_previous, rgb, self._settings.constants.consistency_px)
+        flow = pair_flow(self._flow, rgb_previous, rgb, self._settings.consistency_px)
         # Masked pixels of either image show no tissue.
         seen = pull(valid_previous.astype(np.float32), flow.to_previous) > 0.5
-        compared = pull(rgb_previous, flow.to_previous) if self._settings.constants.compare_warped else rgb_previous
+        compared = pull(rgb_previous, flow.to_previous) if self._settings.compare_warped else rgb_previous
         distance = self._perceptual.compare(compared, rgb)
-        values = (
-            np.full_like(distance.map, distance.score) if self._settings.constants.perceptual_score else distance.map
-        )
+        values = np.full_like(distance.map, distance.score) if self._settings.perceptual_score else distance.map
         consistent = flow.consistent & seen & valid
         return DenseCorrespondence(flow.to_previous, consistent, values, float(valid.mean()))
 
@@ -134,7 +132,7 @@ class Mapis:
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
             refined_sigma = blended_sigma(weight, warped_sigma, sigma)
         self._propagated = (
-            _Propagated(depth_mm, refined_sigma) if self.settings.constants.recursive else _Propagated(scaled_mm, sigma)
+            _Propagated(depth_mm, refined_sigma) if self.settings.recursive else _Propagated(scaled_mm, sigma)
         )
         return RefinedDepth(depth_mm, self._scale, overlap, refined_sigma * depth_mm)
 
@@ -151,16 +149,16 @@ class Mapis:
         self._propagated, self._scale = None, scale
 
     def _scales(self, kind: DepthKind) -> bool:
-        frame_scale = self.settings.constants.frame_scale
+        frame_scale = self.settings.frame_scale
         return frame_scale == "robust" or (frame_scale == "auto" and kind != "measured")
 
     def _pulled_back(self, scale: float, matched_share: float) -> float:
         """Return the scale pulled back towards 1, the more the fewer pixels are matched to the previous frame."""
-        return float(scale ** (1 - self.settings.constants.scale_pull * max(1 - matched_share, 0.0) ** 2))
+        return float(scale ** (1 - self.settings.scale_pull * max(1 - matched_share, 0.0) ** 2))
 
     def _blend(self, kind: DepthKind) -> str:
-        if self.settings.constants.blend != "auto":
-            return self.settings.constants.blend
+        if self.settings.blend != "auto":
+            return self.settings.blend
         return "none" if kind == "measured" else "linear"
 
     def _warped(
@@ -178,22 +176,20 @@ class Mapis:
         warped_mm = np.where(correspondence.consistent, warped_mm, np.float32(np.nan))
         if T_current_previous is not None:
             warped_mm = moved_depth(warped_mm, correspondence.to_previous, camera, T_current_previous)
-        filtered_mm = bilateral_filtered(
-            warped_mm, self.settings.constants.filter_sigma_px, self.settings.constants.filter_sigma_mm
-        )
+        filtered_mm = bilateral_filtered(warped_mm, self.settings.filter_sigma_px, self.settings.filter_sigma_mm)
         warped_sigma = pull(self._propagated.relative_sigma, correspondence.to_previous)
-        return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.constants.sigma_fading))
+        return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.sigma_fading))
 
     def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
         """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""
         match blend:
             case "exponential":
-                return np.exp(-distance / np.float32(self.settings.constants.tau))
+                return np.exp(-distance / np.float32(self.settings.tau))
             case "linear":
                 return 1 - np.clip(distance, 0, 1)
             case "paper-equation":
                 return np.clip(distance, 0, 1)
-        return np.full_like(distance, self.settings.constants.constant_weight)
+        return np.full_like(distance, self.settings.constant_weight)
 
 
 def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:

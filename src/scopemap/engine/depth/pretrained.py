@@ -16,7 +16,7 @@ from scopemap.engine.models.weights import REGISTRY
 if TYPE_CHECKING:
     from transformers import BaseImageProcessor, PreTrainedModel
 
-MM_PER_M = 1000.0
+MM_PER_M = 1000.0  # a unit
 
 
 class PretrainedNetwork:

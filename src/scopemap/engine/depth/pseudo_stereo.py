@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.least_squares import huber_weight, robust_sigma
 
-_HUBER_SIGMAS = 1.345
-_ITERATIONS = 30
+_HUBER_SIGMAS = 1.345  # 95 % efficient on Gaussian errors (Holland and Welsch 1977)
+_ITERATIONS = 30  # guard: reweightings
 
 
 @dataclass(frozen=True)

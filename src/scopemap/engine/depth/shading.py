@@ -11,23 +11,24 @@ from scopemap.engine.depth.guided import filled, guided_filter
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.srgb import LINEAR
 
+# By trial: on the real frames of `scopemap_bench.scripts.depth_without_download`.
 # Red alone saturates on near tissue, green alone follows the blood, blue is mostly noise.
 _CHANNEL_WEIGHTS = np.array([0.5, 0.5, 0.0], dtype=np.float32)
 # Below this linear brightness (sRGB level 3 of 255) there is only noise: it bounds the distance.
-_DARKEST = 1e-3
+_DARKEST = 1e-3  # guard
 # Lamp emission and lens vignetting together fall with about the first power of the angle's cosine.
-_LAMP_COSINE_POWER = 1.0
-_DARK_LEVEL = 12
-_SATURATED_LEVEL = 250
-_HIGHLIGHT_RATIO = 2.0
-_HIGHLIGHT_WHITENESS = 0.6
+_LAMP_COSINE_POWER = 1.0  # by trial
+_DARK_LEVEL = 12  # by trial: the default of `mask.dark_level`
+_SATURATED_LEVEL = 250  # by trial: grey level of green that is clipped
+_HIGHLIGHT_RATIO = 2.0  # by trial: of a highlight's brightness over its wide surroundings'
+_HIGHLIGHT_WHITENESS = 0.6  # by trial: of a highlight's darkest channel over its brightest
 # Shares of the image width: smoothing window, largest hole that is filled.
-_WINDOW_SHARE = 0.04
-_REACH_SHARE = 0.1
+_WINDOW_SHARE = 0.04  # by trial
+_REACH_SHARE = 0.1  # by trial
 # Deviation of log brightness in a window above which it is taken for shape, not for texture.
-_EDGE_LOG = 0.8
+_EDGE_LOG = 0.8  # by trial
 # A frame with less usable tissue cannot fix the scale: the next one is tried.
-_MIN_SHARE = 0.02
+_MIN_SHARE = 0.02  # by trial
 
 
 class ShadingDepth:
@@ -50,7 +51,7 @@ class ShadingDepth:
         neighbours; everything, as long as no frame had usable pixels.
         """
         unit_z = 1 / np.linalg.norm(frame.camera.rays, axis=-1)
-        distance = relative_distance(frame, unit_z, self._settings.constants.shading_exponent)
+        distance = relative_distance(frame, unit_z, self._settings.shading_exponent)
         if self._scale_mm is None:
             seen = distance[frame.valid & np.isfinite(distance)]
             if seen.size >= _MIN_SHARE * distance.size:
@@ -63,7 +64,7 @@ class ShadingDepth:
         return {
             "depth": "near-field shading, embedded, no weights",
             "prior": f"median distance of the first frame {self._settings.shading_median_mm:g} mm",
-            "exponent": f"{self._settings.constants.shading_exponent:g}",
+            "exponent": f"{self._settings.shading_exponent:g}",
         }
 
 

@@ -11,17 +11,17 @@ from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.frame import Frame
 
 # Longest side at which views are matched, px: SGBM's time grows with its cube.
-_LONGEST_SIDE_PX = 800
+_LONGEST_SIDE_PX = 800  # by hand
+_BLOCK_PX = 7  # by hand: side of the blocks that SGBM compares
 # Blurred by so much first: a sensor's noise hides the mild texture of tissue.
-_BLOCK_PX = 7
-_BLUR_PX = 0.8
-_SPECKLE_PIXELS = 400
+_BLUR_PX = 0.8  # by hand
+_SPECKLE_PIXELS = 400  # by hand: smaller islands of disparity are dropped (OpenCV's speckleWindowSize)
 # Largest disparity, share of the width: for most endoscopes tissue that is nearer than two to three baselines.
-_MOST_SHARE = 0.25
+_MOST_SHARE = 0.25  # by hand
 # Disparity is good to a fifth of a pixel or so: depth beyond this one is worth nothing.
-_LEAST_DISPARITY_PX = 2.0
-_LEFT_RIGHT_PX = 1
-_SGBM_UNIT = 16
+_LEAST_DISPARITY_PX = 2.0  # by hand
+_LEFT_RIGHT_PX = 1  # OpenCV's usual check: largest difference of the disparities of both views
+_SGBM_UNIT = 16  # OpenCV's: numbers of disparities are multiples of it, disparities are in sixteenths
 _Pixels = tuple[np.ndarray, np.ndarray]
 
 

@@ -15,26 +15,26 @@ from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.warp import bilinear
 
-_CORNER_BLOCK_PX = 5
-_BORDER_PX = 3
-_CELL_PX = 12
-_CONSISTENCY_PX = 1.0
+_CORNER_BLOCK_PX = 5  # by hand: window of a corner's strength
+_BORDER_PX = 3  # by hand: corners keep so far from what is masked
+_CELL_PX = 12  # by hand: the strongest corner of each cell of that size
+_CONSISTENCY_PX = 1.0  # by hand: largest forward-backward error of flow, the default of `mapis.consistency_px`
 # Of the corners that flow between small images must match, now and on average over some frames: where flow matches few,
 # that between the whole images gives keyframes more in common.
-_SMALL_COVERAGE = 0.5
-_FRAMES_BEFORE = 10
-_EXPECTED_PX = 8  # between the pixels of a flow that is only a start
-_START_COVERAGE = 0.3  # of the corners that must be matched for the flow to be the next frame's start
+_SMALL_COVERAGE = 0.5  # by hand
+_FRAMES_BEFORE = 10  # by hand
+_EXPECTED_PX = 8  # by hand: between the pixels of a flow that is only a start
+_START_COVERAGE = 0.3  # by hand: of the corners that must be matched for the flow to be the next frame's start
 # Refinement.
-_SURROUND_PX = 8.0  # of the local mean and contrast
-_DARKEST = 8.0  # grey levels added to the mean
-_CONTRAST = 50.0  # grey levels of one local standard deviation
-_LEAST_CONTRAST = 0.02  # smaller contrast is noise
-_LOW_RESOLUTION = 4  # at which the surround is computed: what it leaves out is as smooth
-_LEAST_EIGENVALUE = 1e-4
-_MAX_STEP_PX = 1.5  # from where flow has it
-_WARP_SMOOTHING_PX = 10.0  # of the flow by which patches are warped
-_PATCH_CONSISTENCY_PX = 0.5  # largest forward-backward error
+_SURROUND_PX = 8.0  # by hand: of the local mean and contrast
+_DARKEST = 8.0  # by hand: grey levels added to the mean
+_CONTRAST = 50.0  # by hand: grey levels of one local standard deviation
+_LEAST_CONTRAST = 0.02  # by hand: smaller contrast is noise
+_LOW_RESOLUTION = 4  # by hand: at which the surround is computed: what it leaves out is as smooth
+_LEAST_EIGENVALUE = 1e-4  # OpenCV's default, minEigThreshold
+_MAX_STEP_PX = 1.5  # by hand: from where flow has it
+_WARP_SMOOTHING_PX = 10.0  # by hand: of the flow by which patches are warped
+_PATCH_CONSISTENCY_PX = 0.5  # by hand: largest forward-backward error
 
 
 class _Search(NamedTuple):
@@ -45,7 +45,7 @@ class _Search(NamedTuple):
     last_step_px: float
 
 
-_THOROUGH = _Search(15, 20, 0.01)
+_THOROUGH = _Search(15, 20, 0.01)  # by hand
 _QUICK = _Search(11, 10, 0.03)  # a third of the time, and poses of the same error
 
 

@@ -114,15 +114,14 @@ def pair_flow(
 ) -> Flow:
     """Return the flow from a frame (H, W, 3) uint8 to the previous one, checked both ways to `consistency_px`.
 
-    Where that is infinite the flow back is not computed, and all that stays in the image is consistent.
+    Where that is 0 the flow back is not computed, and all that stays in the image is consistent.
     """
     check_shape("rgb_previous", rgb_previous, (None, None, 3))
     check_shape("rgb_current", rgb_current, rgb_previous.shape)
-    if math.isinf(consistency_px):
+    if not consistency_px:
         to_previous = estimator.estimate(rgb_current, rgb_previous)
-        to_current = np.zeros_like(to_previous)
-    else:
-        to_previous, to_current = estimator.estimate_checked(rgb_current, rgb_previous)
+        return Flow(to_previous, agree(to_previous, np.zeros_like(to_previous), math.inf))
+    to_previous, to_current = estimator.estimate_checked(rgb_current, rgb_previous)
     return Flow(to_previous, agree(to_previous, to_current, consistency_px))
 
 

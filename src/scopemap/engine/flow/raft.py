@@ -23,8 +23,8 @@ CHECKPOINTS: dict[Size, tuple[str, ...]] = {
     "small": ("raft-small", "raft-small-authors"),
     "large": ("raft-large", "raft-things"),
 }
-_STRIDE_PX = 8
-_MIN_SIDE_PX = 128
+_STRIDE_PX = 8  # RAFT's: both sides are multiples (Teed and Deng 2020)
+_MIN_SIDE_PX = 128  # guard: its pyramid of four levels needs so many px
 
 # The authors' names to torchvision's, applied one after the other.
 _RENAMES = (

@@ -21,22 +21,22 @@ from numba import njit, prange
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.fusion.tsdf import BLOCK, MeasuredSurface, TsdfCamera, VoxelBlocks, measure_surface
 
-_COSINE_POWER = 0.1
-_DISTANCE_POWER = 0.8
-_AXIS_POWER = 0.8
-_LEAST_LOG_COSINE = np.float32(np.log(0.1))
-_SMOOTH_SHARE = 1 / 30  # of the picture's width: cosines are averaged so far, predicted normals are noisy
-_STEEPEST = 10.0  # tangent of the incidence up to which neighbouring pixels of a rendering are one surface
+_COSINE_POWER = 0.1  # fitted with the next two on three real clips and two phantoms (docs/method.md, Fusion)
+_DISTANCE_POWER = 0.8  # fitted: -0.71 to -0.95 in each; sRGB and an inverse square give 0.9
+_AXIS_POWER = 0.8  # fitted
+_LEAST_LOG_COSINE = np.float32(np.log(0.1))  # guard: grazing incidence
+_SMOOTH_SHARE = 1 / 30  # by hand: of the picture's width: cosines are averaged so far, predicted normals are noisy
+_STEEPEST = 10.0  # by hand: tangent of the incidence up to which neighbouring pixels of a rendering are one surface
 # Bound, approached smoothly, of the light of a pixel over the frame's median light, and of its inverse.
-_MOST_LIGHT = 3.0
-_SATURATED_LEVEL = 250
+_MOST_LIGHT = 3.0  # by hand
+_SATURATED_LEVEL = 250  # by hand: level of a clipped channel
 # A clipped channel has lost its share of the hue; where no other frame has the place it is better than nothing.
-_SATURATED_WEIGHT = 0.02
-_STEP_PX = 8  # between the pixels that are compared with what is fused
-_LEAST_OVERLAP = 50  # of such pixels
+_SATURATED_WEIGHT = 0.02  # by hand
+_STEP_PX = 8  # by hand: between the pixels that are compared with what is fused
+_LEAST_OVERLAP = 50  # by hand: of such pixels
 # Share of the overlap in a gain: an error of the light's model must not grow along a path.
-_FOLLOWED = 0.75
-_GREY = np.array([0.299, 0.587, 0.114], np.float32)
+_FOLLOWED = 0.75  # by hand
+_GREY = np.array([0.299, 0.587, 0.114], np.float32)  # luma of ITU-R BT.601
 
 
 class AlbedoPainter:

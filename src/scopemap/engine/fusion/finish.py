@@ -15,11 +15,11 @@ from scopemap.engine.geometry.rendering import vertex_colours
 
 # Taubin, SIGGRAPH 1995: steps that shrink and steps that grow, 1 / 0.5 - 1 / 0.52 = 0.08, hardly change the volume.
 _SHRINK = 0.5
-_GROW = 0.52
-_LARGEST_PERIMETER_VOXELS = 20.0  # of a hole that is closed
+_GROW = 0.52  # see above
+_LARGEST_PERIMETER_VOXELS = 20.0  # by hand: of a hole that is closed
 # Cosine between a loop's own normal and the surface's beside it: -1 around a hole in a plane, 1 around an island, 0 at
 # the end of a tube, which leads to what no frame saw.
-_HOLE_COSINE = -0.5
+_HOLE_COSINE = -0.5  # by hand
 
 
 def finished(mesh: trimesh.Trimesh, settings: FusionSettings) -> trimesh.Trimesh:

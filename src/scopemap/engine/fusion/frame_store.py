@@ -21,11 +21,12 @@ from scopemap.engine.frame import REGIONS, Frame, Rows
 
 # ln of millimetres in 16 bits: 0.0001 mm (standard deviations are small) to 34 m in steps of 0.03 %; 0 = unknown.
 _LOG_STEP = 3e-4
-_MIN_MM = 1e-4
-_MAX_CODE = 65535
-_CHECKED_AT_ONCE = 1 << 20
-_MOST_SPREAD = 16  # frames of a submap at which its surface is rendered again
+_MIN_MM = 1e-4  # see above
+_MAX_CODE = 65535  # of 16 bits
+_CHECKED_AT_ONCE = 1 << 20  # bytes that are read at once
+_MOST_SPREAD = 16  # by hand: frames of a submap at which its surface is rendered again
 # Colours only paint the mesh: JPEG takes a fifth of the time and half of the space of a lossless format.
+# The quality by hand.
 _COLOUR_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 
 

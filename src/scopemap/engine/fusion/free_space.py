@@ -20,28 +20,28 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.notices import Notice
 
-_MOST_VIEWS = 256  # 50 KB each
-_FEW_VIEWS = 16
-_FRAMES_PER_VIEW = 4
-_CELLS = 64  # along the longer side of the picture: one pixel of each cell is looked at
-_ASKED = 16  # views that a frame is compared with, spread over those that show a third of its points
-_SHARE = 1 / 3
-_LEAST_VIEWS = 2  # never on the word of one
+_MOST_VIEWS = 256  # by hand: 50 KB each
+_FEW_VIEWS = 16  # by hand: of a short clip
+_FRAMES_PER_VIEW = 4  # by hand: one frame of so many is a view
+_CELLS = 64  # by hand: along the longer side of the picture: one pixel of each cell is looked at
+_ASKED = 16  # by hand: views that a frame is compared with, spread over those that show a third of its points
+_SHARE = 1 / 3  # by hand: of the frame's points, and of the views that see a point
+_LEAST_VIEWS = 2  # by hand: never on the word of one
 # Share of the depth by which a view is farther that looks through a point, at least; and in robust standard deviations
 # of what frame and view differ by.
-_TOLERANCE = 0.05
-_SIGMAS = 3.0
+_TOLERANCE = 0.05  # by hand
+_SIGMAS = 3.0  # three standard deviations: 0.3 % of Gaussian errors
 # A region is left out that has so many points which at least half of the views contradict by twice that.
-_LEAST_POINTS = 8
-_CERTAIN = 2.0
+_LEAST_POINTS = 8  # by hand
+_CERTAIN = 2.0  # by hand
 # Difference of colour to the views from which on something else is there, and over that of the frame's median point:
 # tissue that moved has its colour.
-_OTHER_COLOUR = 0.3
-_TIMES_USUAL = 5.0
-_DARK = 8.0  # grey levels, up to which colours are noise
-_SOME_POINTS = 40  # one of so many tells whether a view sees a frame's points
-_SOME_RATIOS = 8  # and what frame and view differ by
-_AROUND = np.ones((3, 3), np.uint8)
+_OTHER_COLOUR = 0.3  # by hand
+_TIMES_USUAL = 5.0  # by hand
+_DARK = 8.0  # by hand: grey levels, up to which colours are noise
+_SOME_POINTS = 40  # by hand: one of so many tells whether a view sees a frame's points
+_SOME_RATIOS = 8  # by hand: and what frame and view differ by
+_AROUND = np.ones((3, 3), np.uint8)  # a pixel and its eight neighbours
 
 
 class _View(NamedTuple):

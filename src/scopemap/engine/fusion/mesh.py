@@ -9,27 +9,27 @@ import numpy as np
 import trimesh
 from numba import njit
 
-from scopemap.engine.config.mapping import FusionConstants
+from scopemap.engine.config.mapping import FusionSettings
 from scopemap.engine.fusion.albedo import displayed
 from scopemap.engine.fusion.tsdf import BLOCK, VoxelBlocks, Voxels, unpack
 
-_CHUNK_BLOCKS = 8
+_CHUNK_BLOCKS = 8  # by hand, for memory: the result does not depend on it
 _CHUNK = _CHUNK_BLOCKS * BLOCK
 # Keeps every vertex off the grid corners, where its edge would be ambiguous.
 _SMALLEST_DISTANCE_VOXELS = 1e-3
 # A cell's diagonal is sqrt(3) voxels, and a distance changes by no more than the step: twice that is a depth edge, not
 # a surface. Without the limit, walls of the truncation's depth would grow behind every fold's silhouette.
 _LARGEST_SPREAD_VOXELS = 3.5
-_UNSEEN_GREY = 128.0
+_UNSEEN_GREY = 128.0  # by hand: colour of what no frame saw
 # Weight of a vertex whose confidence is 1 - 1/e: a frontal look from near weighs 1.
-_CONFIDENT_WEIGHT = 1.5
+_CONFIDENT_WEIGHT = 1.5  # by hand
 # Corners of a cell are numbered by 4 i + 2 j + k. Its faces, counter-clockwise seen from outside; its edges by axis.
 _FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-_EDGES = np.array([(c, c + step) for step in (4, 2, 1) for c in range(8) if not c & step])
-_EDGE_OF = np.full((8, 8), -1)
+_EDGES = np.array([(c, c + step) for step in (4, 2, 1) for c in range(8) if not c & step])  # pairs of corners
+_EDGE_OF = np.full((8, 8), -1)  # edge between two corners; -1: none
 _EDGE_OF[_EDGES, _EDGES[:, ::-1]] = np.arange(len(_EDGES))[:, None]
 _ON_FACE = np.array([[{*edge} <= {*face} for face in _FACES] for edge in _EDGES])
-_ON_ONE_FACE = (_ON_FACE[:, None] & _ON_FACE).any(-1)
+_ON_ONE_FACE = (_ON_FACE[:, None] & _ON_FACE).any(-1)  # whether two edges are on one face
 _MOST_TRIANGLES = len(_EDGES)  # of a cell
 
 
@@ -43,7 +43,7 @@ class _Chunk(NamedTuple):
 
 
 def extract_mesh(
-    blocks: VoxelBlocks, settings: FusionConstants, voxel_mm: float, median_level: float | None = None
+    blocks: VoxelBlocks, settings: FusionSettings, voxel_mm: float, median_level: float | None = None
 ) -> trimesh.Trimesh:
     """Return the zero level of the field as a mesh in world mm, its normals towards free space, with vertex colours.
 

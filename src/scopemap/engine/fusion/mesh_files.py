@@ -21,8 +21,8 @@ T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
 _PLY_AXES = "unit: mm; axes: OpenCV (x right, y down, z forward)"
 _WRITTEN_COLOURS = "_COLOR_0"
 _FLOAT = 5126  # glTF 2.0, sections 3.6.2.2 and 4.4.3
-_JSON = 0x4E4F534A
-_BIN = 0x004E4942
+_JSON = 0x4E4F534A  # glTF 2.0, section 4.4.3: "JSON"
+_BIN = 0x004E4942  # glTF 2.0, section 4.4.3: "BIN"
 
 
 def save_mesh(

@@ -16,16 +16,16 @@ from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.track import MOVING_SIGMAS
 
-_STEP_PX = 8  # between the pixels that are used
-_SOME = (slice(_STEP_PX // 2, None, _STEP_PX),) * 2
+_STEP_PX = 8  # by hand: between the pixels that are used
+_SOME = (slice(_STEP_PX // 2, None, _STEP_PX),) * 2  # such pixels, from the middle of the first cell
 _SEEN = np.dtype([("key", np.int64), ("seen", np.int64), ("moving", np.int64)])
-_EDGE_SHARE = 0.13
-_MOST_ROWS = 1_000_000
-_LEAST_FRAMES = 3  # in which a block moves
-_LEAST_SHARE = 0.05
-_WINDOW_S = 0.5  # standard deviation of the weights
-_CORNERS = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-_AROUND = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+_EDGE_SHARE = 0.13  # by hand: edge of a block over the clip's median depth
+_MOST_ROWS = 1_000_000  # guard: memory; rows are summed up above
+_LEAST_FRAMES = 3  # by hand: in which a block moves
+_LEAST_SHARE = 0.05  # by hand: of the frames that see a block
+_WINDOW_S = 0.5  # by hand: standard deviation of the weights
+_CORNERS = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)  # of a block
+_AROUND = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)  # a block and its 26 neighbours
 
 
 def block_edge_mm(median_depth_mm: float | None) -> float:

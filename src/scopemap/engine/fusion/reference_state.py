@@ -13,9 +13,9 @@ from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.engine.notices import Notice
 
-_STEP_PX = 8  # between the pixels whose motion is computed
-_SEARCHES = 4
-_FOUND_PX = 1.0  # a place that is not found so well is behind an edge of depth
+_STEP_PX = 8  # by hand: between the pixels whose motion is computed
+_SEARCHES = 4  # by hand: fixed-point steps by which a place is found
+_FOUND_PX = 1.0  # by hand: a place that is not found so well is behind an edge of depth
 
 
 @dataclass(frozen=True)

@@ -33,24 +33,24 @@ from scopemap.engine.geometry.uncertainty import depth_trust
 from scopemap.engine.notices import Notice
 
 # Below this cosine a slanted wall cannot be distinguished from a depth edge, whatever the setting.
-_MIN_COSINE = 0.05
+_MIN_COSINE = 0.05  # by hand
 # Voxels of 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, truncation 5 mm); TSDF parameters that are
 # not set keep the proportions at other depths.
 _VOXELS_PER_MEDIAN_DEPTH = 60
-_VOXELS_PER_TRUNCATION = 5
+_VOXELS_PER_TRUNCATION = 5  # see above
 # At this depth a voxel is still larger than a pixel, and a narrowing tube is seen for most of its length.
-_VOXELS_PER_MAX_DEPTH = 200
+_VOXELS_PER_MAX_DEPTH = 200  # by hand
 # Weight of small highlights, where depth is interpolated.
-_MASKED_WEIGHT = 0.1
+_MASKED_WEIGHT = 0.1  # by hand
 # Weight of its colour, the one around it: it counts where no frame saw the tissue. Width of what is around over the
 # picture's, and the step of the pixels looked at.
-_MASKED_COLOUR = 0.01
-_SURROUNDINGS = 1 / 12
-_EVERY_PX = 4
+_MASKED_COLOUR = 0.01  # by hand
+_SURROUNDINGS = 1 / 12  # by hand
+_EVERY_PX = 4  # by hand, for time
 # Share of the picture up to which a highlight is that small.
-_LARGEST_MASKED = 0.02
+_LARGEST_MASKED = 0.02  # by hand
 # No endoscope resolves less; memory would be spent on noise.
-_MIN_VOXEL_MM = 0.01
+_MIN_VOXEL_MM = 0.01  # by hand
 
 
 class TsdfParameters(NamedTuple):
@@ -106,25 +106,25 @@ class TsdfVolume:
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
         depth_mm, T_world_camera = self._checked(frame)
-        camera, advanced, parameters = frame.camera, self.settings.constants, self.parameters
+        camera, settings, parameters = frame.camera, self.settings, self.parameters
         T_camera_world = inverse(T_world_camera)
         R, t = np.ascontiguousarray(T_camera_world[:3, :3]), T_camera_world[:3, 3].copy()
         pinhole = TsdfCamera(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        steepest = max(advanced.min_incidence, _MIN_COSINE)
+        steepest = max(settings.min_incidence, _MIN_COSINE)
         step = math.sqrt(1 / steepest**2 - 1) / min(camera.fx, camera.fy)
         # A share of 1: voxels have the full weight up to the truncation.
-        ramp = {} if advanced.weighted else {"full_weight_share": 1.0}
-        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, advanced.truncation_share, **ramp)
+        ramp = {} if settings.weighted else {"full_weight_share": 1.0}
+        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, settings.truncation_share, **ramp)
         masked = np.zeros_like(frame.valid)
-        if advanced.weighted and frame.highlights is not None:
+        if settings.weighted and frame.highlights is not None:
             masked = _small_regions(frame.highlights)
         with np.errstate(invalid="ignore"):
             usable = (frame.valid | masked) & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
-        surface = measure_surface(inverse_depth, pinhole, step, advanced.min_incidence, parameters.max_depth_mm)
-        trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, advanced.depth_sigma_share)
+        surface = measure_surface(inverse_depth, pinhole, step, settings.min_incidence, parameters.max_depth_mm)
+        trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, settings.depth_sigma_share)
         weight = surface.weight * np.where(masked, np.float32(_MASKED_WEIGHT), np.minimum(trust, np.float32(1.0)))
-        weight = weight * np.float32(frame.quality) if advanced.weighted else (weight > 0).astype(np.float32)
+        weight = weight * np.float32(frame.quality) if settings.weighted else (weight > 0).astype(np.float32)
         surface = surface._replace(weight=weight if frame.weight is None else weight * frame.weight)
         if self._painter is not None:
             picture = self._painter.paint(frame.rgb, surface, pinhole, self._blocks, parameters.voxel_mm)
@@ -145,7 +145,7 @@ class TsdfVolume:
     def extract_mesh(self) -> trimesh.Trimesh:
         """Return the surface seen so far, world mm, vertex colours, normals towards the camera's side; may be empty."""
         median_level = None if self._painter is None else self._painter.median_level
-        return extract_mesh(self._blocks, self.settings.constants, self.parameters.voxel_mm, median_level)
+        return extract_mesh(self._blocks, self.settings, self.parameters.voxel_mm, median_level)
 
     def _checked(self, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         for name in ("depth_mm", "T_world_camera"):

@@ -13,15 +13,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-BLOCK = 8
+BLOCK = 8  # voxels along an edge of a block: 8, as Niessner et al. 2013 hash them
 # 21 bits of a key for each block coordinate.
 KEY_OFFSET = 1 << 20
-_KEY_MASK = (1 << 21) - 1
-_RECENT = 1 << 15
+_KEY_MASK = (1 << 21) - 1  # 21 bits for each of three numbers of a block
+_RECENT = 1 << 15  # by hand, for time: entries of the table of blocks met last; a power of two
 _F32 = np.float32
-_SLOPE_STEP_PX = 3
-_COLOUR_BAND_VOXELS = 2.0
-_FIRST_CAPACITY = 256
+_SLOPE_STEP_PX = 3  # by hand: pixels to either side from which a slope is measured
+_COLOUR_BAND_VOXELS = 2.0  # by hand: colours are integrated so near to the surface
+_FIRST_CAPACITY = 256  # by hand: blocks; doubles when it is full
 
 
 class Voxels(NamedTuple):

@@ -19,19 +19,19 @@ from scipy.spatial import cKDTree
 from scopemap.engine.fusion.mesh import marching_cubes
 from scopemap.engine.geometry.rendering import vertex_colours
 
-_MOST_CELLS = 160  # along the longest side of the mesh
-_MARGIN_CELLS = 10
+_MOST_CELLS = 160  # by hand: along the longest side of the mesh
+_MARGIN_CELLS = 10  # by hand: of the grid around the mesh
 # The distance is known so far from the surface, in cells, and is the mean over the planes of so many vertices.
-_BAND_CELLS = 2
-_PLANES = 4
-SEEN_CELLS = 1.5  # vertices farther from the mesh than this were not seen
-_LEVELS = (8, 4, 2, 1)  # cell sizes over the finest; each level starts from the one before
-_SWEEPS = 40
-_OVER_RELAXATION = 1.7
+_BAND_CELLS = 2  # by hand
+_PLANES = 4  # by hand
+SEEN_CELLS = 1.5  # by hand: vertices farther from the mesh than this were not seen
+_LEVELS = (8, 4, 2, 1)  # by hand: cell sizes over the finest; each level starts from the one before
+_SWEEPS = 40  # by hand: of each level
+_OVER_RELAXATION = 1.7  # by hand, below 2, where successive over-relaxation converges (Young 1954)
 # Length of the mean normal above which a surface faces one way: that of a cavity as deep as its radius.
-_ONE_WAY = 1 / 3
+_ONE_WAY = 1 / 3  # by hand
 _SMALLEST_CELLS = 1e-3  # no vertex on a grid corner, where its edge would be ambiguous
-_UNSEEN_GREY = 128
+_UNSEEN_GREY = 128  # by hand: colour of what no frame saw
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ AlignMode = Literal["none", "origin", "se3", "sim3", "scale"]
 _RANK_TOLERANCE = 1e-12
 # Below this ratio of the variances along its second and first axis a path is nearly a straight line: errors of its
 # positions turn the rotation about it by any angle.
-_STRAIGHT = 1e-3
+_STRAIGHT = 1e-3  # by hand
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-_MOST_CELLS = 60_000  # of the graph; larger spaces are thinned
-_NEAR_WALL_COST = 50.0  # of a step at the wall
-_NEAR_WALL_SHARE = 0.25  # share of the radius over which it falls off
+_MOST_CELLS = 60_000  # by hand: of the graph; larger spaces are thinned
+_NEAR_WALL_COST = 50.0  # by hand: of a step at the wall
+_NEAR_WALL_SHARE = 0.25  # by hand: share of the radius over which it falls off
 
 
 @dataclass(frozen=True)

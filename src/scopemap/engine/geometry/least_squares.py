@@ -169,7 +169,7 @@ def minimise(problem: Problem[State], start: State, options: Options) -> Solutio
     return Solution(state, model.cost, options.max_iterations, False)
 
 
-_RIDGE = 1e-9  # of the diagonal
+_RIDGE = 1e-9  # guard: of the diagonal
 
 
 class PointBlock(NamedTuple):

@@ -11,23 +11,23 @@ from scipy.spatial.distance import pdist, squareform
 
 from scopemap.engine.cameras.camera import PinholeCamera
 
-_SMOOTH_PX = 1.0
-_RIM_PX = 2.5
-_RIM_SHARE = 0.5
-_RING = (0.15, 0.6)  # the wall beside a lesion: from so far outside its outline to so far, over its radius
-_GAP_PX = 2.0
-_LEAST_RING_PX = 30
-_OUTLIER = 2.5
-_LEAST_KNOWN = 0.7
-_LEAST_PX = 12
+_SMOOTH_PX = 1.0  # by hand: of depth within a lesion
+_RIM_PX = 2.5  # by hand: width of the outline
+_RIM_SHARE = 0.5  # by hand: of it, at most, over the lesion's inner radius
+_RING = (0.15, 0.6)  # by hand: the wall beside a lesion: from so far outside its outline to so far, over its radius
+_GAP_PX = 2.0  # by hand: between the outline and the wall beside it, at least
+_LEAST_RING_PX = 30  # by hand: of that wall
+_OUTLIER = 2.5  # by hand: median deviations from its plane
+_LEAST_KNOWN = 0.7  # by hand: share of the lesion with known depth
+_LEAST_PX = 12  # by hand: of a lesion
 # Standard deviations, as shares, by phantoms: of a lesion's diameter by that across the line of sight; of it by depth,
 # and what that grows by with the depth between its ends over what is across.
 _ROUND_ERROR = 0.1
-_DEPTH_ERROR = 0.06
-_SLANT_ERROR = 0.2
+_DEPTH_ERROR = 0.06  # by phantoms
+_SLANT_ERROR = 0.2  # by phantoms
 # Correction of ln diameter in a slanted view, by phantoms: the far rim is occluded; what protrudes shows its side.
 _OCCLUSION = 0.1
-_PROTRUSION = 0.5
+_PROTRUSION = 0.5  # by phantoms
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-_LEAST_WEIGHT = 1e-6
+_LEAST_WEIGHT = 1e-6  # guard: division where nothing is valid
 
 
 def local_mean(

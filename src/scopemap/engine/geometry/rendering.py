@@ -11,11 +11,11 @@ from numba import njit
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.se3 import inverse, transform
 
-_NEAR_MM = 1e-3
+_NEAR_MM = 1e-3  # guard: division by z
 # Pixels on the edge of two triangles belong to both; rounding must not open a gap between them.
 _EDGE = -1e-9
 # Of the points that fall on a pixel, those farther than the nearest by more than this share are hidden.
-_SAME_SURFACE = 1.05
+_SAME_SURFACE = 1.05  # by hand
 
 
 class Rendering(NamedTuple):

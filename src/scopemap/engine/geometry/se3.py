@@ -6,7 +6,7 @@ import numpy as np
 
 from scopemap.engine.errors import check_shape
 
-_SMALL_ANGLE_RAD = 1e-7
+_SMALL_ANGLE_RAD = 1e-7  # guard: below it the series' first terms are exact in float64
 
 
 def hat(vector: np.ndarray) -> np.ndarray:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-_WINDOW_PX = 7
+_WINDOW_PX = 7  # Wang et al. 2004 with scikit-image's default window
 _SAMPLE = _WINDOW_PX**2 / (_WINDOW_PX**2 - 1)  # of a sample's covariance
 _C1 = (0.01 * 255) ** 2  # Wang, section III.B
-_C2 = (0.03 * 255) ** 2
+_C2 = (0.03 * 255) ** 2  # Wang et al. 2004: K2 = 0.03
 
 
 def structural_similarity(grey_a: np.ndarray, grey_b: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-_SKIN = 4  # nodes of a point
-_LEAST_WEIGHT = 1e-3
+_SKIN = 4  # by hand: nodes of a point
+_LEAST_WEIGHT = 1e-3  # guard: a point as far as its farthest node still has weights
 
 
 class Skin(NamedTuple):

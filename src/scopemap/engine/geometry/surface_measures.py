@@ -18,9 +18,9 @@ _PASSES = ((0, 1.03), (1, 1.01), (3, 1.003), (7, 1.0))
 
 Lengths are then up to 1 % too long, by edges alone up to 40 %.
 """
-_CELLS = 400  # along the longer side of a polygon, whose area is measured
-_BREAK = 1.05  # between neighbouring cells: farther apart lie two surfaces
-_INSIDE_EDGE = -1e-9
+_CELLS = 400  # by hand: along the longer side of a polygon, whose area is measured
+_BREAK = 1.05  # by hand: between neighbouring cells: farther apart lie two surfaces
+_INSIDE_EDGE = -1e-9  # guard: rays through an edge meet one of its triangles
 
 
 class SurfacePoint(NamedTuple):

@@ -7,8 +7,8 @@ import numpy as np
 from scopemap.engine.errors import check_shape
 
 # A sigma of 0 or of infinity must not make weights infinite or undefined.
-_MIN_SIGMA = 1e-4
-_MAX_SIGMA = 1e3
+_MIN_SIGMA = 1e-4  # guard
+_MAX_SIGMA = 1e3  # guard
 
 
 def relative_sigma(depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> np.ndarray:

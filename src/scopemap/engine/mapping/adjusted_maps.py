@@ -90,7 +90,7 @@ class MapKeyframes:
 
     def depth_fields(self, points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
         """Return the depth correction field of each keyframe by a solution; () where depth is only scaled."""
-        step_sigma = self.settings.constants.depth_step_sigma
+        step_sigma = self.settings.depth_step_sigma
         if step_sigma <= 0:
             return ()
         as_tracked = replace(points, log_depth=points.log_depth + self.log_drift[points.host])
@@ -110,7 +110,7 @@ class MapKeyframes:
             factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
             after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
         # Farther apart two keyframes may have a few pixels in common, which prove nothing.
-        gaps = [gap for gap in self.settings.constants.keyframe_gaps if gap <= MOST_RECENT]
+        gaps = [gap for gap in self.settings.keyframe_gaps if gap <= MOST_RECENT]
         adjusted = inverse(found.state.T_camera_world), after
         grown = growth_of_disagreement(self.camera, (self.T_world_camera, before), adjusted, gaps)
         if grown is None:
@@ -189,15 +189,15 @@ def adjust_maps(keyframes: MapKeyframes, problem: BundleProblem, loops: np.ndarr
 
 def _solution(keyframes: MapKeyframes, problem: BundleProblem) -> tuple[BundleSolution, ShapeTest]:
     """Return the solution; of one map that of the start that wins, and what the starts tell."""
-    found, constants = adjust_in_windows(problem), keyframes.settings.constants
-    if len(keyframes.S_common_map) > 1 or not constants.other_starts:
+    found, settings = adjust_in_windows(problem), keyframes.settings
+    if len(keyframes.S_common_map) > 1 or not settings.other_starts:
         return found, ShapeTest()
-    return with_other_starts(problem, found, is_rigid=found.sigma_px <= constants.max_sigma_px)
+    return with_other_starts(problem, found, is_rigid=found.sigma_px <= settings.max_sigma_px)
 
 
 def _refusal_by_views(keyframes: MapKeyframes, found: BundleSolution, shape: ShapeTest) -> Notice | None:
     """Return why the views refuse a solution; None where they do not."""
-    if not found.sigma_px <= keyframes.settings.constants.max_sigma_px:  # NaN: nothing was observed
+    if not found.sigma_px <= keyframes.settings.max_sigma_px:  # NaN: nothing was observed
         return Notice("mapping-not-rigid", {"sigma_px": found.sigma_px, "merged": ""})
     if shape.refuses(found.sigma_px):
         errors = {"error_px": shape.error_px, "other_px": shape.other_px}

@@ -36,9 +36,9 @@ from scopemap.engine.mapping.pose_graph import (
 from scopemap.engine.tracking.features import FeatureDetector
 
 # Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
-_MAX_PART_ERROR = 0.05
+_MAX_PART_ERROR = 0.05  # by hand
 # Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
-MOST_OBSERVATIONS = 1_000_000
+MOST_OBSERVATIONS = 1_000_000  # by hand
 """Of an adjustment, unless memory is limited."""
 
 
@@ -67,7 +67,7 @@ class Backend:
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
         self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
         self._tracks = FeatureTracks(settings, flow, table)
-        self._finder = LoopFinder(settings, table, features) if settings.constants.min_loop_inliers > 0 else None
+        self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
         self._loops = table("loops", LOOP)
         self._all_weighed = False
         self._camera: PinholeCamera | None = None
@@ -187,7 +187,7 @@ class Backend:
             if refused > len(merged) or number not in (S := self._merged(main, few)):
                 continue
             together = self._adjusted(S, main)
-            if not together.accepted(alone, self._settings.constants.max_sigma_px):
+            if not together.accepted(alone, self._settings.max_sigma_px):
                 refused += 1
                 continue
             merged.add(number)
@@ -196,7 +196,7 @@ class Backend:
         if len(worlds) < len(merged):
             S = self._merged(main, merged)
             together = self._adjusted(S, main)
-            if together.accepted(alone, self._settings.constants.max_sigma_px):
+            if together.accepted(alone, self._settings.max_sigma_px):
                 return together, S
         return found, worlds
 
@@ -267,7 +267,7 @@ class Backend:
     def _with_moving_tissue(self, alone: AdjustedMaps, worlds: Mapping[int, Similarity]) -> FrameCorrection:
         """Return the correction with tissue that moves where left-out tracks confirm it, else the rigid one."""
         by_depth = alone.correction.refused and alone.rigid.sigma_px < RIGID_CORE_PX
-        if self._camera is None or not self._settings.constants.moving_tissue or by_depth:
+        if self._camera is None or not self._settings.moving_tissue or by_depth:
             return alone.correction
         time_s = np.array(self._times_s)[self._chosen(worlds)]
         solution = adjust_moving_tissue(alone.problem, alone.rigid, time_s)
@@ -282,17 +282,17 @@ class Backend:
     def _problem(self, worlds: Mapping[int, Similarity]) -> tuple[BundleProblem, np.ndarray]:
         """Return the bundle adjustment of maps' keyframes, from the pose graph, and its accepted loops (A, 2)."""
         assert self._camera is not None
-        constants, chosen = self._settings.constants, self._chosen(worlds)
+        settings, chosen = self._settings, self._chosen(worlds)
         poses = [self._tracked[k] for k in chosen]
         T_map_camera, to_common = self._path.T_world_camera[chosen], [worlds[pose.map] for pose in poses]
         T_world_camera = np.stack([S.transform_poses(T) for S, T in zip(to_common, T_map_camera, strict=True)])
         log_unit = np.log([S.scale for S in to_common]) - self._path.drift[chosen]
         points, observations = self._tracks.collected(chosen, self.most_observations)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
-        rotation_rad = math.radians(constants.rotation_sigma_deg)
-        priors = Priors(constants.scale_sigma, rotation_rad, constants.translation_sigma_share)
+        rotation_rad = math.radians(settings.rotation_sigma_deg)
+        priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
         pairs = tracked_pairs([self._frames[k] for k in chosen], poses)
-        T, correlated = inverse(T_world_camera), constants.correlated_observations
+        T, correlated = inverse(T_world_camera), settings.correlated_observations
         problem = BundleProblem(T, points, observations, priors, pairs, self._camera.fx, correlated=correlated)
         loops = self._loops_among(chosen, log_unit)
         if not loops:

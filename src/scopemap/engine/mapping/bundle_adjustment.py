@@ -46,18 +46,18 @@ from scopemap.engine.mapping.bundle_problem import (
 )
 
 PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
-CAUCHY = 2.0  # residuals of that many standard deviations get half the weight
-_BEHIND = 100.0  # squared residual, in variances, of a point behind the camera
-_INVERSE_DEPTH_STEP = (0.1, 10.0)  # factor of the inverse depth in one step
-_POINT_STEPS = 5  # of the points alone, after the keyframes
-_ADDED_WITH = 2  # keyframes before a new one that move with it, and steps of each search
-_ADDED_ITERATIONS = 6
-WINDOW = 300
+CAUCHY = 2.0  # by hand: residuals of that many standard deviations get half the weight
+_BEHIND = 100.0  # guard: squared residual, in variances, of a point behind the camera
+_INVERSE_DEPTH_STEP = (0.1, 10.0)  # by hand: factor of the inverse depth in one step
+_POINT_STEPS = 5  # by hand: of the points alone, after the keyframes
+_ADDED_WITH = 2  # by hand: keyframes before a new one that move with it, and steps of each search
+_ADDED_ITERATIONS = 6  # by hand
+WINDOW = 300  # by hand
 """Most keyframes that are adjusted at once."""
 RIGID_SIGMA_PX = 0.4
 """Robust standard deviation of reprojection errors above which a scene is hardly rigid: rigid ones leave at most 0.3 px
 between near keyframes (0.45 in a fast, interlaced video, C3VD trans_t2_a), moving tissue leaves 0.4 to 1.5."""
-HELD_SIGMA = 0.01
+HELD_SIGMA = 0.01  # by hand
 """Least standard deviation of ln depth of points that an earlier window adjusted."""
 
 

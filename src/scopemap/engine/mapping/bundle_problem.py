@@ -14,7 +14,7 @@ import numpy as np
 
 from scopemap.engine.geometry.se3 import inverse
 
-_LEAST_Z = 1e-3
+_LEAST_Z = 1e-3  # guard: points nearer to the camera's plane, over their distance, are behind it
 
 
 @dataclass(frozen=True)

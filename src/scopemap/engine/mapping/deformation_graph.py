@@ -20,14 +20,14 @@ from scipy.spatial import KDTree
 
 from scopemap.engine.geometry.se3 import hat, inverse, se3_exp, so3_log
 
-_NEIGHBOURS = 6  # of a node
-_FARTHEST_SHARE = 97  # percent of the points, nearest to their median, among which nodes are
+_NEIGHBOURS = 6  # by hand: of a node
+_FARTHEST_SHARE = 97  # by hand: percent of the points, nearest to their median, among which nodes are
 # A curve repeats itself where a sinusoid of at least so many periods explains so much of its variance.
-_LEAST_PERIODS = 1.5
-_PERIODIC_SHARE = 0.8
-_RATES = 200
-_REWEIGHTINGS = 5
-_LEAST_GAP_S = 1e-3
+_LEAST_PERIODS = 1.5  # by hand
+_PERIODIC_SHARE = 0.8  # by hand
+_RATES = 200  # by hand: rates that are tried
+_REWEIGHTINGS = 5  # by hand: of the robust fit
+_LEAST_GAP_S = 1e-3  # guard: frames with one time stamp
 
 
 @dataclass(frozen=True)

@@ -24,28 +24,28 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.mapping.bundle_problem import Points
 
-ROWS = 6
-COLUMNS = 7
-LEVELS = 4
+ROWS = 6  # by hand, with the two below: patches of a network's error, not blurred edges (docs/method.md)
+COLUMNS = 7  # by hand: of the image
+LEVELS = 4  # by hand: of ln depth
 _SHAPE = (ROWS, COLUMNS, LEVELS)
-MAX_LOG_FACTOR = 0.7
+MAX_LOG_FACTOR = 0.7  # by hand
 """Bound of |ln factor|: larger errors of points are not errors of depth."""
 
 # Standard deviation of the change between neighbouring nodes of rows, columns and levels, in units of the setting.
-_STEP_SHARES = (1.0, 1.0, 2.0)
+_STEP_SHARES = (1.0, 1.0, 2.0)  # by hand
 # Standard deviation of the correction itself, in the same units; nodes without points stay near 0.
-_SIZE_SHARE = 3.0
+_SIZE_SHARE = 3.0  # by hand
 # Errors of flow and poses are correlated between neighbouring points: no point is more certain than this.
-_MIN_SIGMA = 0.03
-_CAUCHY = 2.0
-_ITERATIONS = 3
-_MIN_POINTS = 10
+_MIN_SIGMA = 0.03  # by hand
+_CAUCHY = 2.0  # by hand: residuals of that many standard deviations get half the weight
+_ITERATIONS = 3  # by hand: reweightings
+_MIN_POINTS = 10  # by hand: of a keyframe; fewer fit no field
 # The first and the last level are these percentiles of the points' ln depths.
-_LEVEL_PERCENTILES = (1, 99)
+_LEVEL_PERCENTILES = (1, 99)  # by hand
 # Disagreement of depth, ln, that a right adjustment may leave: errors of networks themselves; and its growth by noise.
-_DEPTH_ERROR = 0.05
-_MAX_DEPTH_FACTOR = 1.1
-_GRID_PX = 8  # between the pixels whose depth is compared between keyframes
+_DEPTH_ERROR = 0.05  # by hand
+_MAX_DEPTH_FACTOR = 1.1  # by hand: depths of keyframes that disagree by less than so much more agree as well as before
+_GRID_PX = 8  # by hand: between the pixels whose depth is compared between keyframes
 
 
 @dataclass(frozen=True)

@@ -32,12 +32,12 @@ from scopemap.engine.geometry.uncertainty import relative_sigma
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.loop_closure import MOST_RECENT, Loop
 
-_CELL_PX = 16  # one corner in each cell of that size
+_CELL_PX = 16  # by hand: one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.
-_MOST_MAPS = 20
-_DOWNSCALE = 2  # of flow that only starts a search
-_CONSISTENCY_PX = 1.0  # largest forward-backward error of flow
-_LEAST_IN_COMMON = 0.15  # of either picture, by depth and poses as tracked
+_MOST_MAPS = 20  # by hand
+_DOWNSCALE = 2  # by hand: of flow that only starts a search
+_CONSISTENCY_PX = 1.0  # by hand: largest forward-backward error of flow
+_LEAST_IN_COMMON = 0.15  # by hand: of either picture, by depth and poses as tracked
 _LEAST_MATCHED = 0.05  # of the corners of both (chance gives 0.03); below, keyframes before are tried no more
 
 
@@ -87,6 +87,7 @@ class KeyframeMatches(NamedTuple):
     coarse: FlowPair | None = None
 
 
+# Columns of the table of points.
 _POINT = np.dtype([("host", np.int64), ("pixel", np.float64, (2,)), ("log_depth", np.float64), ("sigma", np.float32)])
 _MATCH = np.dtype([("point", np.int64), ("keyframe", np.int64), ("pixel", np.float64, (2,))])
 """An observation, in the order in which they were found; its pixel is as in the image."""
@@ -105,7 +106,7 @@ class FeatureTracks:
         table: RowTable = rows_in_memory,
         gaps: Collection[int] | None = None,
     ) -> None:
-        self.settings, self._flow = settings.constants, flow
+        self.settings, self._flow = settings, flow
         self._gaps = gaps or self.settings.keyframe_gaps
         self._recent: dict[int, deque[_FlowKeyframe]] = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)

@@ -17,7 +17,7 @@ from scopemap.engine.mapping.nonrigid_adjustment import LeftOutTracks
 from scopemap.engine.mapping.other_starts import ShapeTest
 from scopemap.engine.notices import Notice
 
-_AT_REST = 1e-6  # rad
+_AT_REST = 1e-6  # guard: rad
 
 
 class TrackedPose(NamedTuple):

@@ -10,7 +10,7 @@ from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.mapping.bundle_adjustment import with_points
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, State, reproject
 
-_RESCALINGS = 3
+_RESCALINGS = 3  # by hand: of the robust standard deviation
 
 
 def part_of(problem: BundleProblem, chosen: np.ndarray) -> BundleProblem:

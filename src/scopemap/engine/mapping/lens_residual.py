@@ -21,17 +21,19 @@ from scopemap.engine.mapping.bundle_adjustment import WINDOW, adjust, linearised
 from scopemap.engine.mapping.bundle_problem import BundleProblem, State
 from scopemap.engine.notices import Notice
 
-_RESIDUAL_SIGMA = np.array([0.3, 0.2, 0.2])  # prior standard deviations of ln f, and of the principal point over f
-_RESIDUAL_DEPTH = 3.0  # factor of the estimated depth's deviation there: errors of a network bend the lens, too
+# By hand: prior standard deviations of ln f, and of the principal point over f.
+_RESIDUAL_SIGMA = np.array([0.3, 0.2, 0.2])
+# By hand: factor of the estimated depth's deviation there: errors of a network bend the lens, too.
+_RESIDUAL_DEPTH = 3.0
 _SIGNIFICANT = 5.0  # standard deviations: a right lens of a real clip had 3.4, the least noticed wrong one 6.7
-_FOCAL_SIGMA = 0.05  # of ln f, above which the views say too little of the lens to confirm it
-_MOST_SURFACE = 0.035
+_FOCAL_SIGMA = 0.05  # by hand: of ln f, above which the views say too little of the lens to confirm it
+_MOST_SURFACE = 0.035  # 5 % of the table of verdicts, less 1.5 %
 _MOST_PATH = 0.03
 """Changes of surface and path above which the views contradict the lens: the 5 % and 3 % above which the table of
 verdicts calls a result wrong, less the 1.5 % by which surfaces are off with a right lens."""
-_LEAST_POINTS = 10  # of a keyframe whose shape is compared
-_ITERATIONS = 40  # a wrong lens may be far away
-_MIN_DECREASE = 1e-4
+_LEAST_POINTS = 10  # by hand: of a keyframe whose shape is compared
+_ITERATIONS = 40  # by hand: a wrong lens may be far away
+_MIN_DECREASE = 1e-4  # by hand: relative, of the cost, that ends the adjustment
 
 
 class LensResidual(NamedTuple):

@@ -27,13 +27,13 @@ from scopemap.engine.mapping.lens_residual import LensEvidence, LensResidual, le
 from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.engine.notices import Notice
 
-_FREE = 3  # last keyframes of the window that move
-_ITERATIONS = 10
-_LEAST_SEEN = 0.1  # of a keyframe's points that those before it must observe: else nothing corrects its depth
-_REMEMBERED = 1000  # keyframes whose correction is kept: the tracker returns to fewer
-_LENS_EVERY = 4  # adjusted keyframes: windows that have hardly a keyframe in common
-_LENS_SIGMA = 0.01  # of ln f, below which no further windows are asked
-_MOST_REFUSED = 0.1  # of the keyframes: with more, the scene is not rigid
+_FREE = 3  # by hand: last keyframes of the window that move
+_ITERATIONS = 10  # by hand: steps of a window's adjustment
+_LEAST_SEEN = 0.1  # by hand: of a keyframe's points that those before it must observe: else nothing corrects its depth
+_REMEMBERED = 1000  # by hand: keyframes whose correction is kept: the tracker returns to fewer
+_LENS_EVERY = 4  # by hand: adjusted keyframes: windows that have hardly a keyframe in common
+_LENS_SIGMA = 0.01  # by hand: of ln f, below which no further windows are asked
+_MOST_REFUSED = 0.1  # by hand: of the keyframes: with more, the scene is not rigid
 
 
 class KeyframeCorrection(NamedTuple):
@@ -82,8 +82,8 @@ class LocalAdjustment:
 
     def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
         self._settings, self._flow = settings, flow
-        self._tracks = FeatureTracks(settings, flow, gaps=settings.constants.local_gaps)
-        self._window: deque[_WindowKeyframe] = deque(maxlen=settings.constants.local_window)
+        self._tracks = FeatureTracks(settings, flow, gaps=settings.local_gaps)
+        self._window: deque[_WindowKeyframe] = deque(maxlen=settings.local_window)
         self._corrections: dict[int, KeyframeCorrection] = {}
         self._adjusted, self._refused = Counter[int](), Counter[int]()
         self._lens_evidence: LensEvidence | None = None
@@ -153,7 +153,7 @@ class LocalAdjustment:
 
     def _begin(self) -> None:
         """Begin a window without keyframes."""
-        self._tracks = FeatureTracks(self._settings, self._flow, gaps=self._settings.constants.local_gaps)
+        self._tracks = FeatureTracks(self._settings, self._flow, gaps=self._settings.local_gaps)
         self._window.clear()
         self._is_determined = False
 
@@ -173,7 +173,7 @@ class LocalAdjustment:
 
     def _problem(self, points: Points, observations: Observations, focal_px: float) -> BundleProblem:
         """Return the adjustment of the window, from where its keyframes are; the first ones are held."""
-        constants, count = self._settings.constants, len(self._window)
+        settings, count = self._settings, len(self._window)
         _, _, T_camera_world, log_scale, log_depth, found_sigma = map(list, zip(*self._window, strict=True))
         T, lens = np.stack(T_camera_world), np.array([np.log(focal_px), 0.0, 0.0])
         start = State(T, np.array(log_scale), np.concatenate(log_depth), lens)
@@ -181,10 +181,10 @@ class LocalAdjustment:
         known, sigma = points.host < held, np.clip(np.concatenate(found_sigma), HELD_SIGMA, points.sigma)
         estimated = np.where(known, start.log_depth - start.log_scale[points.host], points.log_depth)
         points = replace(points, log_depth=estimated, sigma=np.where(known, sigma, points.sigma))
-        rotation_rad = math.radians(constants.rotation_sigma_deg)
-        priors = Priors(constants.scale_sigma, rotation_rad, constants.translation_sigma_share)
+        rotation_rad = math.radians(settings.rotation_sigma_deg)
+        priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
         facts = (points, observations, priors, np.arange(count - 1)[:, None] + [0, 1], focal_px)
-        correlated = constants.correlated_observations
+        correlated = settings.correlated_observations
         return BundleProblem(T, *facts, start=start, correlated=correlated, held=held)
 
     def _with_other_starts(
@@ -192,7 +192,7 @@ class LocalAdjustment:
     ) -> tuple[BundleSolution, ShapeTest]:
         """Return the solution of the start that wins in a full window, until one determines the shape; and the test."""
         is_due = len(self._window) == self._window.maxlen and not self._is_determined
-        if not (is_due and self._settings.constants.other_starts):
+        if not (is_due and self._settings.other_starts):
             return found, ShapeTest()
         problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
         best, test = with_other_starts(problem, found, is_rigid=found.sigma_px <= RIGID_SIGMA_PX)
@@ -223,5 +223,5 @@ class LocalAdjustment:
             self._window[k] = keyframe._replace(**changed)
         alone = Points(points.host[own] - last, points.pixel[own], points.log_depth[own], points.sigma[own])
         error = state.log_depth[own] - alone.log_depth - log_scale
-        step_sigma = self._settings.constants.depth_step_sigma
+        step_sigma = self._settings.depth_step_sigma
         return KeyframeCorrection(log_scale, fit_depth_corrections(camera, alone, 1, error, sigma[own], step_sigma)[0])

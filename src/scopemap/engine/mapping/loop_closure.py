@@ -24,29 +24,29 @@ from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.geometry.se3 import transform
 from scopemap.engine.tracking.features import FeatureDetector, Features, SiftFeatures, relative_pose_pnp, similarity
 
-_STRONGEST_VALUES = 8192  # of the descriptors of the strongest features, by which candidates are ranked
-_CANDIDATES = 3
-_STATIC_PX = 2.0
+_STRONGEST_VALUES = 8192  # by hand: of the descriptors of the strongest features, by which candidates are ranked
+_CANDIDATES = 3  # by hand: that are verified, the most similar ones
+_STATIC_PX = 2.0  # by hand: features that move less between two maps may be dirt on the lens
 # With a camera at rest every keyframe would close loops to the same few ones; the adjustment's cost is their square.
-_MIN_INTERVAL = 5  # keyframes between two loops to the same keyframe, loops to one keyframe
-_MAX_LOOPS = 20
-MOST_RECENT = 8
+_MIN_INTERVAL = 5  # by hand: keyframes between two loops to the same keyframe, loops to one keyframe
+_MAX_LOOPS = 20  # by hand
+MOST_RECENT = 8  # by hand
 """Keyframes just before a new one: flow leads to them, and loops are sought to those before them."""
-_MAX_PAIRS = 60  # features of a loop
-MOST_SEARCHED = 400
+_MAX_PAIRS = 60  # by hand: features of a loop
+MOST_SEARCHED = 400  # by hand
 """Keyframes with features; above, every second one is forgotten, so that memory and time of a search are bounded."""
-_TRIED_BETWEEN = 20  # pairs of keyframes that are verified at the end: of two maps, of all maps
-_MOST_TRIED = 1000
+_TRIED_BETWEEN = 20  # by hand: pairs of keyframes that are verified at the end: of two maps, of all maps
+_MOST_TRIED = 1000  # by hand, for time
 LOOP = np.dtype([("past", np.int64), ("new", np.int64), ("T_new_past", np.float64, (4, 4)), ("log_ratio", np.float64)])
 """A loop without its features."""
-_WIDTH = 160  # px of the small picture, and between the pixels that are compared
-_HEIGHT = 128
-_STEP = 2
-_FINE_PX = 0.75  # standard deviations of the Gaussians between which the detail lies
-_COARSE_PX = 2.5
-_DARKEST = 8.0  # grey levels added before the logarithm
-_LEAST_CONTRAST = 0.01  # ln, below which detail is noise
-_MIN_PIXELS = 100
+_WIDTH = 160  # by hand: px of the small picture, and between the pixels that are compared
+_HEIGHT = 128  # by hand
+_STEP = 2  # by hand
+_FINE_PX = 0.75  # by hand: standard deviations of the Gaussians between which the detail lies
+_COARSE_PX = 2.5  # by hand
+_DARKEST = 8.0  # by hand: grey levels added before the logarithm
+_LEAST_CONTRAST = 0.01  # by hand: ln, below which detail is noise
+_MIN_PIXELS = 100  # by hand: fewer pixels in common verify nothing
 # In an examination of which the truth is known: 97 of 100 right loops are above, and 8 of 100 wrong ones.
 _MIN_CORRELATION = 0.12
 VIEW = np.dtype(
@@ -59,7 +59,7 @@ VIEW = np.dtype(
 
 NaN: not usable, or the depth is unknown.
 """
-_NO_FEATURES = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+_NO_FEATURES = (np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))  # of a loop without features
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class LoopFinder:
     """Takes keyframes one by one and returns the loops that each closes, to long before and to other maps.
 
     Candidates are the keyframes with the most similar features. A loop is accepted if PnP places the new keyframe with
-    at least `settings.constants.min_loop_inliers` inliers and both look alike there (`is_verified`). table : where is
+    at least `settings.min_loop_inliers` inliers and both look alike there (`is_verified`). table : where is
     kept what only this needs. detector : of features; None: SIFT.
     """
 
@@ -122,7 +122,7 @@ class LoopFinder:
     ) -> None:
         self._detector = detector or SiftFeatures()
         self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
-        self._min_inliers, gaps = settings.constants.min_loop_inliers, settings.constants.keyframe_gaps
+        self._min_inliers, gaps = settings.min_loop_inliers, settings.keyframe_gaps
         self._max_gap = min(max(gaps), MOST_RECENT)
         self._features: dict[int, _KeptFeatures] = {}
         self._rows, self._views = table("features", self._kind), table("views", VIEW)

@@ -27,10 +27,10 @@ from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.mapping.frame_correction import TrackedPose
 from scopemap.engine.mapping.loop_closure import Loop
 
-_MIN_SUPPORT = 2  # agreeing keyframes in either map
+_MIN_SUPPORT = 2  # by hand: agreeing keyframes in either map
 # Maps drift independently: two loops agree within these, rad, share of the scene's depth, ln.
-_MAX_DIFFERENCE = (0.2, 0.3, 0.3)
-_MAX_LOG_SCALE = 1.0  # between maps of one video
+_MAX_DIFFERENCE = (0.2, 0.3, 0.3)  # by hand
+_MAX_LOG_SCALE = 1.0  # by hand: between maps of one video
 # Observations of points in common that support a motion tracked across a loss: as many as relocalisation needs inliers.
 _MIN_COMMON = 20
 

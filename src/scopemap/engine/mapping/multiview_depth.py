@@ -37,29 +37,30 @@ from scopemap.engine.notices import Notice
 
 # Displacements in px per unit of ln depth that are aimed at: the median of all pixels, and that of the farthest fifth.
 # Less is noise, more is hard to match.
-_PARALLAX_PX = (10.0, 20.0)
-_FAR_PARALLAX_PX = (12.0,)
-_MIN_PARALLAX_PX = 1.5
-_FAR_PERCENTILE = 80
+_PARALLAX_PX = (10.0, 20.0)  # by hand
+_FAR_PARALLAX_PX = (12.0,)  # by hand
+_MIN_PARALLAX_PX = 1.5  # by hand
+_FAR_PERCENTILE = 80  # by hand: the farthest fifth
 # Frames before and after a keyframe among which its neighbours are sought, and the step of the pixels that tell.
-_SEARCHED_FRAMES = 150
-_SAMPLED_EVERY = 8
+_SEARCHED_FRAMES = 150  # by hand
+_SAMPLED_EVERY = 8  # by hand, for time
 # Standard deviations of flow along one axis, and of predicted ln depth.
-_FLOW_SIGMA_PX = 0.3
-PRIOR_SIGMA = 0.3
+_FLOW_SIGMA_PX = 0.3  # by hand
+PRIOR_SIGMA = 0.3  # by hand: of predicted ln depth
 # Above this median standard deviation tissue moves or poses are wrong: the predicted depth is better.
-MAX_SIGMA = 0.08
-_MAX_LOG_FACTOR = 0.5
-_MIN_SPREAD = 4.0  # grey levels of normalised contrast, standard deviation
-_WARPS = 2
-_PROPAGATED_EVERY = 2  # pixels of a row and a column are compared with keyframes; what depth is off by is smooth
-_CACHED_VIEWS = 24
+MAX_SIGMA = 0.08  # by hand
+_MAX_LOG_FACTOR = 0.5  # by hand: guard against wrong matches
+_MIN_SPREAD = 4.0  # by hand: grey levels of normalised contrast, standard deviation
+_WARPS = 2  # by hand: of each neighbour, the second from the depth that the first has found
+# By hand: pixels of a row and a column are compared with keyframes; what depth is off by is smooth.
+_PROPAGATED_EVERY = 2
+_CACHED_VIEWS = 24  # by hand, for memory: the result does not depend on it
 # Standard deviations of Gaussian windows, px: of local contrast, of the disagreement's mean, of the result, and of
 # the result where little is measured.
-_CONTRAST_PX = 6.0
-_DISAGREEMENT_PX = 6.0
-_SMOOTHING_PX = 2.0
-_WIDE_PX = 16.0
+_CONTRAST_PX = 6.0  # by hand
+_DISAGREEMENT_PX = 6.0  # by hand
+_SMOOTHING_PX = 2.0  # by hand
+_WIDE_PX = 16.0  # by hand
 
 
 class StereoView(NamedTuple):

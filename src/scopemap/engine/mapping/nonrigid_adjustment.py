@@ -33,32 +33,32 @@ from scopemap.engine.mapping.deformation_graph import (
 from scopemap.engine.mapping.left_out import part_of, placed
 from scopemap.engine.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, solve
 
-LEAST_KEYFRAMES = 6
-MOST_KEYFRAMES = 300
+LEAST_KEYFRAMES = 6  # by hand
+MOST_KEYFRAMES = 300  # by hand
 """With fewer keyframes no curve is known; with more, time and memory of the adjustment would grow too much."""
-RIGID_CORE_PX = 0.4
+RIGID_CORE_PX = 0.4  # by hand
 """Robust standard deviation of a rigid solution below which most of the tissue is at rest."""
-_NODES = 60
+_NODES = 60  # by hand
 # Nodes that find the curves, of up to so many keyframes and of many, and the least hat functions of each.
-_CURVE_NODES = 15
-_FEW_KEYFRAMES = 60
-_LEAST_CURVE_NODES = 10
-_LEAST_HATS = 30
-_THINNED = 3  # one of so many points finds the curve
+_CURVE_NODES = 15  # by hand
+_FEW_KEYFRAMES = 60  # by hand
+_LEAST_CURVE_NODES = 10  # by hand
+_LEAST_HATS = 30  # by hand
+_THINNED = 3  # by hand: one of so many points finds the curve
 # Nodes that move step by step, and those that follow a curve; priors of tracked motion are tighter by the last factor.
-_FREE = MotionPrior(0.1, 0.03, 0.03)
-_ONE_CURVE = MotionPrior(0.2, 0.1, 0.03)
-_TRACKED_SHARE = 0.05
-_CELL_PX = 16  # cells of the picture, and which share of them is left out
-_EVERY = 5
+_FREE = MotionPrior(0.1, 0.03, 0.03)  # by hand
+_ONE_CURVE = MotionPrior(0.2, 0.1, 0.03)  # by hand
+_TRACKED_SHARE = 0.05  # by hand
+_CELL_PX = 16  # by hand: cells of the picture, and which share of them is left out
+_EVERY = 5  # by hand: every fifth cell
 # Left-out errors: that count as wrong, and beyond which an error counts no more, px.
-_WRONG_PX = 2.0
-_FALSE_PX = 10.0
-_LEAST_FACTOR = 1.5
-_LEAST_FALL = 0.05
-_LEAST_LEFT_OUT = 100  # observations
+_WRONG_PX = 2.0  # by hand
+_FALSE_PX = 10.0  # by hand
+_LEAST_FACTOR = 1.5  # by hand: the rigid solution's errors over these, at least
+_LEAST_FALL = 0.05  # by hand: of the share of wrong observations
+_LEAST_LEFT_OUT = 100  # by hand: observations
 # Beside a core at rest a node moves where the share of wrong observations exceeds that of most nodes by so much.
-_MOVING_SHARE = 0.02
+_MOVING_SHARE = 0.02  # by hand
 
 
 @dataclass(frozen=True)

@@ -30,12 +30,12 @@ from scopemap.engine.mapping.bundle_adjustment import (
 )
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Reprojection, State, jacobians, reproject
 
-_RIDGE = 1e-9  # of the diagonal
+_RIDGE = 1e-9  # guard: of the diagonal
 # Of nodes that move step by step only the curve is needed, which is found long before them.
-_MAX_ITERATIONS = 20
-_FOR_CURVE = 6
-_MIN_DECREASE = 1e-3
-_CURVE_SIGMA = 0.3  # prior standard deviation of a curve, whose largest value is 1
+_MAX_ITERATIONS = 20  # by hand
+_FOR_CURVE = 6  # by hand
+_MIN_DECREASE = 1e-3  # by hand: relative, of the cost, that ends the adjustment
+_CURVE_SIGMA = 0.3  # by hand: prior standard deviation of a curve, whose largest value is 1
 
 
 @dataclass(frozen=True)

@@ -32,18 +32,18 @@ from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, 
 from scopemap.engine.mapping.left_out import part_of, placed
 from scopemap.engine.notices import Notice
 
-MOST_KEYFRAMES = 60
+MOST_KEYFRAMES = 60  # by hand
 """That are tested at first."""
-_POINTS = 100  # of a keyframe that are adjusted, and as many that are left out
-_LOOSE_SIGMA = 0.5  # standard deviation of ln depth by which other starts hold their points
+_POINTS = 100  # by hand: of a keyframe that are adjusted, and as many that are left out
+_LOOSE_SIGMA = 0.5  # by hand: standard deviation of ln depth by which other starts hold their points
 # Of poses without a start: half a radian, half the depth.
-_NO_POSES = Priors(scale=0.3, rotation_rad=0.5, translation_share=0.5)
-_KNOWN_SIGMA = 0.2  # standard deviation of ln depth below which a left-out point tells of the shape
-_LEAST_POINTS = 50  # with fewer such points nothing is compared: the camera hardly moved
-_LEAST_OF_KEYFRAME = 5
+_NO_POSES = Priors(scale=0.3, rotation_rad=0.5, translation_share=0.5)  # by hand
+_KNOWN_SIGMA = 0.2  # by hand: standard deviation of ln depth below which a left-out point tells of the shape
+_LEAST_POINTS = 50  # by hand: with fewer such points nothing is compared: the camera hardly moved
+_LEAST_OF_KEYFRAME = 5  # by hand: fewer such points of a keyframe have no relief
 # Two shapes meet. Real clips: the same valley .96 to 1.00 and .003 to .07; another one at most .84, and .07 to .39.
 _LEAST_CORRELATION = 0.9
-_MOST_DIFFERENCE = 0.1
+_MOST_DIFFERENCE = 0.1  # see above
 # Errors of left-out tracks over those of the other shape. In the right valley of a laparoscopy .75; where both are
 # wrong, since tissue moves, .93 to 1.1.
 _CLEARLY_LESS = 0.85

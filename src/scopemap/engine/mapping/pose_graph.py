@@ -34,21 +34,21 @@ from scopemap.engine.mapping.loop_closure import Loop
 
 _UNKNOWNS = 7  # of a keyframe: rotation, position, ln scale
 # Standard deviations of an edge: rad, share of the scene's depth, ln. Only their ratio matters.
-_TRACKED_SIGMA = (0.01, 0.02, 0.03)
-_LOOP_SIGMA = (0.02, 0.03, 0.05)
+_TRACKED_SIGMA = (0.01, 0.02, 0.03)  # by hand
+_LOOP_SIGMA = (0.02, 0.03, 0.05)  # by hand
 # Of Cauchy's loss, in standard deviations. Wide at first: after much drift a true loop has errors as large as a false.
-_TOLERANCES = (100.0, 10.0, 1.0)
+_TOLERANCES = (100.0, 10.0, 1.0)  # by hand
 # Factored, not by conjugate gradients: long chains are stiff, and their steps end far too early beside false loops.
 _OPTIONS = Options(np.inf, min_step=0.0)
-_RIDGE = 1e-9  # of the unit matrix
-_MAX_LOOP_ERROR = 3.0  # root mean square, in standard deviations, of an accepted loop
+_RIDGE = 1e-9  # guard: of the unit matrix
+_MAX_LOOP_ERROR = 3.0  # by hand: root mean square, in standard deviations, of an accepted loop
 # A loop whose error as tracked exceeds this share of path length plus depth cannot be drift.
-_MAX_DRIFT_SHARE = 0.5
+_MAX_DRIFT_SHARE = 0.5  # by hand
 # Standard deviations, ln: of the network's scale at a keyframe, many of which err alike, of the drift from one keyframe
 # to the next, and of the change of that drift.
-_NETWORK_SIGMA = 0.2
-_DRIFT_SIGMA = 0.02
-_CHANGE_SIGMA = 0.002
+_NETWORK_SIGMA = 0.2  # by hand
+_DRIFT_SIGMA = 0.02  # by hand
+_CHANGE_SIGMA = 0.002  # by hand
 
 
 class PathWithoutDrift(NamedTuple):

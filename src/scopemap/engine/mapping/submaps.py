@@ -34,7 +34,7 @@ _TRACKED = np.dtype(
 )
 """Number of a frame, and its `TrackedPose`."""
 
-LEAST_FRAMES = 10
+LEAST_FRAMES = 10  # by hand
 """Tracked frames that a submap needs to be a result beside the largest."""
 
 
@@ -79,7 +79,7 @@ class Mapper:
         features: FeatureDetector | None = None,
         anchored: bool = False,
     ) -> None:
-        links = settings.constants.global_adjustment and flow.name != "none"
+        links = settings.global_adjustment and flow.name != "none"
         self._backend = Backend(settings, flow, table, features, anchored) if links else None
         self._rows = table("tracked_poses", _TRACKED)
         self._last: tuple[int, TrackedPose] | None = None

@@ -13,7 +13,7 @@ from scopemap.engine.geometry.skinning import skin_of
 
 TISSUE_MOTION = "tissue_motion.npz"
 """File of a result with the motion of its tissue."""
-_LEAST_NODES = 5
+_LEAST_NODES = 5  # guard: a file with fewer cannot be skinned
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,15 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-VIEW_SIGMA = 0.03
+VIEW_SIGMA = 0.03  # by hand
 """Standard deviation of ln depth from one neighbour that all pixels share: errors of poses."""
 
-_MAX_FLOW_PX = 20.0
-_MAX_PROPAGATED = 0.25  # larger differences between a frame's depth and its keyframe's are an occlusion
-_CAUCHY = 2.0
-_ITERATIONS = 4
-_LEAST_MM = 1e-3
-_OUTSIDE_PX = -1e4
+_MAX_FLOW_PX = 20.0  # by hand: more is a wrong match
+_MAX_PROPAGATED = 0.25  # by hand: larger differences between a frame's depth and its keyframe's are an occlusion
+_CAUCHY = 2.0  # by hand: residuals of that many standard deviations get half the weight
+_ITERATIONS = 4  # by hand: reweightings
+_LEAST_MM = 1e-3  # guard: division by z
+_OUTSIDE_PX = -1e4  # a place outside of every picture
 
 
 class Intrinsics(NamedTuple):

@@ -14,26 +14,26 @@ from scopemap.engine.masking.overlays import OverlayFinder
 from scopemap.engine.notices import Notice
 
 # The local level that a highlight stands out from is taken over this share of the image's longer side.
-_NEIGHBOURHOOD_SHARE = 0.09
-_DARKEST_HIGHLIGHT = 70
+_NEIGHBOURHOOD_SHARE = 0.09  # by hand
+_DARKEST_HIGHLIGHT = 70  # by hand: grey level of a highlight's darkest channel, at least
 # Level at which the second-brightest channel is saturated, and how far a highlight's darkest channel stands out.
-BRIGHT_LEVEL = 240
-_HIGHLIGHT_RATIO = 1.5
+BRIGHT_LEVEL = 240  # by hand
+_HIGHLIGHT_RATIO = 1.5  # by hand
 # A highlight is widened, and the field of view shrunk, by so much: their rims are blurred.
-_HIGHLIGHT_GROW_PX = 2
-BORDER_PX = 3
+_HIGHLIGHT_GROW_PX = 2  # by hand
+BORDER_PX = 3  # by hand
 # Width of the mean that leaves little of a sensor's noise.
-_CALM_WIDTH_PX = 5
-_MIN_FIELD_SHARE = 0.05
+_CALM_WIDTH_PX = 5  # by hand
+_MIN_FIELD_SHARE = 0.05  # by hand: of the picture; less is no field of view
 # Instruments: a region counts where this share of the picture is likelier than `_SEED`, and reaches as far as pixels
 # are likelier than `_REACH`, or than `_HELD` near instruments of the frame before.
-_SEED = 0.5
-_REACH = 0.04
-_HELD = 0.02
-_LEAST_SHARE = 0.0004
+_SEED = 0.5  # by hand
+_REACH = 0.04  # chosen on pictures of training scenes (docs/models/scopenet.md)
+_HELD = 0.02  # by hand
+_LEAST_SHARE = 0.0004  # by hand
 # How near that is, and how wide the blurred rim is, as shares of the picture's longer side.
-_NEAR_SHARE = 0.02
-_RIM_SHARE = 0.008
+_NEAR_SHARE = 0.02  # by hand
+_RIM_SHARE = 0.008  # by hand
 
 
 class FieldOfView:
@@ -96,7 +96,7 @@ class Masker:
     def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
         self._field = FieldOfView()
-        self._overlays = OverlayFinder() if settings.constants.overlays else None
+        self._overlays = OverlayFinder() if settings.overlays else None
         self._from_file = False
         self._instruments: np.ndarray | None = None
 
@@ -108,11 +108,11 @@ class Masker:
         """
         darkest, middle = darker_channels(frame.rgb)
         clipped = middle >= BRIGHT_LEVEL
-        lit = is_lit(frame.rgb, self.settings.constants.dark_level)
-        valid = frame.valid & lit & ~clipped if self.settings.constants.exposure else frame.valid
-        field = self._field(lit, frame.valid) if self.settings.constants.field_of_view else frame.valid
+        lit = is_lit(frame.rgb, self.settings.dark_level)
+        valid = frame.valid & lit & ~clipped if self.settings.exposure else frame.valid
+        field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
         highlights = np.zeros_like(valid)
-        if self.settings.constants.highlights:
+        if self.settings.highlights:
             bright = clipped | specular(darkest, field)
             highlights = frame.valid & field & (cv2.dilate(bright.astype(np.uint8), disc(_HIGHLIGHT_GROW_PX)) > 0)
             valid &= ~highlights

@@ -10,34 +10,34 @@ import numpy as np
 # The green channel: red tissue is dark there, so both white and black text have contrast.
 _CHANNEL = 1
 # Camera motion is detected in a small copy without its local mean, divided into parts; grey levels of 255.
-_SMALL_SIDE_PX = 60
-_LOCAL_PX = 9
-_PARTS = (8, 6)
-_TEXTURE = 1.0
-_ALIKE = 0.94
-_MIN_PARTS = 12
-_MOVED_SHARE = 0.7
-_MIN_COUNT = 12
-_MEMORY = 40
-_LOOK_EVERY = 4
+_SMALL_SIDE_PX = 60  # by hand
+_LOCAL_PX = 9  # by hand: of the local mean
+_PARTS = (8, 6)  # by hand: columns and rows of parts
+_TEXTURE = 1.0  # by hand: grey levels by which a part with texture varies
+_ALIKE = 0.94  # by hand: correlation below which a part has moved
+_MIN_PARTS = 12  # by hand: with texture
+_MOVED_SHARE = 0.7  # by hand: of these that must have moved
+_MIN_COUNT = 12  # by hand: moving frames before overlays are sought
+_MEMORY = 40  # by hand: moving frames over which changes are averaged
+_LOOK_EVERY = 4  # by hand: moving frames between two searches
 # Edge threshold, grey levels; share of an edge that may change on average and in one image (video coding changes it).
-_EDGE = 40
-_STILL_SHARE = 0.1
-_NOW_SHARE = 0.25
-_RIM_PX = 2
-_CLOSING_PX = 5
-_GROW_PX = 2
-_MIN_PX = 6
-_MAX_SHARE = 0.25
+_EDGE = 40  # by hand
+_STILL_SHARE = 0.1  # by hand
+_NOW_SHARE = 0.25  # by hand
+_RIM_PX = 2  # by hand: the rim of the field of view is static, too
+_CLOSING_PX = 5  # by hand: gaps in the edges of letters that are closed
+_GROW_PX = 2  # by hand: an overlay is widened by it
+_MIN_PX = 6  # by hand: of an overlay's edges
+_MAX_SHARE = 0.25  # by hand: of the picture, that an overlay fills
 # The surroundings of a static edge must change (grey levels after noise removal) or be uniform, nearly all of them.
-_CALM_PX = 5
-_NEAR_PX = 4
-_FAR_PX = 8
-_CHANGED = 1.5
-_PLAIN = 2.0
-_AROUND_SHARE = 0.7
+_CALM_PX = 5  # by hand
+_NEAR_PX = 4  # by hand: what is so near to an edge belongs to it
+_FAR_PX = 8  # by hand: what is so near surrounds it
+_CHANGED = 1.5  # by hand
+_PLAIN = 2.0  # by hand
+_AROUND_SHARE = 0.7  # by hand: nearly all
 # An overlay has disappeared where this share of its edge pixels differs (half of them belong to the surroundings).
-_GONE_SHARE = 0.25
+_GONE_SHARE = 0.25  # by hand
 
 
 @dataclass(frozen=True)

@@ -23,15 +23,15 @@ from scopemap.engine.tracking.features import Features, points_at
 STRIDE = 32  # of the network: both sides of its input are multiples
 _NETWORK = "alike.onnx"
 _MAPS = ["map1", "map2", "map3", "map4"]
-_MAX_FEATURES = 1000  # twice those of SIFT: where tissue is bare, the weaker half holds a third of the matches
-_RADIUS_PX = 2  # of the surroundings of which a keypoint has the highest score
-_TEMPERATURE = 0.1  # of the soft argmax
+_MAX_FEATURES = 1000  # by hand: twice those of SIFT: where tissue is bare, the weaker half holds a third of the matches
+_RADIUS_PX = 2  # ALIKE's: of the surroundings of which a keypoint has the highest score
+_TEMPERATURE = 0.1  # ALIKE's: of the soft argmax
 # Local brightness that pictures are brought to, its width as a share of the picture's, and what is added to the dark.
-_EVEN_LEVEL = 110.0
-_EVEN_SHARE = 1 / 16
-_DARKEST = 8.0
-_LOW_RESOLUTION = 4
-_MOST_KEPT = 32  # the keyframes in which a lost camera is searched among them
+_EVEN_LEVEL = 110.0  # by hand
+_EVEN_SHARE = 1 / 16  # by hand
+_DARKEST = 8.0  # by hand: grey levels
+_LOW_RESOLUTION = 4  # by hand, for time: what it leaves out is as smooth
+_MOST_KEPT = 32  # by hand: the keyframes in which a lost camera is searched among them
 
 
 class AlikeFeatures:

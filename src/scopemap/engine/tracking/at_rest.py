@@ -29,7 +29,7 @@ class CameraAtRest(FrameTracker):
         """Return the identity, with the motion of the tissue since the keyframe; "lost" where little is usable."""
         here, share = np.eye(4), float(frame.valid.mean())
         self._frames_since_keyframe += 1
-        if share < self._settings.constants.min_valid_share:
+        if share < self._settings.min_valid_share:
             reference = frame.index if self._keyframe is None else self._keyframe
             return Track(frame.index, "lost", f"only {share:.0%} of the image is usable", here, reference)
         if self._keyframe is None:
@@ -46,7 +46,7 @@ class CameraAtRest(FrameTracker):
     def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
         """Follow the corners of this frame from now on; False where too little of its depth is known."""
         known = frame.valid & np.isfinite(np.asarray(frame.depth_mm))
-        if known.mean() < self._settings.constants.min_valid_share:
+        if known.mean() < self._settings.min_valid_share:
             return False
         if self._matcher is not None:
             self._matcher.set_keyframe(frame)

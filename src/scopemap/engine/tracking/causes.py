@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-FAST_MOTION = 0.03
+FAST_MOTION = 0.03  # by hand
 """Median flow between two frames, share of the width, beyond which a frame is lost for its motion."""
 
 

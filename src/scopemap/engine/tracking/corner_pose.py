@@ -27,13 +27,13 @@ from scopemap.engine.geometry.least_squares import (
 )
 from scopemap.engine.geometry.se3 import orthonormalised, se3_exp
 
-_MIN_POINTS = 50
-_MIN_REGION_POINTS = 4
-_SIGMA_PX = 0.5
-_MIN_SCALE = 0.1
-_MAX_RESCALES = 20
+_MIN_POINTS = 50  # by hand: fewer corners give no pose
+_MIN_REGION_POINTS = 4  # by hand: of a region whose motion is measured
+_SIGMA_PX = 0.5  # by hand: standard deviation of a matched corner
+_MIN_SCALE = 0.1  # guard: of the robust standard deviation
+_MAX_RESCALES = 20  # guard: of a scale that does not settle
 _OPTIONS = Options()
-_SAME_SCALE = 0.01  # a relative change that is none
+_SAME_SCALE = 0.01  # by hand: a relative change that is none
 
 
 def pose_from_correspondences(

@@ -13,14 +13,14 @@ from scopemap.engine.flow.corners import usable_pixels
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import se3, so3_exp
 
-_MAX_FEATURES = 500
+_MAX_FEATURES = 500  # by hand
 _MIN_CONTRAST = 0.01  # a quarter of OpenCV's default: tissue texture is faint
-_MAX_EDGE_RATIO = 15.0
-_MAX_RATIO = 0.8  # Lowe's ratio test
-_MIN_SIMILARITY = 0.8  # cosine of descriptors above which they count for the similarity of two pictures
-_MAX_ITERATIONS = 500
-_CONFIDENCE = 0.999
-_INLIER_SHARE = 1 / 80  # largest reprojection error of an inlier, share of the image's width
+_MAX_EDGE_RATIO = 15.0  # by hand; OpenCV's default, Lowe's, is 10
+_MAX_RATIO = 0.8  # Lowe 2004: ratio test
+_MIN_SIMILARITY = 0.8  # by hand: cosine of descriptors above which they count for the similarity of two pictures
+_MAX_ITERATIONS = 500  # by hand: of RANSAC
+_CONFIDENCE = 0.999  # by hand: of RANSAC
+_INLIER_SHARE = 1 / 80  # by hand: largest reprojection error of an inlier, share of the image's width
 
 
 @dataclass(frozen=True)

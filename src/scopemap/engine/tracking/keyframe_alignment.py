@@ -21,12 +21,13 @@ from scopemap.engine.tracking.track import TrackingLoss
 
 MIN_TEXTURE = 0.5
 """Of an image that shows nothing but noise; tissue has 0.65 and more."""
-MAX_EXTRAPOLATION = 5
+MAX_EXTRAPOLATION = 5  # by hand
 """Frames for which the last motion is extrapolated after a loss."""
-_DOUBTFUL_INLIER_SHARE = 0.6  # below it an unsharp frame is lost, unless so many features match: by chance 20 at most
-_CLEAR_MATCHES = 40  # features that do not match by chance
-_MIN_COVERAGE = 0.1  # of the keyframe's corners that must be matched for them to support a pose
-_MAX_SUPPORT_PX = 2.0  # median reprojection error of a supported pose
+# By hand: below it an unsharp frame is lost, unless so many features match: by chance 20 at most.
+_DOUBTFUL_INLIER_SHARE = 0.6
+_CLEAR_MATCHES = 40  # by hand: features that do not match by chance
+_MIN_COVERAGE = 0.1  # by hand: of the keyframe's corners that must be matched for them to support a pose
+_MAX_SUPPORT_PX = 2.0  # by hand: median reprojection error of a supported pose
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class KeyframeAligner:
 
     def __init__(self, settings: TrackingSettings, flow: FlowEstimator | None, motion: MotionModel) -> None:
         self._settings, self.flow, self._motion = settings, flow, motion
-        with_corners = flow is not None and flow.name != "none" and settings.constants.corner_depth_sigma > 0
+        with_corners = flow is not None and flow.name != "none" and settings.corner_depth_sigma > 0
         self._matcher = KeyframeMatcher(flow) if flow is not None and with_corners else None
 
     def has_corners(self, keyframe: Keyframe) -> bool:
@@ -115,9 +116,9 @@ class KeyframeAligner:
         if by_corners is not None and self.rejection(keyframe, by_corners) is None:
             return by_corners, None
         pyramid, starts = self.pyramid(keyframe, frame), self._motion.predictions()
-        if self._settings.constants.start == "identity" and len(starts) == 1:
+        if self._settings.start == "identity" and len(starts) == 1:
             starts = [keyframe.T_world_camera]
-        searched = self.has_corners(keyframe) and self._settings.constants.relocalisation_keyframes > 0
+        searched = self.has_corners(keyframe) and self._settings.relocalisation_keyframes > 0
         found = []
         for T_start in (inverse(T) @ keyframe.T_world_camera for T in starts):
             judged = judge(keyframe.pyramid, pyramid, Motion(T_start, np.array([1.0, 0.0])))
@@ -142,7 +143,7 @@ class KeyframeAligner:
         correspondences = None if self._matcher is None else self._matcher.match(frame)
         if correspondences is None:
             return None
-        depth_sigma = self._settings.constants.corner_depth_sigma
+        depth_sigma = self._settings.corner_depth_sigma
         T = pose_from_correspondences(correspondences, frame.camera, T_start, depth_sigma)
         if T is None:
             return None
@@ -162,20 +163,20 @@ class KeyframeAligner:
 
     def rejection(self, keyframe: Keyframe, alignment: Alignment) -> TrackingLoss | None:
         """Return why an alignment is rejected, or None."""
-        T_world_camera, advanced = keyframe.pose_by(alignment), self._settings.constants
+        T_world_camera, settings = keyframe.pose_by(alignment), self._settings
         if not np.isfinite(T_world_camera).all():
             return TrackingLoss(LossCause.VIEW_CHANGED, "the alignment diverged")
-        if alignment.overlap < self._settings.constants.min_valid_share:
+        if alignment.overlap < self._settings.min_valid_share:
             return TrackingLoss(LossCause.VIEW_CHANGED, f"overlap {alignment.overlap:.0%} with the keyframe")
-        if alignment.inlier_share < advanced.min_inlier_share and not alignment.is_supported:
+        if alignment.inlier_share < settings.min_inlier_share and not alignment.is_supported:
             return TrackingLoss(LossCause.VIEW_CHANGED, f"inlier share {alignment.inlier_share:.0%} with the keyframe")
         # Measured depth constrains a pose by shape alone.
-        by_shape = keyframe.measured and advanced.depth_weight > 0
-        if alignment.correlation < advanced.min_correlation and not by_shape:
+        by_shape = keyframe.measured and settings.depth_weight > 0
+        if alignment.correlation < settings.min_correlation and not by_shape:
             if alignment.texture < MIN_TEXTURE:
                 return TrackingLoss(LossCause.NO_TEXTURE, "weakly constrained, hardly any texture")
             # A supported pose may be a pixel off, which decorrelates fine texture.
-            if alignment.correlation < advanced.min_correlation / 3 or not alignment.is_supported:
+            if alignment.correlation < settings.min_correlation / 3 or not alignment.is_supported:
                 return TrackingLoss(
                     LossCause.VIEW_CHANGED, f"correlation {alignment.correlation:.2f} with the keyframe"
                 )
@@ -185,7 +186,7 @@ class KeyframeAligner:
         T_step = inverse(self._motion.T_world_last) @ T_world_camera
         rotation_rad = float(rotation_angle_rad(T_step[:3, :3]))
         translation = float(np.linalg.norm(T_step[:3, 3])) / keyframe.depth_mm
-        if max(rotation_rad, translation) > advanced.max_step * (1 + self._motion.frames_lost):
+        if max(rotation_rad, translation) > settings.max_step * (1 + self._motion.frames_lost):
             jump = f"jump of {np.degrees(rotation_rad):.0f} deg and {translation:.2f} mean depths"
             return TrackingLoss(LossCause.VIEW_CHANGED, jump)
         return None

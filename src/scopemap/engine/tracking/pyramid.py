@@ -14,11 +14,12 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.tracking.residuals import View
 
-_GREY_UNIT = 32.0  # grey levels per residual unit without local normalisation: residuals of order one either way
-_SLOPE_SIGMA_PX = 1.5
-_NORMALISE_SIGMA_PX = 2.0
-_MIN_SIDE_PX = 16
-_NOISE_LEVEL = 2.0  # grey levels of local deviation below which an area counts as flat
+# By hand: grey levels per residual unit without local normalisation: residuals of order one either way.
+_GREY_UNIT = 32.0
+_SLOPE_SIGMA_PX = 1.5  # by hand: of the smoothing of depth before its slope is measured
+_NORMALISE_SIGMA_PX = 2.0  # chosen on cecum_t1_a (C3VD) and four phantoms: of the local mean and deviation
+_MIN_SIDE_PX = 16  # METHOD section WEMA-RTDL: no level is smaller
+_NOISE_LEVEL = 2.0  # by hand: grey levels of local deviation below which an area counts as flat
 
 
 def build_pyramid(
@@ -35,8 +36,8 @@ def build_pyramid(
     depth = np.full(grey.shape, np.nan, np.float32)
     if frame.depth_mm is not None:
         depth = np.where(frame.valid, frame.depth_mm, np.float32(np.nan))
-    finest = min(settings.constants.finest_level, settings.constants.levels - 1)
-    count = settings.constants.levels if levels is None else finest + levels
+    finest = min(settings.finest_level, settings.levels - 1)
+    count = settings.levels if levels is None else finest + levels
     camera = frame.camera
     views: list[View] = []
     for level in range(count):

@@ -27,21 +27,21 @@ from scopemap.engine.tracking.keyframe_alignment import Keyframe
 from scopemap.engine.tracking.rtdl import Alignment
 from scopemap.engine.tracking.track import Track
 
-_MIN_INLIERS = 20
-_STRONGEST = 128  # descriptors by which keyframes are ranked
-_CANDIDATES = 3  # those that are tried, of either group
+_MIN_INLIERS = 20  # by hand: of PnP; 20 match by chance, at most
+_STRONGEST = 128  # by hand: descriptors by which keyframes are ranked
+_CANDIDATES = 3  # by hand: those that are tried, of either group
 _LEAST_SIMILARITY = 3.0  # of keyframes that are tried: in less similar ones of a colonoscopy PnP succeeded once
-_MAX_APART = 0.3  # distance of an earlier keyframe's view, at most, and over that of the current one
-_NEARER = 0.7
-_CLOSE_UP_RANGE = 0.5  # of the range of ln depth of the keyframe: a frame with less is a close-up
-_EVERY_PX = 4
-_RANGE = (5, 95)
+_MAX_APART = 0.3  # by hand: distance of an earlier keyframe's view, at most, and over that of the current one
+_NEARER = 0.7  # by hand
+_CLOSE_UP_RANGE = 0.5  # by hand: of the range of ln depth of the keyframe: a frame with less is a close-up
+_EVERY_PX = 4  # by hand, for time
+_RANGE = (5, 95)  # by hand: percentiles between which the range is measured
 # Of flow that supports a rotation: step of its pixels, share of them that is matched, median error over the width.
-_FLOW_EVERY_PX = 8
-_FOLLOWED_COVERAGE = 0.25
-_FOLLOWED_ERROR = 0.01
-_DEPTH_SIGMA = 0.2  # relative standard deviation of depth in a close-up
-_MIN_MAP_FRAMES = 5  # tracked in another map before relocalisation searches it
+_FLOW_EVERY_PX = 8  # by hand
+_FOLLOWED_COVERAGE = 0.25  # by hand
+_FOLLOWED_ERROR = 0.01  # by hand
+_DEPTH_SIGMA = 0.2  # by hand: relative standard deviation of depth in a close-up
+_MIN_MAP_FRAMES = 5  # by hand: tracked in another map before relocalisation searches it
 
 
 def is_close_up(frame: Frame, keyframe: Keyframe) -> bool:
@@ -136,8 +136,8 @@ class Relocaliser:
 
     def __init__(self, settings: TrackingSettings, detector: FeatureDetector) -> None:
         self.settings, self.detector = settings, detector
-        self._keyframes: deque[Keyframe] = deque(maxlen=settings.constants.relocalisation_keyframes)
-        self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.constants.relocalisation_keyframes)
+        self._keyframes: deque[Keyframe] = deque(maxlen=settings.relocalisation_keyframes)
+        self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.relocalisation_keyframes)
         self._features: dict[int, Features] = {}
         self._frames_of_map: Counter[int] = Counter()
 
@@ -174,7 +174,7 @@ class Relocaliser:
         that are searched in any case. recent : whether the others of the current map are, too. other_maps : whether
         those of other maps are, where none of these is found.
         """
-        if self.settings.constants.relocalisation_keyframes == 0:
+        if self.settings.relocalisation_keyframes == 0:
             return None
         current = self.detector.detect(replace(frame, depth_mm=None))
         kept = {keyframe.frame.index for keyframe in (*self._keyframes, *self._of_other_maps, *near)}

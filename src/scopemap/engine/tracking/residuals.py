@@ -27,9 +27,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-PARAMETERS = 8
-_MAX_SURFACE_SPREAD = 0.1  # of four neighbouring depths on one surface, relative
-_MAX_DEPTH_DIFFERENCE = 0.1  # of associated points, relative
+PARAMETERS = 8  # of an alignment: rotation, translation, gain and bias
+_MAX_SURFACE_SPREAD = 0.1  # by hand: of four neighbouring depths on one surface, relative
+_MAX_DEPTH_DIFFERENCE = 0.1  # by hand: of associated points, relative
 
 
 class View(NamedTuple):

@@ -22,11 +22,11 @@ from scopemap.engine.tracking.residuals import (
 )
 
 _LIT = np.array([True, False])  # grey, normalised: the channels of a pyramid
-_INLIER = 0.5
-_MIN_SIGMA = 1e-3  # avoids division by zero in flat images
-_MIN_DEPTH_SIGMA = 1e-3  # of the distance to measured depth, share of the keyframe's mean depth
-_GREY_SHARE = 0.3  # weight of the grey channel against the normalised one
-_RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth
+_INLIER = 0.5  # by hand: residual of an inlier, in units of the normalised channel
+_MIN_SIGMA = 1e-3  # guard: division by zero in flat images
+_MIN_DEPTH_SIGMA = 1e-3  # guard: of the distance to measured depth, share of the keyframe's mean depth
+_GREY_SHARE = 0.3  # by hand: weight of the grey channel against the normalised one
+_RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth; METHOD gives none, not searched
 
 
 class Motion(NamedTuple):
@@ -74,23 +74,23 @@ def align(reference: list[View], current: list[View], T_start: np.ndarray, setti
     depth = reference[-1].depth_mm
     unit_mm = float(np.nanmean(depth)) if np.isfinite(depth).any() else 1.0
     for level in reversed(range(len(reference))):
-        rotation_only = settings.constants.rotation_first and level == len(reference) - 1 and len(reference) > 1
+        rotation_only = settings.rotation_first and level == len(reference) - 1 and len(reference) > 1
         motion, steps = _align_level(reference[level], current[level], motion, settings, rotation_only, unit_mm)
         iterations += steps
         coarse = math.inf if rotation_only else _correlation(reference[level:], current[level:], motion, settings)
-        if coarse < settings.constants.min_correlation:
+        if coarse < settings.min_correlation:
             break
     # The inverse by transposition doubles the error of a rotation matrix at every frame.
     motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
     found = judge(reference, current, motion, iterations)
     # What ended at a coarse level is not to be accepted, however well it happens to correlate at the finest.
-    ended = coarse < settings.constants.min_correlation
+    ended = coarse < settings.min_correlation
     return replace(found, correlation=min(found.correlation, coarse)) if ended else found
 
 
 def _correlation(reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings) -> float:
     """Return the correlation at the finest of these levels; infinite where measured depth takes part."""
-    by_shape = settings.constants.depth_weight > 0 and np.isfinite(current[0].depth_mm).any()
+    by_shape = settings.depth_weight > 0 and np.isfinite(current[0].depth_mm).any()
     return math.inf if by_shape else judge(reference, current, motion).correlation
 
 
@@ -108,8 +108,8 @@ def judge(reference: list[View], current: list[View], motion: Motion, iterations
 
 
 def _loss(sigma: np.ndarray, settings: TrackingSettings) -> Loss:
-    share = (1.0, 0.0) if settings.constants.channels == "grey" else (_GREY_SHARE, 1.0)
-    return Loss(sigma, settings.constants.huber, np.array(share), _LIT, settings.constants.lamp_gamma)
+    share = (1.0, 0.0) if settings.channels == "grey" else (_GREY_SHARE, 1.0)
+    return Loss(sigma, settings.huber, np.array(share), _LIT, settings.lamp_gamma)
 
 
 def _align_level(
@@ -118,17 +118,15 @@ def _align_level(
     loss = _loss(np.ones(len(reference.channels)), settings)
     start = residual_images(reference, current, motion.T_current_reference, motion.affine, loss)
     loss = _loss(np.array([robust_sigma(r[np.isfinite(r)], _MIN_SIGMA) for r in start]), settings)
-    if settings.constants.depth_weight > 0 and np.isfinite(current.depth_mm).any():
+    if settings.depth_weight > 0 and np.isfinite(current.depth_mm).any():
         gaps = depth_residuals(reference, current, motion.T_current_reference, unit_mm)
         gaps = gaps[np.isfinite(gaps)]
         if gaps.size:
             sigma = robust_sigma(gaps, _MIN_DEPTH_SIGMA)
-            loss = loss._replace(depth_sigma=sigma, depth_share=settings.constants.depth_weight)
+            loss = loss._replace(depth_sigma=sigma, depth_share=settings.depth_weight)
     min_weight = 0.5 * float(reference.weight[np.isfinite(start[0])].sum())
     free = np.array(
-        [0, 1, 2]
-        + ([] if rotation_only else [3, 4, 5])
-        + ([6, 7] if settings.constants.gain_bias and loss.share[0] > 0 else [])
+        [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.share[0] > 0 else [])
     )
 
     def linearise(state: Motion) -> DenseModel:
@@ -143,7 +141,7 @@ def _align_level(
         full[3:6] *= unit_mm
         return Motion(se3_exp(full[:6]) @ state.T_current_reference, state.affine + full[6:])
 
-    takes_full_steps = settings.constants.solver == "gauss-newton"
-    options = Options(_RADIUS, settings.constants.max_iterations, gauss_newton=takes_full_steps)
+    takes_full_steps = settings.solver == "gauss-newton"
+    options = Options(_RADIUS, settings.max_iterations, gauss_newton=takes_full_steps)
     solution = minimise(Problem(linearise, retract), motion, options)
     return solution.state, solution.iterations

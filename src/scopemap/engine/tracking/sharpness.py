@@ -9,9 +9,9 @@ import numpy as np
 
 from scopemap.engine.geometry.local_contrast import local_mean
 
-_FINE = 1 / 320  # of the picture's width: standard deviations of the two blurs
-_COARSE = 4 / 320
-_FRAMES = 30
+_FINE = 1 / 320  # by hand: of the picture's width: standard deviations of the two blurs
+_COARSE = 4 / 320  # by hand
+_FRAMES = 30  # by hand: of the median
 # Quality is measured in a small copy, against the upper quartile of so many frames: unlike their median, it is still
 # that of clear ones where fluid stays for seconds.
 _SMALL_PX = 320

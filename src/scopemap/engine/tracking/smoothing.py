@@ -26,8 +26,8 @@ class Wema:
         settings, past = self.settings, self._past
         smoothed = T_world_camera
         if len(past) == 2 and settings.method != "none":
-            s = 1.0 - np.exp(-self._count * settings.constants.omega) if settings.constants.dynamic else 1.0
-            weights = [s * settings.constants.alpha, s * settings.constants.beta, s * settings.constants.gamma]
+            s = 1.0 - np.exp(-self._count * settings.omega) if settings.dynamic else 1.0
+            weights = [s * settings.alpha, s * settings.beta, s * settings.gamma]
             # What is left, 1 - s, is the newest pose's too: it is the base of the tangent space.
             smoothed = mean_near(T_world_camera, [T_world_camera, past[1], past[0]], weights)
         self._past = [*past, T_world_camera][-2:]

@@ -30,12 +30,14 @@ from scopemap.engine.tracking.sharpness import SharpnessMonitor
 from scopemap.engine.tracking.track import FrameTracker, Track, TrackingLoss
 from scopemap.engine.tracking.usable import too_few_pixels
 
-_EARLIER_KEYFRAMES = 64  # of the current map, that are searched for one nearer than the current one
-_FOUND_OVERLAP = 0.25  # with the keyframe in which features find a frame: with less the pose hangs on a corner of it
-_WEAK_COVERAGE = 0.15  # of a pose that is compared with one by features
-_KEYFRAME_COVERAGE = 0.3  # a frame in which fewer corners are matched becomes a keyframe
-_REVISITED_COVERAGE = 0.5  # of an earlier keyframe's corners that must be matched for it to be tracked against again
-_CLEAR = 0.8  # of the best quality since the keyframe: below it the next one waits
+_EARLIER_KEYFRAMES = 64  # by hand: of the current map, that are searched for one nearer than the current one
+# By hand: with the keyframe in which features find a frame: with less the pose hangs on a corner of it.
+_FOUND_OVERLAP = 0.25
+_WEAK_COVERAGE = 0.15  # by hand: of a pose that is compared with one by features
+_KEYFRAME_COVERAGE = 0.3  # by hand: a frame in which fewer corners are matched becomes a keyframe
+# By hand: of an earlier keyframe's corners that must be matched for it to be tracked against again.
+_REVISITED_COVERAGE = 0.5
+_CLEAR = 0.8  # by hand: of the best quality since the keyframe: below it the next one waits
 _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 
 
@@ -79,11 +81,11 @@ class KeyframeChoice:
     def is_due(self, alignment: Alignment | None = None) -> bool:
         """Return whether a frame with this alignment should become a keyframe; None: the one that was accepted last."""
         alignment = alignment or self._last
-        constants = self._settings.constants
-        patience = constants.keyframe_patience if self._quality < _CLEAR * self._best_quality else 0
+        settings = self._settings
+        patience = settings.keyframe_patience if self._quality < _CLEAR * self._best_quality else 0
         if self.frames_since >= self._settings.keyframe_every + patience and self._has_moved(alignment):
             return True
-        least = constants.min_keyframe_agreement * (self._first_agreement or 0.0)
+        least = settings.min_keyframe_agreement * (self._first_agreement or 0.0)
         return alignment is not None and (alignment.agreement < least or alignment.coverage < _KEYFRAME_COVERAGE)
 
     def _has_moved(self, alignment: Alignment | None) -> bool:
@@ -91,7 +93,7 @@ class KeyframeChoice:
             return True
         T = alignment.motion.T_current_reference
         moved = rotation_angle_rad(T[:3, :3]) + np.linalg.norm(T[:3, 3]) / self._depth_mm
-        return bool(moved >= self._settings.constants.min_keyframe_motion)
+        return bool(moved >= self._settings.min_keyframe_motion)
 
 
 class Tracker(FrameTracker):
@@ -132,13 +134,13 @@ class Tracker(FrameTracker):
 
     def _track(self, frame: Frame, sharpness: float) -> Track:
         """Return the track of a frame with enough usable pixels."""
-        self._is_unsharp = sharpness < self.settings.constants.min_sharpness
+        self._is_unsharp = sharpness < self.settings.min_sharpness
         keyframe, was_lost = self._keyframe, self._motion.frames_lost > 0
         if keyframe is None:
             return self._lost(frame, _unsharp(sharpness)) if self._is_unsharp else self._first(frame)
         if not self._is_searched():
             self._sharp_frames_lost += not self._is_unsharp
-            skipped = f"not searched: one of {self.settings.constants.search_every} lost frames is"
+            skipped = f"not searched: one of {self.settings.search_every} lost frames is"
             return self._lost(frame, TrackingLoss(LossCause.OTHER, skipped))
         alignment, pyramid = self._aligner.align(keyframe, frame)
         if self._choice.is_due(alignment) and not was_lost and not self._rejection(alignment):
@@ -154,7 +156,7 @@ class Tracker(FrameTracker):
 
     def _is_searched(self) -> bool:
         """Whether a frame is looked for; of many in a row that are lost only some are."""
-        lost, every = self._motion.frames_lost, self.settings.constants.search_every
+        lost, every = self._motion.frames_lost, self.settings.search_every
         return lost <= MAX_EXTRAPOLATION or lost % every == 0
 
     def _failure(self, frame: Frame, alignment: Alignment, sharpness: float) -> _Failure | None:
@@ -165,14 +167,14 @@ class Tracker(FrameTracker):
         """
         assert self._keyframe is not None
         failure, rejection = None, self._rejection(alignment)
-        if is_obscured(sharpness, alignment, self.settings.constants.min_sharpness):
+        if is_obscured(sharpness, alignment, self.settings.min_sharpness):
             failure = _Failure(_unsharp(sharpness), is_obscured=True)
         elif rejection is not None:
             failure = _Failure(rejection, is_obscured=False)
         if failure is not None and is_close_up(frame, self._keyframe):
             self._after_close_up = True
             return failure._replace(loss=_in_contact(failure.loss))
-        if failure is None and self._after_close_up and self.settings.constants.relocalisation_keyframes:
+        if failure is None and self._after_close_up and self.settings.relocalisation_keyframes:
             return _Failure(TrackingLoss(LossCause.VIEW_CHANGED, _UNCONFIRMED), is_obscured=False)
         return failure
 
@@ -182,7 +184,7 @@ class Tracker(FrameTracker):
             self._sharp_frames_lost = 0
             return self._lost(frame, failure.loss, alignment)
         self._sharp_frames_lost += 1
-        most = self.settings.constants.new_map_after * (2 if self._after_close_up else 1)
+        most = self.settings.new_map_after * (2 if self._after_close_up else 1)
         if self._sharp_frames_lost > most > 0 and not self._is_unsharp:
             return self._new_map(frame)
         return self._lost(frame, failure.loss._replace(reason=f"rejected: {failure.loss.reason}"), alignment)
@@ -251,7 +253,7 @@ class Tracker(FrameTracker):
         assert frame.depth_mm is not None
         assert frame.T_world_camera is not None
         known = frame.valid & np.isfinite(frame.depth_mm)
-        if known.mean() < self.settings.constants.min_valid_share:
+        if known.mean() < self.settings.min_valid_share:
             return None
         pyramid = build_pyramid(frame, self.settings, use_slope=measured)
         mean_mm = float(frame.depth_mm[known].mean())
@@ -279,7 +281,7 @@ class Tracker(FrameTracker):
                 and alignment.overlap >= _FOUND_OVERLAP
                 # Of many keyframes one always fits a picture without texture.
                 and (keyframe.measured or alignment.texture >= MIN_TEXTURE)
-                and not is_obscured(sharpness, alignment, self.settings.constants.min_sharpness)
+                and not is_obscured(sharpness, alignment, self.settings.min_sharpness)
             ),
             near=near,
             recent=failed or self._motion.frames_lost > 0,

@@ -20,7 +20,7 @@ _MOST_LOW_TEXTURE = 10  # frames in a row that are tried all the same: motion bl
 def too_few_pixels(frame: Frame, settings: TrackingSettings) -> TrackingLoss | None:
     """Return why few pixels of a frame are usable: it is dark, overexposed, or covered; None: enough are."""
     share = float(frame.valid.mean())
-    if share >= settings.constants.min_valid_share:
+    if share >= settings.min_valid_share:
         return None
     low, middle = percentiles(frame.rgb[::2, ::2].max(axis=2), [20.0, 50.0])
     reason = f"only {share:.0%} of the image is usable"
@@ -34,7 +34,7 @@ def too_few_pixels(frame: Frame, settings: TrackingSettings) -> TrackingLoss | N
 def covered_by(instruments: np.ndarray, frame: Frame, settings: TrackingSettings) -> TrackingLoss | None:
     """Return that instruments (H, W) bool, left out of a frame, leave too few usable pixels; None: enough are left."""
     share = float(frame.valid.mean())
-    if share >= settings.constants.min_valid_share:
+    if share >= settings.min_valid_share:
         return None
     reason = f"only {share:.0%} of the image is usable: instruments cover {instruments.mean():.0%}"
     return TrackingLoss(LossCause.VIEW_COVERED, reason)
@@ -49,7 +49,7 @@ class TextureMonitor:
 
     def too_little(self, frame: Frame) -> TrackingLoss | None:
         """Return that this frame and those before it have too little texture; None: it is worth trying."""
-        least = self._settings.constants.min_texture
+        least = self._settings.min_texture
         found = texture(frame, self._settings) if least else math.inf
         self._low_texture = self._low_texture + 1 if found < least else 0
         if self._low_texture <= _MOST_LOW_TEXTURE:

@@ -12,8 +12,8 @@ from scopemap.engine.geometry.srgb import LINEAR
 
 # Linear red from which on it counts less, and from which on it does not count: sRGB levels 188 and 237.
 _SATURATES = 0.5
-_SATURATED = 0.85
-_DARKEST = 1e-3
+_SATURATED = 0.85  # sRGB level 237
+_DARKEST = 1e-3  # guard: sRGB level 3, below which there is only noise
 _LINEAR = LINEAR.astype(np.float32)
 
 

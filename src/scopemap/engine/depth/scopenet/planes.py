@@ -8,7 +8,7 @@ import numpy as np
 from scopemap.engine.errors import check_shape
 from scopemap.engine.geometry.srgb import LINEAR
 
-PLANES = 8
+PLANES = 8  # the network's input, as trained: colour, log brightness, rays and valid mask
 INSTRUMENTS = "instruments"  # name of that output
 STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
