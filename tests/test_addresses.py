@@ -15,7 +15,7 @@ from scopemap.engine.errors import InputError
 from scopemap.input.inputs import RemoteFile, is_address, named_inputs, remote_files
 from scopemap_bench.scripts.batch import CAMERA, write_videos
 
-QUICK = ["--set", "mapping.method=no-triangulation"]
+QUICK = ["--set", "mapping.triangulate_depth=false"]
 
 
 @pytest.fixture

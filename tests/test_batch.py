@@ -21,7 +21,7 @@ from scopemap.apps.batch.command import videos_of
 from scopemap.input.inputs import named_inputs
 from scopemap.report.batch_page import BatchRow, write_batch_page
 
-QUICK = ["--set", "mapping.method=no-triangulation"]
+QUICK = ["--set", "mapping.triangulate_depth=false"]
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,8 @@ READERS = {
     "networks": ["runner/estimators.py"],
     "tracking": ["engine/tracking/*.py", "runner/estimators.py", "engine/preprocessing.py"],
     "smoothing": ["engine/tracking/smoothing.py"],
-    "mapping": ["engine/mapping/*.py", "runner/*.py", "engine/pipeline.py"],
-    "fusion": ["engine/fusion/*.py", "engine/pipeline.py", "runner/run.py"],
+    "mapping": ["engine/mapping/*.py", "engine/finishing.py", "engine/pipeline.py"],
+    "fusion": ["engine/fusion/*.py", "engine/finishing.py", "engine/pipeline.py"],
 }
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import plane_scene
 import pytest
+from drawn_run import changed
 from plane_scene import CAMERA, EVERYWHERE
 from result_files import through_checkpoint
 from tiny_phantom import with_true_depth, write_tiny
@@ -179,7 +180,7 @@ def test_rotations_are_marked_where_a_wall_filled_the_picture_and_not_counted_as
 @pytest.mark.slow
 def test_rotations_are_in_the_folder_and_come_back(tmp_path: Path) -> None:
     phantom = write_tiny(tmp_path / "phantom", frames=8)
-    result = replace(reconstruct(open_sequence(phantom), with_true_depth(phantom)), frames=_frames_at_a_wall())
+    result = changed(reconstruct(open_sequence(phantom), with_true_depth(phantom)), frames=_frames_at_a_wall())
     assert result.lost["index"].tolist() == [3, 4, 5, 7]
     result.save(tmp_path / "out")
     found = read_trajectory(tmp_path / "out", kind="run")

@@ -18,7 +18,6 @@ class MappingSettings(StageSettings):
         "full": {},
         "none": {"local_window": 0, "global_adjustment": False},
         "local": {"triangulate_depth": False, "min_loop_inliers": 0, "global_adjustment": False},
-        "no-triangulation": {"triangulate_depth": False},
         "rigid": {"moving_tissue": False},
     }
     method: str = Field(

@@ -19,8 +19,8 @@ from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.similarity import structural_similarity
 from scopemap.engine.mapping.tissue_states import TissueStates
 
-_NEAR = float(np.log(1.1))
-_SAME_SURFACE = 0.02  # between a vertex and what is rendered at its pixel, of its depth: it is not hidden
+_NEAR = float(np.log(1.1))  # within 10 %
+_SAME_SURFACE = 0.02  # by hand: between a vertex and what is rendered at its pixel, of its depth: it is not hidden
 
 
 class FrameAgreement(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-_LEVEL = np.arange(256) / 255
+_LEVEL = np.arange(256) / 255  # 8-bit levels, 0..1
 LINEAR = np.where(_LEVEL <= 0.04045, _LEVEL / 12.92, ((_LEVEL + 0.055) / 1.055) ** 2.4)
 """Linear light, (256,) float64, 0..1, of each 8-bit level."""
 

@@ -37,10 +37,10 @@ from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.engine.notices import Notice
 
 # Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
-_MAX_ERROR_FACTOR = 1.5
-_NOISE_PX = 0.05
+_MAX_ERROR_FACTOR = 1.5  # by hand
+_NOISE_PX = 0.05  # by hand
 # Keyframes of either map with loops to the other, where errors between maps are larger than within or untested.
-_MIN_LOOPED = 4
+_MIN_LOOPED = 4  # by hand
 # Learned features are matched to about a pixel: errors between maps of one place were up to 0.96 px, of two from 1.38.
 _MAX_FEATURE_PX = 1.2
 

@@ -14,10 +14,10 @@ _COARSE = 4 / 320  # by hand
 _FRAMES = 30  # by hand: of the median
 # Quality is measured in a small copy, against the upper quartile of so many frames: unlike their median, it is still
 # that of clear ones where fluid stays for seconds.
-_SMALL_PX = 320
-_NEIGHBOURS = 100
-_CLEAR_PERCENTILE = 75
-LEAST_QUALITY = 0.01
+_SMALL_PX = 320  # by hand
+_NEIGHBOURS = 100  # by hand
+_CLEAR_PERCENTILE = 75  # by hand
+LEAST_QUALITY = 0.01  # guard: a frame still has a weight
 # Least sharpness, usable share and saturation of clear frames by which others are judged: pictures may all be flat, or
 # have no colours; coding alone makes saturations of one level in a hundred.
 _LEAST_MEASURES = np.array([1e-6, 1e-6, 0.02])

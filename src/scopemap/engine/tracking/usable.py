@@ -12,9 +12,9 @@ from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.pyramid import texture
 from scopemap.engine.tracking.track import TrackingLoss
 
-_DARK_LEVEL = 40  # of the brightest channel, in an image with few usable pixels
-_BRIGHT_LEVEL = 200
-_MOST_LOW_TEXTURE = 10  # frames in a row that are tried all the same: motion blur is shorter
+_DARK_LEVEL = 40  # by hand: of the brightest channel, in an image with few usable pixels
+_BRIGHT_LEVEL = 200  # by hand
+_MOST_LOW_TEXTURE = 10  # by hand: frames in a row that are tried all the same: motion blur is shorter
 
 
 def too_few_pixels(frame: Frame, settings: TrackingSettings) -> TrackingLoss | None:

@@ -12,8 +12,8 @@ PLANES = 8  # the network's input, as trained: colour, log brightness, rays and 
 INSTRUMENTS = "instruments"  # name of that output
 STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
-_DARKEST = 1e-3
-_HALF_LINEAR = (0.5 * LINEAR).astype(np.float32)
+_DARKEST = 1e-3  # guard
+_HALF_LINEAR = (0.5 * LINEAR).astype(np.float32)  # brightness is the mean of red and green
 
 
 def input_planes(rgb: np.ndarray, unit_rays: np.ndarray | None, valid: np.ndarray) -> np.ndarray:
