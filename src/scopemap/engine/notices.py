@@ -35,6 +35,11 @@ KINDS: dict[str, _Kind] = {
         "combs; --deinterlace (input.deinterlace=true) uses one field of each",
         "The video is interlaced: what moves has combed edges (see --deinterlace)",
     ),
+    "input-interlaced-averaged": _Kind(
+        "info",
+        "the pictures are interlaced: their even and odd rows were taken at two times; the working size averages both, "
+        "and what moves fast is blurred; --deinterlace (input.deinterlace=true) uses one field of each",
+    ),
     "input-text-burned-in": _Kind(
         "note",
         "by its header notes, perhaps a patient's name, are burned into the images",

@@ -7,14 +7,16 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
 
 from scopemap.engine.errors import SettingsError
 from scopemap.engine.frame import is_constant
-from scopemap.input.source import SourceFrame
+
+if TYPE_CHECKING:
+    from scopemap.input.source import SourceFrame
 
 _SLICE = re.compile(r"(-?\d{1,15})?:(-?\d{1,15})?(:\d{0,15})?")
 LEAST_DIFFERENCE = 0.5

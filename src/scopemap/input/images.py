@@ -15,6 +15,7 @@ import numpy as np
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.input.camera_files.reading import stated_calibration
 from scopemap.input.decoding import by_number, decoded, frame_number, read_decoded
+from scopemap.input.sampling import MOST_REPEATS, SampledPair, pair_of
 from scopemap.input.source import OWN_CALIBRATION, Source, SourceFrame
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -94,6 +95,12 @@ class ImageFolder(Source):
                 continue
             self._check_size(rgb, f"{file}: it")
             yield SourceFrame(number, self._time_s(number), rgb, file.name)
+
+    def sample_pairs(self, count: int) -> list[SampledPair]:
+        """Return about `count` pictures from all parts of the folder, each with the next other one."""
+        starts = range(0, len(self.files), max(1, len(self.files) // count))[:count]
+        runs = (self.frames(slice(start, start + 1 + MOST_REPEATS)) for start in starts)
+        return [pair for run in runs if (pair := pair_of(frame.rgb for frame in run)) is not None]
 
     def _image(self, file: Path) -> np.ndarray | None:
         return read_image(file)

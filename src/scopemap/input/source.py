@@ -14,6 +14,7 @@ from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import TruthQuality
 from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.calibration import Calibration, fitted
+from scopemap.input.sampling import SampledPair, pairs_in_order
 
 ASSUMED_RATE_HZ = 30.0
 """Frames per s of inputs that state none."""
@@ -110,6 +111,10 @@ class Source:
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
         """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
         return None if self.numbers is None else [(number, self._time_s(number)) for number in self.numbers[selection]]
+
+    def sample_pairs(self, count: int) -> list[SampledPair]:
+        """Return about `count` pictures from all parts of the input, or of its begin, each with the next other one."""
+        return pairs_in_order((frame.rgb for frame in self.frames(slice(None))), count)
 
     def media(self) -> str | None:
         """Return the name that FFmpeg opens where the frames are those of one video; None elsewhere."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from av.video.reformatter import VideoReformatter
 
 from scopemap.engine.errors import InputError
 from scopemap.input.decoding import limit_in_words, most_pixels
+from scopemap.input.sampling import SampledPair, pair_of
 from scopemap.input.source import Source, SourceFrame
 
 # Some headers give the unit of their clock for the rate.
@@ -25,8 +26,6 @@ _HIGHEST_RATE_HZ = 1000.0
 _MISSING_SHARE = 0.02
 _MISSING_FRAMES = 2
 _MOST_CODED_PIXELS = 2**31 - 1
-# A frame out of so many is looked at where a video can only be read in order.
-_SAMPLED_EVERY = 10
 # FFmpeg draws text files as a terminal would show them.
 _TEXT_CODECS = ("ansi", "bintext", "idf", "xbin")
 # A recording may pause, a time lapse be slow; a stamp that runs ahead by more is of another clock.
@@ -88,17 +87,22 @@ class VideoFile(Source):
 
     def samples(self, count: int) -> list[np.ndarray]:
         """Return about `count` pictures (h, w, 3) uint8 from all parts of the video, where it can be entered."""
-        found, reformatter = dict[int | None, np.ndarray](), VideoReformatter()
+        return [picture for picture, _ in self.sample_pairs(count)]
+
+    def sample_pairs(self, count: int) -> list[SampledPair]:
+        """Return the pictures of `samples`, each with the next other one."""
+        found, reformatter = dict[int | None, SampledPair](), VideoReformatter()
         with suppress(av.FFmpegError, StopIteration), self._opened() as container:
             start, length = container.start_time or 0, container.duration or 0
             for part in range(count):
                 container.seek(start + length * part // count)
-                frame = next(container.decode(container.streams.video[0]))
-                found[frame.pts] = self._shown(frame, reformatter)
-        pictures = [rgb for rgb in found.values() if rgb.shape[:2] == (self.height, self.width)]
-        if len(pictures) >= count // 2:
-            return pictures
-        return [frame.rgb for frame in self.frames(slice(0, count * _SAMPLED_EVERY, _SAMPLED_EVERY))]
+                frames = container.decode(container.streams.video[0])
+                first = next(frames)
+                shown = (self._shown(frame, reformatter) for frame in chain([first], frames))
+                if (pair := pair_of(shown)) is not None:
+                    found[first.pts] = pair
+        pairs = [pair for pair in found.values() if pair[0].shape[:2] == (self.height, self.width)]
+        return pairs if len(pairs) >= count // 2 else super().sample_pairs(count)
 
     def media(self) -> str:
         """Return what FFmpeg opens: the file's name, or that of its bytes within another file."""
