@@ -43,7 +43,7 @@ class SkippedFrame:
     index: int
     time_s: float
     name: str
-    kind: Literal["repeated", "thinned"]
+    kind: Literal["repeated", "thinned", "size"]
     reason: str
 
 

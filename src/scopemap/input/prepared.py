@@ -32,7 +32,7 @@ _SAMPLES_BYTES = 100_000_000
 # Attributes and methods of a source that are the same for one view of it.
 _KEPT = (
     *("name", "width", "height", "pixel_aspect", "count", "numbers", "stamped", "rate_hz", "notes", "warnings"),
-    "frame_limit_s",
+    *("frame_limit_s", "left_out", "resized"),
     *("quality", "depth_scale_mm", "depth_sensor", "masks", "stamps", "media", "pose", "truth"),
 )
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
@@ -159,6 +159,8 @@ def sample_pairs(source: Source) -> list[SampledPair]:
     with suppress(InputError):
         found.extend(source.sample_pairs(count))
     del source.warnings[warnings:]
+    source.left_out.clear()
+    source.resized.clear()
     return found
 
 

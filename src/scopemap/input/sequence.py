@@ -95,8 +95,8 @@ class Sequence:
 
     @property
     def skipped(self) -> list[SkippedFrame]:
-        """The selected frames that were left out so far, as `choice` has it, in order."""
-        return [frame for _, frame in sorted(self.choice.skipped.items())]
+        """The selected frames that were left out so far, as `choice` has it or for their size, in order."""
+        return [frame for _, frame in sorted((self.choice.skipped | self.source.left_out).items())]
 
     @property
     def notes(self) -> list[str | Notice]:
@@ -106,7 +106,7 @@ class Sequence:
     @property
     def warnings(self) -> list[str | Notice]:
         """What was found wrong while reading, so far."""
-        return list(self.source.warnings)
+        return [*self.source.warnings, *self.source.size_notices]
 
     def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
         """Yield each frame, rectified, with its truth."""
@@ -133,6 +133,7 @@ class Sequence:
                 views = None if item.second is None else (item.rgb, item.second)
                 yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name, views=views)
             found += 1
+        self.source.check_sizes(found + len(self.choice.skipped))
         if found < 2:
             skipped = "".join(f"; frame {frame.index} {frame.reason}" for frame in self.skipped[-1:])
             remedy = "; a higher input.fps or input.skip_duplicates=false uses more" * bool(skipped)

@@ -114,12 +114,12 @@ class VideoFile(Source):
         return path.is_file()
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames."""
+        """Yield the selected frames; those of another size are left out."""
         reformatter = VideoReformatter()  # one for all frames: setting it up costs more than a frame
         for index, time_s, frame in islice(self._decoded(), *self._bounds(selection)):
-            rgb = self._shown(frame, reformatter)
-            self._check_size(rgb, f"the video {self.path}: frame {index}")
-            yield SourceFrame(index, time_s, rgb)
+            shown = self._of_one_size(SourceFrame(index, time_s, self._shown(frame, reformatter)))
+            if shown is not None:
+                yield shown
 
     def samples(self, count: int) -> list[np.ndarray]:
         """Return about `count` pictures (h, w, 3) uint8 from all parts of the video, where it can be entered."""

@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from scopemap.result.frame_table import FrameTable
     from scopemap.result.reconstruction import Reconstruction
 
-_SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
+_SKIPPED = {
+    "repeated": "which repeat the one before (--set input.skip_duplicates=false)",
+    "thinned": "by input.fps",
+    "size": "of another size",
+}
 _MOST_LOSSES = 5
 
 
