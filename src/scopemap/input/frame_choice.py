@@ -92,6 +92,16 @@ def slice_of(frames: slice | str | None) -> slice:
     return slice(*(int(part) if part else None for part in frames.split(":")))
 
 
+def selection_text(selection: slice) -> str:
+    """Return the text of a slice as `slice_of` reads it; "" for all frames."""
+    if selection == slice(None):
+        return ""
+    start, stop, step = (
+        "" if part is None else str(part) for part in (selection.start, selection.stop, selection.step)
+    )
+    return f"{start}:{stop}" + (f":{step}" if step else "")
+
+
 def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
     """Return the mean absolute difference, grey levels, of (h, w, 3) uint8 over pixels not black in both, or all."""
     step = max(1, min(one.shape[:2]) // _COMPARED_SIDE_PX)

@@ -21,7 +21,7 @@ from scopemap.input.datasets.colmap import ColmapFolder
 from scopemap.input.datasets.dicom import Dicom
 from scopemap.input.datasets.rosbag import RosBag
 from scopemap.input.decoding import most_pixels
-from scopemap.input.frame_choice import FrameChoice, slice_of
+from scopemap.input.frame_choice import FrameChoice, selection_text, slice_of
 from scopemap.input.images import ImageFolder
 from scopemap.input.plugins import plugins
 from scopemap.input.prepared import UNKNOWN_MAKE, of_one_view, prepared
@@ -89,7 +89,8 @@ def open_sequence(
         reader = _reader(Path(path), dataset)
     sequence = sequence_of(reader, camera=camera, fov_deg=fov_deg, size=size, frames=frames, settings=settings)
     if sequence.count is not None and sequence.count < 2 and not isinstance(reader, VideoFile):
-        raise InputError(f"reading {sequence.path}: {sequence.count} frame(s) selected, two are needed")
+        of = f" of its {reader.count}, by --frames {selection_text(frames)}" if frames != slice(None) else ""
+        raise InputError(f"reading {sequence.path}: {sequence.count} frame(s) selected{of}, two are needed")
     return sequence
 
 
