@@ -77,10 +77,11 @@ def open_sequence(
     fov_deg : horizontal field of view of an unknown camera, degrees; None: that of the settings' `scope`, else 70,
         until a run estimates it.
     size : working size (width, height), px; None: by `settings.longest_side_px`.
-    frames : which frames, by their positions in the input, a slice or "0:100:2"; None: all.
+    frames : which frames, by their positions in the input, a slice or "0:100:2"; None: those of the settings.
     settings : how the input is read, by default `Config().input`.
     """
-    frames = slice_of(frames)
+    settings = settings or InputSettings()
+    frames = slice_of(settings.frames or None if frames is None else frames)
     if frames.step is not None and frames.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {frames.step}")
     if size is not None and not (isinstance(size, tuple | list) and len(size) == 2):

@@ -177,7 +177,7 @@ def open_other(
     The settings of the input, and the parameters, are those of `open_sequence`, which see for what is raised.
     """
     run = RunFolder(folder).checked()
-    kept, settings = run.source_camera_file, run.config.input
+    kept, settings = run.source_camera_file, run.config.input.model_copy(update={"frames": ""})
     sequence = open_sequence(path, camera=camera, dataset=dataset, frames=frames, settings=settings)
     if sequence.calibrated or kept is None:
         return sequence

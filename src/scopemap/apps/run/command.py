@@ -126,12 +126,14 @@ def run(
     Ctrl-C ends it early and writes what was tracked until then; a second Ctrl-C writes nothing.
     """
     from scopemap.engine.config import Config
+    from scopemap.input.frame_choice import selection_text
 
     given = {
         "input.camera_fit": camera_fit,
         "input.stereo": stereo,
         "input.deinterlace": deinterlace or None,
         "input.redact": [options.parse_box(box) for box in redact] if redact else None,
+        "input.frames": None if frames is None else selection_text(frames),
         "input.fps": fps,
         "input.scope": scope,
         "run.memory_mb": options.parse_memory(memory) if memory else None,
@@ -160,7 +162,6 @@ def run(
             camera=camera,
             fov_deg=fov,
             size=options.parse_size(size) if size else None,
-            frames=frames,
             settings=resolved.input,
         )
     from scopemap.runner.checkpoints import check_resumable, discard_unfinished
@@ -203,6 +204,7 @@ def _report(result: Reconstruction, config: Config, out: Path, *, as_json: bool,
 def summary_lines(result: Reconstruction) -> list[str]:
     """Return the summary of a run, one fact per line."""
     from scopemap.engine.notices import scale_words
+    from scopemap.result.input_part import part_of_input
     from scopemap.result.losses import losses
 
     facts, known = result.provenance, result.provenance["scale"]["known"]
@@ -219,6 +221,7 @@ def summary_lines(result: Reconstruction) -> list[str]:
         f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces{_surface(facts['surface'])}",
         _time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
     ]
+    lines += [f"input: {part}; shares are of these" for part in [part_of_input(facts)] if part]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     if result.others:
         lines += _map_lines(result.frames)
