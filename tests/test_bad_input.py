@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-import av
 import pytest
 import trimesh
 from drawn_datasets import WRITERS
@@ -23,7 +22,7 @@ from drawn_inputs import picture, save, write_video
 from front_door import call, refused
 from tiny_phantom import FRAMES, write_tiny
 
-from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.engine.errors import ScopemapError
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.opening import open_sequence
 from scopemap.result.reference import reference_trajectory
@@ -62,21 +61,6 @@ def test_content_decides_not_names(tmp_path: Path) -> None:
     sequence = open_sequence(tmp_path)
     assert [frame.index for frame in sequence.frames()] == [0, 1, 3]
     assert "2.png cannot be read and was left out" in sequence.warnings[0]
-
-
-def test_a_video_that_changes_its_size_is_refused_with_both(tmp_path: Path) -> None:
-    """Two transport streams one behind the other, as recorders write them when the source is switched."""
-    joined = tmp_path / "joined.ts"
-    for number, size in enumerate([(160, 120), (128, 96)]):
-        with av.open(str(tmp_path / f"{number}.ts"), "w") as container:
-            stream = container.add_stream("mpeg2video", rate=25)
-            stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-            for i in range(30):
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(i, size), format="rgb24")))
-            container.mux(stream.encode())
-    joined.write_bytes((tmp_path / "0.ts").read_bytes() + (tmp_path / "1.ts").read_bytes())
-    with pytest.raises(InputError, match=r"is 128x96 px, those before it are 160x120 px"):
-        list(open_sequence(joined).frames())
 
 
 # ---- poses

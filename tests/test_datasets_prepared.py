@@ -17,7 +17,7 @@ from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.opening import open_sequence
-from scopemap.input.video_format.interlacing import combing
+from scopemap.input.video_format.interlacing import LEAST_COMBING, combing
 
 COUNT = 12
 Draw = Callable[[int], np.ndarray]
@@ -108,6 +108,27 @@ def test_interlaced_material_is_told_and_undone(tmp_path: Path) -> None:
     for comb, frame in zip(told.source.frames(slice(None)), undone.source.frames(slice(None)), strict=True):
         np.testing.assert_array_equal(frame.rgb[::2], comb.rgb[::2])
         assert combing(comb.rgb) > 10 * combing(frame.rgb)
+
+
+def test_interlacing_does_not_matter_where_rows_are_averaged(tmp_path: Path) -> None:
+    file = _video(tmp_path / "v.mp4", lambda number: woven(2 * number))
+    halved = open_sequence(file, size=(WIDTH // 2, HEIGHT // 2))
+    assert halved.warnings == []
+    assert Notice("input-interlaced-averaged") in halved.notes
+    frame = next(halved.frames())
+    assert combing(frame.rgb) < LEAST_COMBING
+
+
+@pytest.mark.parametrize("kind", ["video", "folder"])
+def test_fine_stripes_of_a_progressive_clip_are_not_two_fields(kind: str, tmp_path: Path) -> None:
+    stripes = 30 * np.sin(2 * np.pi * np.arange(HEIGHT) / 2.1)[:, None, None]
+    pictures = [np.clip(tissue(n) + stripes, 0, 255).astype(np.uint8) for n in range(40)]
+    assert combing(pictures[5]) > LEAST_COMBING
+    if kind == "folder":
+        for number, picture in enumerate(pictures):
+            save(tmp_path / f"{number:03d}.png", picture)
+    path = tmp_path if kind == "folder" else encode(tmp_path / "v.mp4", pictures)
+    assert open_sequence(path).warnings == []
 
 
 # ---- frames that are left out

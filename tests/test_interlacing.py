@@ -15,7 +15,14 @@ from drawn_videos import HEIGHT, WIDTH, woven
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scopemap.input.video_format.interlacing import LEAST_COMBING, combing, deinterlaced, is_interlaced
+from scopemap.input.video_format.interlacing import (
+    LEAST_COMBING,
+    combing,
+    deinterlaced,
+    fields_alternate,
+    is_interlaced,
+    is_shortly_after,
+)
 
 NUMBERS = range(0, 40, 5)
 C3VD = "endoscopy/c3vd"
@@ -74,6 +81,90 @@ def test_a_clip_at_rest_needs_only_some_motion() -> None:
     assert not is_interlaced([*still, *still, woven(5)])
 
 
+# ---- two successive pictures
+
+
+def _moved(picture: np.ndarray, at: float) -> np.ndarray:
+    """The picture `at` px further to the right and a third as much down."""
+    shift = np.array([[1, 0, at], [0, 1, at / 3]])
+    size = picture.shape[1::-1]
+    return cv2.warpAffine(picture, shift, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+def _striped(picture: np.ndarray, period: float) -> np.ndarray:
+    stripes = np.sin(2 * np.pi * np.arange(picture.shape[0]) / period)[:, None, None]
+    return np.clip(picture + 25.0 * stripes, 0, 255).astype(np.uint8)
+
+
+def _glossy(picture: np.ndarray) -> np.ndarray:
+    rng, out = np.random.default_rng(5), picture.copy()
+    for u, v in rng.integers(0, picture.shape[1::-1], (150, 2)).tolist():
+        cv2.ellipse(out, (u, v), (3, 1), float(rng.uniform(0, 180)), 0, 360, (255, 255, 255), -1)
+    return out
+
+
+def _coded(picture: np.ndarray, quality: int) -> np.ndarray:
+    jpg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.asarray(cv2.imdecode(jpg, cv2.IMREAD_COLOR))
+
+
+def _doubled(picture: np.ndarray) -> np.ndarray:
+    return picture[::2].repeat(2, 0)
+
+
+def _flickering(picture: np.ndarray) -> np.ndarray:
+    out = picture.astype(float)
+    out[1::2] *= 1.06
+    return np.clip(out, 0, 255).astype(np.uint8)
+
+
+LOOKS = {
+    "plain": lambda rgb: rgb,
+    "glossy": _glossy,
+    **{f"stripes {period}": lambda rgb, period=period: _striped(rgb, period) for period in (2.05, 2.1, 2.3, 3.0, 5.0)},
+}
+CODED = {"raw": lambda rgb: rgb, "q80": lambda rgb: _coded(rgb, 80), "q50": lambda rgb: _coded(rgb, 50)}
+
+
+@pytest.mark.parametrize("coded", CODED)
+@pytest.mark.parametrize("look", [*LOOKS, "doubled", "flickering"])
+@pytest.mark.parametrize("step_px", [0.0, 1.5, 6.0])
+def test_progressive_clips_are_not_interlaced(look: str, coded: str, step_px: float) -> None:
+    shown = {"doubled": _doubled, "flickering": _flickering} | LOOKS
+    for scene in range(0, 20, 5):
+        # Stripes that stay, as an overlay's or a coder's do, and stripes that move as the tissue does.
+        pairs = [
+            [shown[look](_moved(tissue(scene), n * step_px)) for n in (1, 2)],
+            [_moved(shown[look](tissue(scene)), n * step_px) for n in (1, 2)],
+        ]
+        for first, second in pairs:
+            assert not is_interlaced([CODED[coded](first)], [CODED[coded](second)])
+
+
+@pytest.mark.parametrize("coded", CODED)
+@pytest.mark.parametrize("bottom_first", [False, True])
+@pytest.mark.parametrize(("look", "step_px"), [("plain", 8.0), ("glossy", 8.0), ("plain", 12.0), ("stripes 5.0", 12.0)])
+def test_woven_clips_are_interlaced(look: str, step_px: float, coded: str, bottom_first: bool) -> None:
+    pictures, later = [], []
+    for scene in range(0, 40, 5):
+        fields = [_moved(LOOKS[look](tissue(scene)), n * step_px / 2) for n in range(4)]
+        for found, (one, other) in ((pictures, fields[:2]), (later, fields[2:])):
+            even, odd = (other, one) if bottom_first else (one, other)
+            comb = even.copy()
+            comb[1::2] = odd[1::2]
+            found.append(CODED[coded](comb))
+    assert is_interlaced(pictures, later)
+
+
+def test_slow_motion_is_told_where_coding_leaves_the_combs() -> None:
+    fields = [_moved(tissue(3), n / 2) for n in range(4)]
+    for one, other in (fields[:2], fields[2:]):
+        one[1::2] = other[1::2]
+    assert fields_alternate(fields[0], fields[2])
+    assert is_shortly_after(fields[0], fields[2])
+    assert not is_shortly_after(tissue(0), tissue(16))
+
+
 def test_one_field_is_left_where_it_was() -> None:
     comb = woven(3)
     out = deinterlaced(comb)
@@ -129,6 +220,7 @@ def test_c3vd_is_interlaced(real_data: Path, name: str, numbers: tuple[int, int]
     assert correlation > least
     assert combing(first) > 3 * LEAST_COMBING
     assert combing(deinterlaced(first)) < LEAST_COMBING
+    assert fields_alternate(first, second)
 
 
 @pytest.mark.real
@@ -139,6 +231,7 @@ def test_real_progressive_pictures_are_told_from_woven_ones(real_data: Path, pat
     first, next_, later = pictures[::3], pictures[1::3], pictures[2::3]
     assert max(combing(picture) for picture in first) < LEAST_COMBING
     assert abs(np.median([_slope(*pair)[0] for pair in zip(first, later, strict=True)])) < 0.1
+    assert not is_interlaced(first, next_)
     for others in (next_, later):
         for picture, other in zip(first, others, strict=True):
             other[::2] = picture[::2]

@@ -140,7 +140,7 @@ FAULTS: dict[str, Fault] = {
     ),
     "a picture of another size": Fault(
         lambda planted, at: planted.rgb.update({at: planted.rgb[at][:-8, :-8]}),
-        ("reading-stopped", "refused", "frame-unreadable"),
+        ("reading-stopped", "refused", "frame-unreadable", "source"),
         _stored_alone,
         named=0,
     ),

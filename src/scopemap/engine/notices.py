@@ -35,6 +35,21 @@ KINDS: dict[str, _Kind] = {
         "combs; --deinterlace (input.deinterlace=true) uses one field of each",
         "The video is interlaced: what moves has combed edges (see --deinterlace)",
     ),
+    "input-interlaced-averaged": _Kind(
+        "info",
+        "the pictures are interlaced: their even and odd rows were taken at two times; the working size averages both, "
+        "and what moves fast is blurred; --deinterlace (input.deinterlace=true) uses one field of each",
+    ),
+    "input-resized": _Kind(
+        "info",
+        "{frames} picture(s) differ from {size} px by at most 1 % and were cut or completed at their right and bottom "
+        "edge (first: {first})",
+    ),
+    "input-other-size": _Kind(
+        "note",
+        "{frames} picture(s) of another size were left out (first: {first}, {reason}); frames.csv names them",
+        "{frames} picture(s) of another size were left out",
+    ),
     "input-text-burned-in": _Kind(
         "note",
         "by its header notes, perhaps a patient's name, are burned into the images",

@@ -23,6 +23,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_MISSING_BYTES = 16 << 20
 _WIDTH = 256  # TIFF 6.0, section 8
 _HEIGHT = 257
+_ON_THEIR_SIDE = (5, 6, 7, 8)  # orientations of Exif 2.32, 4.6.4
 
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
@@ -90,6 +91,19 @@ def most_pixels() -> float:
         return 1e6 * (float(text) if text else _MOST_MEGAPIXELS)
     except ValueError:
         raise InputError(f"the environment variable {_VARIABLE} must be a number, got '{text}'") from None
+
+
+def stated_size(file: Path) -> tuple[int, int] | None:
+    """Return (height, width), px, of an image by its header, as it is to be shown; None where that cannot be read."""
+    from PIL import ExifTags, Image
+
+    try:
+        with warnings.catch_warnings(), Image.open(file) as image:
+            warnings.simplefilter("ignore")
+            swapped = image.getexif().get(ExifTags.Base.Orientation, 1) in _ON_THEIR_SIDE
+            return (image.width, image.height) if swapped else (image.height, image.width)
+    except Exception:  # damaged headers end in exceptions of any kind
+        return None
 
 
 def _holds_its_chunks(content: bytes) -> bool:

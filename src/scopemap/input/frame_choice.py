@@ -7,14 +7,16 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
 
 from scopemap.engine.errors import SettingsError
 from scopemap.engine.frame import is_constant
-from scopemap.input.source import SourceFrame
+
+if TYPE_CHECKING:
+    from scopemap.input.source import SourceFrame
 
 _SLICE = re.compile(r"(-?\d{1,15})?:(-?\d{1,15})?(:\d{0,15})?")
 LEAST_DIFFERENCE = 0.5
@@ -41,7 +43,7 @@ class SkippedFrame:
     index: int
     time_s: float
     name: str
-    kind: Literal["repeated", "thinned"]
+    kind: Literal["repeated", "thinned", "size"]
     reason: str
 
 
@@ -88,6 +90,16 @@ def slice_of(frames: slice | str | None) -> slice:
         expected = "expected START:STOP or START:STOP:STEP such as 0:100, in Python a slice, too"
         raise SettingsError(f"cannot read the frames '{str(frames)[:80]}': {expected}")
     return slice(*(int(part) if part else None for part in frames.split(":")))
+
+
+def selection_text(selection: slice) -> str:
+    """Return the text of a slice as `slice_of` reads it; "" for all frames."""
+    if selection == slice(None):
+        return ""
+    start, stop, step = (
+        "" if part is None else str(part) for part in (selection.start, selection.stop, selection.step)
+    )
+    return f"{start}:{stop}" + (f":{step}" if step else "")
 
 
 def mean_difference(one: np.ndarray, other: np.ndarray) -> float:

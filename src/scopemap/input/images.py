@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,10 +15,12 @@ import numpy as np
 
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.input.camera_files.reading import stated_calibration
-from scopemap.input.decoding import by_number, decoded, frame_number, read_decoded
+from scopemap.input.decoding import by_number, decoded, frame_number, read_decoded, stated_size
+from scopemap.input.sampling import MOST_REPEATS, SampledPair, pair_of
 from scopemap.input.source import OWN_CALIBRATION, Source, SourceFrame
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+_MOST_HEADERS = 500  # are looked at
 _COMPANION = re.compile(r"[_.](depth|normals?|flow|occlusions?|masks?)$", re.IGNORECASE)
 
 DepthCode = tuple[tuple[int, float, int], ...]
@@ -86,14 +89,21 @@ class ImageFolder(Source):
         return dict(zip(self.numbers, self.files, strict=True))
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames; an unreadable file is left out with a warning, another size is an `InputError`."""
+        """Yield the selected frames; unreadable files, with a warning, and those of another size are left out."""
         for number, file in list(zip(self.numbers, self.files, strict=True))[selection]:
             rgb = self._image(file)
             if rgb is None:
                 self._warn(f"{file} cannot be read and was left out")
                 continue
-            self._check_size(rgb, f"{file}: it")
-            yield SourceFrame(number, self._time_s(number), rgb, file.name)
+            frame = self._of_one_size(SourceFrame(number, self._time_s(number), rgb, file.name))
+            if frame is not None:
+                yield frame
+
+    def sample_pairs(self, count: int) -> list[SampledPair]:
+        """Return about `count` pictures from all parts of the folder, each with the next other one."""
+        starts = range(0, len(self.files), max(1, len(self.files) // count))[:count]
+        runs = (self.frames(slice(start, start + 1 + MOST_REPEATS)) for start in starts)
+        return [pair for run in runs if (pair := pair_of(frame.rgb for frame in run)) is not None]
 
     def _image(self, file: Path) -> np.ndarray | None:
         return read_image(file)
@@ -120,9 +130,20 @@ class ImageFolder(Source):
         for file in self.files:
             image = self._image(file)
             if image is not None:
-                return image.shape[0], image.shape[1]
+                first = image.shape[0], image.shape[1]
+                return self._usual_size(first) if stated_size(file) == first else first
         found = f"none of the {len(self.files)} images can be read" if self.files else "there is no image"
         raise InputError(f"reading {self.path}: {found} (looked for {', '.join(SUFFIXES)})")
+
+    def _usual_size(self, first: tuple[int, int]) -> tuple[int, int]:
+        """Return the size of most pictures by their headers, or else that of the first one."""
+        every = max(1, len(self.files) // _MOST_HEADERS)
+        sizes = Counter(size for file in self.files[::every] if (size := stated_size(file)) is not None)
+        size, count = sizes.most_common(1)[0]
+        if 2 * count <= sizes.total() and len(sizes) > 2:
+            named = ", ".join(f"{n} of {width}x{height} px" for (height, width), n in sizes.most_common(3))
+            raise InputError(f"reading {self.path}: its pictures have no common size ({named}); give those of one size")
+        return size if count > sizes[first] else first
 
     @contextmanager
     def _making_camera(self) -> Iterator[None]:

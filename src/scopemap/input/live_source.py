@@ -95,10 +95,10 @@ class LiveSource(Source):
         with self._changed:
             if stamp_s is not None:
                 self._changed.wait_for(lambda: self._ended, timeout=max(stamp_s - self.now_s(), 0.0))
-            self._check_size(rgb, f"{self.path}: frame {self.read}")
-            if not self.paused:
+            frame = self._of_one_size(SourceFrame(self.read, self.now_s() if stamp_s is None else stamp_s, rgb))
+            if frame is not None and not self.paused:
                 self.dropped += self._newest is not None
-                self._newest = SourceFrame(self.read, self.now_s() if stamp_s is None else stamp_s, rgb)
+                self._newest = frame
                 self._changed.notify_all()
             self.read += 1
 

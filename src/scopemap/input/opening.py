@@ -13,6 +13,7 @@ import numpy as np
 from scopemap.engine.cameras.rectification import Rectifier, StereoPair, working_camera, working_size
 from scopemap.engine.config import InputSettings
 from scopemap.engine.errors import CalibrationError, InputError
+from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.calibration import Calibration, fitted
 from scopemap.input.camera_files.pair import NEEDS_PAIR, read_pair
 from scopemap.input.camera_files.reading import read_calibration
@@ -20,7 +21,7 @@ from scopemap.input.datasets.colmap import ColmapFolder
 from scopemap.input.datasets.dicom import Dicom
 from scopemap.input.datasets.rosbag import RosBag
 from scopemap.input.decoding import most_pixels
-from scopemap.input.frame_choice import FrameChoice, slice_of
+from scopemap.input.frame_choice import FrameChoice, selection_text, slice_of
 from scopemap.input.images import ImageFolder
 from scopemap.input.plugins import plugins
 from scopemap.input.prepared import UNKNOWN_MAKE, of_one_view, prepared
@@ -76,10 +77,11 @@ def open_sequence(
     fov_deg : horizontal field of view of an unknown camera, degrees; None: that of the settings' `scope`, else 70,
         until a run estimates it.
     size : working size (width, height), px; None: by `settings.longest_side_px`.
-    frames : which frames, by their positions in the input, a slice or "0:100:2"; None: all.
+    frames : which frames, by their positions in the input, a slice or "0:100:2"; None: those of the settings.
     settings : how the input is read, by default `Config().input`.
     """
-    frames = slice_of(frames)
+    settings = settings or InputSettings()
+    frames = slice_of(settings.frames or None if frames is None else frames)
     if frames.step is not None and frames.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {frames.step}")
     if size is not None and not (isinstance(size, tuple | list) and len(size) == 2):
@@ -88,7 +90,8 @@ def open_sequence(
         reader = _reader(Path(path), dataset)
     sequence = sequence_of(reader, camera=camera, fov_deg=fov_deg, size=size, frames=frames, settings=settings)
     if sequence.count is not None and sequence.count < 2 and not isinstance(reader, VideoFile):
-        raise InputError(f"reading {sequence.path}: {sequence.count} frame(s) selected, two are needed")
+        of = f" of its {reader.count}, by --frames {selection_text(frames)}" if frames != slice(None) else ""
+        raise InputError(f"reading {sequence.path}: {sequence.count} frame(s) selected{of}, two are needed")
     return sequence
 
 
@@ -116,6 +119,7 @@ def sequence_of(
         most = f"{_LARGEST_SIDE_PX} px a side and {most_pixels() / 1e6:g} million pixels at most"
         raise InputError(f"{working} is too large: {most}; give another by --size")
     size_source = f"{size[0]}x{size[1]} px {size_source} for input of {source.width}x{source.height} px"
+    _soften_interlacing(source, size[1])
     rectifier = Rectifier(calibration.camera, working_camera(calibration.camera, size))
     if (seen := float(rectifier.valid.mean())) < _LEAST_SEEN_SHARE:
         rest = f"{seen:.1%} of the picture remains without its distortion; check the distortion coefficients"
@@ -249,6 +253,13 @@ def _folders_in(path: Path) -> list[Path]:
         names = [entry.name for entry in found if os.path.isdir(entry)]  # a link may lead in a circle
     inner = (path / n for n in names if not n.startswith(".") and n not in ("lost+found", "__MACOSX"))
     return sorted(i for i in inner if not (i.is_symlink() and path.resolve().is_relative_to(i.resolve())))
+
+
+def _soften_interlacing(source: Source, height: int) -> None:
+    """Let the source say no more than is so where a pixel of the working size holds rows of both fields."""
+    if Notice("input-interlaced") in source.warnings and source.height >= 2 * height:
+        source.warnings.remove(Notice("input-interlaced"))
+        source.notes.append(Notice("input-interlaced-averaged"))
 
 
 def _pair_of(source: Source, file: Path | str | None, camera_fit: str) -> StereoPair | CalibrationError:

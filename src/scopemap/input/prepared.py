@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,10 @@ from scopemap.engine.config.input import Box
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.engine.notices import Notice
 from scopemap.input.images import ImageFolder, use_first_calibration
+from scopemap.input.sampling import SampledPair
 from scopemap.input.source import Source, SourceFrame
 from scopemap.input.video import VideoFile
-from scopemap.input.video_format.interlacing import deinterlaced, is_interlaced
+from scopemap.input.video_format.interlacing import deinterlaced, is_interlaced, is_shortly_after
 from scopemap.input.video_format.stereo_packing import Packing, packing, squeezed_views, suspected
 
 UNKNOWN_MAKE = ("video", "images", "dicom")
@@ -27,13 +27,13 @@ OF_UNKNOWN_VIEWS = (*UNKNOWN_MAKE, "rosbag", "live")
 """Readers for which `input.stereo` may name the stereo packing; other data sets define their view."""
 
 _SAMPLES = 8
-_SAMPLED_EVERY = 10
 _FEWEST_SAMPLES = 2
 _SAMPLES_BYTES = 100_000_000
 # Attributes and methods of a source that are the same for one view of it.
 _KEPT = (
     "name", "width", "height", "pixel_aspect", "count", "numbers", "stamped", "rate_hz", "notes", "warnings",
-    "frame_limit_s", "quality", "depth_scale_mm", "depth_sensor", "masks", "stamps", "media", "pose", "truth",
+    "frame_limit_s", "left_out", "resized", "quality", "depth_scale_mm", "depth_sensor", "masks", "stamps", "media",
+    "pose", "truth",
 )  # fmt: skip
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 
@@ -54,10 +54,10 @@ def prepared(source: Source, settings: InputSettings, second: Source | None = No
             outside = f"is outside of the pictures of {source.width}x{source.height} px"
             named = f"the box {','.join(map(str, box))} to blacken (--redact, X,Y,WIDTH,HEIGHT)"
             raise InputError(f"reading {source.path}: {named} {outside}")
-    samples = sample_pictures(source) if source.name in UNKNOWN_MAKE else []
-    samples = [redacted(rgb, settings.redact) for rgb in samples]
-    packed, note = _packing(source, settings, samples)
-    if not settings.deinterlace and is_interlaced(samples):
+    pairs = sample_pairs(source) if source.name in UNKNOWN_MAKE else []
+    pairs = [(redacted(rgb, settings.redact), redacted(later, settings.redact)) for rgb, later in pairs]
+    packed, note = _packing(source, settings, [rgb for rgb, _ in pairs])
+    if not settings.deinterlace and shows_two_fields(source, pairs):
         source.warnings.append(Notice("input-interlaced"))
     if note:
         source.notes.append(note)
@@ -141,20 +141,26 @@ def of_one_view(source: Source) -> str:
     return f"; the pictures hold two views, and {one} (--stereo none uses the whole picture)"
 
 
-def sample_pictures(source: Source) -> list[np.ndarray]:
-    """Return a few pictures from all parts of the input, fewer where they are large: all are held at once."""
+def shows_two_fields(source: Source, pairs: list[SampledPair]) -> bool:
+    """Return whether the pictures of a source are interlaced, by pairs from `sample_pairs`."""
+    # Those of a folder may be some of a video only, too far apart to tell anything of time.
+    is_video = isinstance(source, VideoFile)
+    later = [after if is_video or is_shortly_after(rgb, after) else None for rgb, after in pairs]
+    return is_interlaced([rgb for rgb, _ in pairs], later)
+
+
+def sample_pairs(source: Source) -> list[SampledPair]:
+    """Return a few pictures from all parts of the input, fewer where they are large, each with the next other one."""
     picture_bytes = max(1, 3 * source.width * source.height)
     count = max(_FEWEST_SAMPLES, min(_SAMPLES, _SAMPLES_BYTES // picture_bytes))
-    found: list[np.ndarray] = []
+    found: list[SampledPair] = []
     warnings = len(source.warnings)
     # Errors and warnings here may concern frames that the run does not read; it reports those that it meets.
     with suppress(InputError):
-        if isinstance(source, VideoFile):
-            found.extend(source.samples(count))
-        else:
-            step = max(1, (source.count or 0) // count) if isinstance(source, ImageFolder) else _SAMPLED_EVERY
-            found.extend(frame.rgb for frame in islice(source.frames(slice(0, None, step)), count))
+        found.extend(source.sample_pairs(count))
     del source.warnings[warnings:]
+    source.left_out.clear()
+    source.resized.clear()
     return found
 
 

@@ -17,7 +17,7 @@ from scopemap.engine.cameras.rectification import Rectifier, StereoPair, working
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.engine.frame import Frame, Truth
 from scopemap.engine.notices import Notice
-from scopemap.input.frame_choice import FrameChoice, SkippedFrame
+from scopemap.input.frame_choice import FrameChoice, SkippedFrame, selection_text
 from scopemap.input.source import Source, SourceFrame, assumed_camera
 
 CameraOrigin = Literal["calibrated", "stated", "estimated", "assumed"]
@@ -95,8 +95,8 @@ class Sequence:
 
     @property
     def skipped(self) -> list[SkippedFrame]:
-        """The selected frames that were left out so far, as `choice` has it, in order."""
-        return [frame for _, frame in sorted(self.choice.skipped.items())]
+        """The selected frames that were left out so far, as `choice` has it or for their size, in order."""
+        return [frame for _, frame in sorted((self.choice.skipped | self.source.left_out).items())]
 
     @property
     def notes(self) -> list[str | Notice]:
@@ -106,7 +106,7 @@ class Sequence:
     @property
     def warnings(self) -> list[str | Notice]:
         """What was found wrong while reading, so far."""
-        return list(self.source.warnings)
+        return [*self.source.warnings, *self.source.size_notices]
 
     def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
         """Yield each frame, rectified, with its truth."""
@@ -133,11 +133,20 @@ class Sequence:
                 views = None if item.second is None else (item.rgb, item.second)
                 yield Frame(item.index, item.time_s, rgb, self.camera, valid, name=item.name, views=views)
             found += 1
+        self.source.check_sizes(found + len(self.choice.skipped))
         if found < 2:
             skipped = "".join(f"; frame {frame.index} {frame.reason}" for frame in self.skipped[-1:])
             remedy = "; a higher input.fps or input.skip_duplicates=false uses more" * bool(skipped)
-            few = f"{found} readable frame(s) in the selection, two are needed"
+            few = f"{found} readable frame(s){self._selected_of}, two are needed"
             raise InputError(f"reading {self.path}: {few}{skipped}{remedy}")
+
+    @property
+    def _selected_of(self) -> str:
+        """What an error about too few frames adds: the selection, where there is one, and how many frames there are."""
+        if self.selection == slice(None):
+            return ""
+        of = "" if self.source.count is None else f" of its {self.source.count} frames, 0 to {self.source.count - 1}"
+        return f" in the selection {selection_text(self.selection)}{of}"
 
     def _in_time(self) -> Iterator[SourceFrame]:
         """Yield the selected pictures until one does not come in time."""

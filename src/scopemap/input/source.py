@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
@@ -14,12 +15,17 @@ from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import TruthQuality
 from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.calibration import Calibration, fitted
+from scopemap.input.frame_choice import SkippedFrame
+from scopemap.input.sampling import SampledPair, pairs_in_order
 
 ASSUMED_RATE_HZ = 30.0
 """Frames per s of inputs that state none."""
 
 OWN_CALIBRATION = "camera.yaml"
 """Calibration file beside the frames, which comes before a data set's own."""
+
+# Of the width or height: cropping tools leave pictures a pixel apart.
+_MOST_CHANGE = 0.01
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,8 @@ class Source:
     masks : folder of the data set's own masks of what is no tissue, as `MaskFiles` reads them, or None.
     notes : what had to be assumed.
     warnings : what was found wrong so far; grows while frames are read.
+    left_out, resized : pictures of another size so far, by frame number: those that are not used, and the names of
+        those that differ by at most 1 % and were cut.
     """
 
     name: str
@@ -97,6 +105,8 @@ class Source:
         self.times_s: dict[int, float] = {}
         self.notes: list[str | Notice] = []
         self.warnings: list[str | Notice] = []
+        self.left_out: dict[int, SkippedFrame] = {}
+        self.resized: dict[int, str] = {}
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -110,6 +120,10 @@ class Source:
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
         """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
         return None if self.numbers is None else [(number, self._time_s(number)) for number in self.numbers[selection]]
+
+    def sample_pairs(self, count: int) -> list[SampledPair]:
+        """Return about `count` pictures from all parts of the input, or of its begin, each with the next other one."""
+        return pairs_in_order((frame.rgb for frame in self.frames(slice(None))), count)
 
     def media(self) -> str | None:
         """Return the name that FFmpeg opens where the frames are those of one video; None elsewhere."""
@@ -130,12 +144,45 @@ class Source:
     def _time_s(self, number: int) -> float:
         return self.times_s.get(number, number / self.rate_hz)
 
-    def _check_size(self, rgb: np.ndarray, what: str) -> None:
-        """Raise `InputError` where an image is not of the source's size."""
-        height, width = rgb.shape[:2]
-        if (width, height) != (self.width, self.height):
-            differ = f"{width}x{height} px, those before it are {self.width}x{self.height} px"
-            raise InputError(f"reading {what} is {differ}; a sequence needs frames of one size")
+    def _of_one_size(self, frame: SourceFrame) -> SourceFrame | None:
+        """Return a frame with a picture of the source's size, or None where its size differs by more than 1 %.
+
+        One that differs by less is cut at the right and the bottom, or its last pixels there are repeated, so that
+        every pixel stays where it is.
+        """
+        height, width = frame.rgb.shape[:2]
+        if (width, height) == (self.width, self.height):
+            return frame
+        sides = ((width, self.width), (height, self.height))
+        if all(abs(found - usual) <= max(1.0, _MOST_CHANGE * usual) for found, usual in sides):
+            self.resized[frame.index] = frame.name or f"frame {frame.index}"
+            missing = max(self.height - height, 0), max(self.width - width, 0)
+            rgb = frame.rgb[: self.height, : self.width]
+            return replace(frame, rgb=cv2.copyMakeBorder(rgb, 0, missing[0], 0, missing[1], cv2.BORDER_REPLICATE))
+        reason = f"{width}x{height} px, others are {self.width}x{self.height} px"
+        self.left_out[frame.index] = SkippedFrame(frame.index, frame.time_s, frame.name, "size", reason)
+        return None
+
+    def check_sizes(self, used: int) -> None:
+        """Raise `InputError` where more pictures were left out for their size than used."""
+        if len(self.left_out) > used:
+            first = self.left_out[min(self.left_out)]
+            differ = f"{len(self.left_out)} of {len(self.left_out) + used} pictures have another size"
+            such = f"such as {first.name or f'frame {first.index}'}, {first.reason}"
+            raise InputError(f"reading {self.path}: {differ}, {such}; choose those of one size by --frames")
+
+    @property
+    def size_notices(self) -> list[Notice]:
+        """What was done so far with pictures of other sizes."""
+        usual, found = f"{self.width}x{self.height}", list[Notice]()
+        if self.resized:
+            first = self.resized[min(self.resized)]
+            found.append(Notice("input-resized", {"frames": len(self.resized), "size": usual, "first": first}))
+        if self.left_out:
+            out = self.left_out[min(self.left_out)]
+            named = {"first": out.name or f"frame {out.index}", "reason": out.reason}
+            found.append(Notice("input-other-size", {"frames": len(self.left_out)} | named))
+        return found
 
     def _warn(self, message: str | Notice) -> None:
         if message not in self.warnings:

@@ -23,6 +23,7 @@ from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measur
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
 from scopemap.report.video_parts import video_parts
 from scopemap.result.frame_table import NOT_USED
+from scopemap.result.input_part import part_of_input
 from scopemap.result.losses import losses
 from scopemap.result.reference import read_reference
 from scopemap.result.result import Result
@@ -102,6 +103,7 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
             {"row": loss.first, "when": loss.when, "frames": loss.frames, "cause": loss.cause, "advice": loss.advice}
             for loss in losses(run.frames)
         ],
+        "used_part": part_of_input(run.provenance),
         "parts": [asdict(part) for part in video_parts(run)],
         "not_shown_maps": max(len(run.submaps) - _MOST_MAPS, 0),
         "albedo": tomllib.loads(run.config_text).get("fusion", {}).get("colours") != "raw",

@@ -9,6 +9,7 @@ import numpy as np
 
 from scopemap.engine.notices import Notice, notices_of
 from scopemap.result.frame_table import ELSEWHERE, NOT_USED, FrameTable
+from scopemap.result.input_part import part_of_input
 from scopemap.result.losses import in_words, losses
 from scopemap.result.result import Result
 from scopemap.result.submap_summaries import doubt_words, submaps_in_time
@@ -158,8 +159,11 @@ def _sentence(run: Result) -> str:
 
 def _of_frames(run: Result) -> Reason:
     inside, used = frames_in_result(run.frames)
+    part = part_of_input(run.provenance)
+    chosen, which = (" chosen", f" Chosen: {part}.") if part else ("", "")
     if inside < LEAST_FRAMES:
-        return Reason("frames-too-few", "bad", f"Only {inside} of {used} frames could be joined: too few for a shape.")
+        few = f"Only {inside} of {used}{chosen} frames could be joined: too few for a shape.{which}"
+        return Reason("frames-too-few", "bad", few)
     place = run.frames.place[run.frames.place != NOT_USED]
     found = np.isin(place, [0, *_segments(run)])
     share, apart = found.mean(), int(found.sum()) - inside
@@ -170,7 +174,7 @@ def _of_frames(run: Result) -> Reason:
     if apart:
         where += f", or in submaps of {LEAST_SEGMENT_S:g} s and more that can be used by themselves"
         counted = f"{inside} and {apart} of {used}"
-    text = f"{_percent(share)} of the frames{until} are {where} ({counted}).{longest}"
+    text = f"{_percent(share)} of the{chosen} frames{until} are {where} ({counted}).{longest}{which}"
     return Reason("frames-in-result", _level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
 
 

@@ -97,7 +97,10 @@ class Checkpoints:
             setattr(self._run, name, found[name])
         self._run.sequence.choice.skipped.update(found["skipped"])
         if facts["complete"]:
-            self._run.sequence.source.warnings[:] = found["warnings"]
+            source = self._run.sequence.source
+            source.warnings[:] = found["warnings"]
+            source.left_out.update(found["left_out"])
+            source.resized.update(found["resized"])
         pipeline.fusion.store.reopen()
         return int(facts["last"]), bool(facts["complete"])
 
@@ -112,7 +115,9 @@ class Checkpoints:
     def _rest(self) -> dict[str, Any]:
         sequence = self._run.sequence
         found = {name: getattr(self._run, name) for name in _RUN}
-        read = {"skipped": dict(sequence.choice.skipped), "warnings": list(sequence.source.warnings)}
+        source = sequence.source
+        read = {"skipped": dict(sequence.choice.skipped), "warnings": list(source.warnings)}
+        read |= {"left_out": dict(source.left_out), "resized": dict(source.resized)}
         return found | read | {"fusion": self._run.pipeline.fusion, "kept": self._kept}
 
 

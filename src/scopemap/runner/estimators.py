@@ -20,6 +20,7 @@ from scopemap.engine.flow.flows import create_flow
 from scopemap.engine.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
 from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.engine.models import weights
+from scopemap.engine.models.device import choose_device
 from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.at_rest import CameraAtRest
 from scopemap.engine.tracking.features import SiftFeatures
@@ -42,6 +43,8 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
 
     own : replace those of the settings; a flow must then be safe in several threads.
     """
+    if config.networks.device != "auto":
+        choose_device(config.networks.device)  # also where no network would run there
     own = own or CustomEstimators()
     if own == CustomEstimators() and len(lacking := missing_weights(config)) > 1:
         pulls = " && ".join(f"scopemap models pull {name}" for name in lacking)

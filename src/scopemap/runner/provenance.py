@@ -18,6 +18,7 @@ from scopemap.engine.estimators import Estimators
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.notices import Notice, of_input
 from scopemap.engine.tracking.features import FeatureDetector
+from scopemap.input.frame_choice import selection_text
 from scopemap.input.sequence import Sequence
 from scopemap.result.frame_table import FrameTable
 
@@ -90,6 +91,7 @@ def provenance_of(
         "input": str(sequence.path),
         "dataset": sequence.source.name,
         **frames.counts,
+        "selection": {"frames": selection_text(sequence.selection), "of": sequence.source.count},
         "skipped": dict(Counter(frame.kind for frame in sequence.skipped)),
         "camera": {
             "source": sequence.camera_source,

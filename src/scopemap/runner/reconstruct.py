@@ -12,6 +12,7 @@ from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
 from scopemap.engine.tracking.track import FrameTracker
+from scopemap.input.frame_choice import selection_text, slice_of
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import DepthPreviews
@@ -87,6 +88,7 @@ def _reconstruct(
     tracker: FrameTracker | None,
 ) -> Result:
     clock = Clock()
+    config = _with_selection(config, sequence)
     plan = memory_plan(config, sequence)
     if out is not None:
         refuse_own_input(out, sequence, config)
@@ -128,6 +130,14 @@ def _reconstruct(
                 owner.save(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
     return result if out is None else Result(out)
+
+
+def _with_selection(config: Config, sequence: Sequence) -> Config:
+    """Return the settings that choose the frames of the sequence: those in the result repeat the run."""
+    if slice_of(config.input.frames or None) == sequence.selection:
+        return config
+    chosen = config.input.model_copy(update={"frames": selection_text(sequence.selection)})
+    return config.model_copy(update={"input": chosen})
 
 
 def _kept_with(observers: tuple[Observer, ...]) -> tuple[Any, ...]:

@@ -150,4 +150,4 @@ def _input_settings(run: Path) -> InputSettings:
     except SettingsError:  # of another version
         settings = InputSettings()
     left = {"stereo": "none"} if settings.second_view else {}
-    return settings.model_copy(update={"fps": None, "skip_duplicates": False} | left)
+    return settings.model_copy(update={"frames": "", "fps": None, "skip_duplicates": False} | left)

@@ -180,6 +180,9 @@ def parse_settings(pairs: list[str]) -> dict[str, Any]:
     for pair in pairs:
         key, found, value = pair.partition("=")
         if not found:
+            from scopemap.engine.config.config import check_setting
+
+            check_setting(key)
             raise SettingsError(
                 f"cannot read the setting '{pair[:_QUOTED]}': expected KEY=VALUE such as tracking.keyframe_every=5"
             )

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from scopemap.apps.inspect.clip import Clip, Segment, VideoFinding, covered, segments_of
-from scopemap.input.video_format.interlacing import is_interlaced
 from scopemap.input.video_format.stereo_packing import Packing
 
 _BLACK_LEVEL = 16.0
@@ -81,18 +80,15 @@ def check_timing(clip: Clip, claimed_s: float | None) -> Iterator[VideoFinding]:
         yield VideoFinding("info", "rate-high", message, f"--fps {clip.rate_hz / 2:.3g} halves the work")
 
 
-def check_packing(packed: Packing | None, pictures: list[np.ndarray]) -> Iterator[VideoFinding]:
-    """Yield whether a picture holds two views (stereo), or two fields of different times (interlaced).
-
-    `pictures` are some of the video, (H, W, 3) uint8; interlacing shows only where something moves.
-    """
+def check_packing(packed: Packing | None, *, interlaced: bool) -> Iterator[VideoFinding]:
+    """Yield whether a picture holds two views (stereo), or two fields of different times (interlaced)."""
     if packed is not None:
         where = "beside" if packed.layout == "left-right" else "above"
         squeezed = ", each squeezed to half its size" if packed.squeezed else ""
         correlation = f"(correlation {packed.correlation:.2f})"
         message = f"two views {where} each other{squeezed} {correlation}; the rest is about the first"
         yield VideoFinding("warning", "stereo", message, f"--stereo {packed.layout}")
-    if pictures and is_interlaced(pictures):
+    if interlaced:
         message = "interlaced: odd and even rows show two moments, edges of what moves look like combs"
         yield VideoFinding("warning", "interlaced", message, "--deinterlace")
 

@@ -21,7 +21,7 @@ from scopemap.engine.config import InputSettings
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import Frame
 from scopemap.input.opening import open_sequence, open_source
-from scopemap.input.prepared import OF_UNKNOWN_VIEWS, sample_pictures
+from scopemap.input.prepared import OF_UNKNOWN_VIEWS, sample_pairs, shows_two_fields
 from scopemap.input.sequence import Sequence
 from scopemap.input.video_format.stereo_packing import Packing, packing
 
@@ -104,7 +104,10 @@ def inspect(
     # Whether there are two views comes first: the camera may be that of one.
     source = open_source(path, dataset=dataset, settings=plain)
     unknown = source.name in OF_UNKNOWN_VIEWS  # the readers of data sets know what a picture holds
-    packed = packing(sample_pictures(source), source.pixel_aspect) if unknown else None
+    pairs = sample_pairs(source)
+    packed = packing([rgb for rgb, _ in pairs], source.pixel_aspect) if unknown else None
+    interlaced = shows_two_fields(source, pairs)
+    del pairs
     settings = plain if packed is None else plain.model_copy(update={"stereo": packed.layout})
     sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
     media = sequence.source.media()
@@ -130,7 +133,7 @@ def inspect(
         *_of_source(list(map(str, sequence.warnings))),
         *(check_container(container) if container else []),
         *checks.check_timing(clip, container["length_s"] if container else None),
-        *checks.check_packing(packed, [item.rgb for item in sampled.kept if not item.measures.blank]),
+        *checks.check_packing(packed, interlaced=interlaced),
         *checks.check_repeats(clip),
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
         *([] if sequence.calibrated else check_scope(field.field(), size, stereo=packed is not None)),

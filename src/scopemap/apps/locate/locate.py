@@ -179,7 +179,7 @@ def open_other(
     camera_fit : that of the settings' `input`, for this video.
     """
     run = Result(folder).checked()
-    kept, settings = run.source_camera_file, run.config.input
+    kept, settings = run.source_camera_file, run.config.input.model_copy(update={"frames": ""})
     if camera_fit is not None:
         settings = settings.model_copy(update={"camera_fit": camera_fit})
     sequence = open_sequence(path, camera=camera, dataset=dataset, frames=frames, settings=settings)

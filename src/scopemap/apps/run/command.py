@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from scopemap.result.frame_table import FrameTable
     from scopemap.result.result import Result
 
-_SKIPPED = {"repeated": "which repeat the one before (--set input.skip_duplicates=false)", "thinned": "by input.fps"}
+_SKIPPED = {
+    "repeated": "which repeat the one before (--set input.skip_duplicates=false)",
+    "thinned": "by input.fps",
+    "size": "of another size",
+}
 _MOST_LOSSES = 5
 
 
@@ -116,12 +120,14 @@ def run(
     Ctrl-C ends it early and writes what was tracked until then; a second Ctrl-C writes nothing.
     """
     from scopemap.engine.config import Config
+    from scopemap.input.frame_choice import selection_text
 
     given = {
         "input.camera_fit": camera_fit,
         "input.stereo": stereo,
         "input.deinterlace": deinterlace or None,
         "input.redact": [options.parse_box(box) for box in redact] if redact else None,
+        "input.frames": None if frames is None else selection_text(frames),
         "input.fps": fps,
         "input.scope": scope,
         "run.memory_mb": options.parse_memory(memory) if memory else None,
@@ -150,7 +156,6 @@ def run(
             camera=camera,
             fov_deg=fov,
             size=options.parse_size(size) if size else None,
-            frames=frames,
             settings=resolved.input,
         )
     from scopemap.runner.checkpoints import check_resumable, discard_unfinished
@@ -193,6 +198,7 @@ def _report(result: Result, config: Config, out: Path, *, as_json: bool, quiet: 
 def summary_lines(result: Result) -> list[str]:
     """Return the summary of a run, one fact per line."""
     from scopemap.engine.notices import scale_words
+    from scopemap.result.input_part import part_of_input
     from scopemap.result.losses import losses
 
     facts, known = result.provenance, result.provenance["scale"]["known"]
@@ -209,6 +215,7 @@ def summary_lines(result: Result) -> list[str]:
         f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces{_surface(facts['surface'])}",
         time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
     ]
+    lines += [f"input: {part}; shares are of these" for part in [part_of_input(facts)] if part]
     lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
     if result.others:
         lines += _map_lines(result.frames)

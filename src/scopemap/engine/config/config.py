@@ -14,6 +14,7 @@ plausible values that were not searched.
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -143,9 +144,18 @@ def _advanced_of_methods() -> dict[str, frozenset[str]]:
     return {f"{stage}.method": frozenset(f"{stage}.{name}" for name in part.sources()) for stage, part in stages}
 
 
+def check_setting(dotted: str) -> None:
+    """Raise `SettingsError` for a name that is none of a setting; it says which are near, and which its group has."""
+    if dotted in (names := setting_names()):
+        return
+    group = dotted.partition(".")[0] + "."
+    others = [name.removeprefix(group) for name in names if name.startswith(group)]
+    of_group = f" {group[:-1]} has {', '.join(others)}" if others else ""
+    raise SettingsError(f"unknown setting '{dotted}': {hint(dotted, names)}{of_group}")
+
+
 def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:
-    if dotted not in (names := setting_names()):
-        raise SettingsError(f"unknown setting '{dotted}': {hint(dotted, names)}")
+    check_setting(dotted)
     *groups, name = dotted.split(".")
     for group in groups:
         tree = tree.setdefault(group, {})
@@ -164,6 +174,10 @@ def _read_toml(file: Path) -> dict[str, Any]:
 def explain(error: Any) -> str:
     """Return one phrase for an error that pydantic found: which setting, what is wrong, what was given."""
     where = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "literal_error":
+        choices = [choice for choice in re.findall(r"'[^']*'", error["ctx"]["expected"]) if choice != "''"]
+        unknown = f"unknown {where.rpartition('.')[2]} {_quoted(error['input'])}"
+        return f"setting '{where}': {unknown}: choose one of {', '.join(choices)}"
     return f"setting '{where}': {error['msg'].removeprefix('Value error, ')} (got {_quoted(error['input'])})"
 
 

@@ -59,6 +59,12 @@ class InputSettings(Settings):
         description="longest side of the working size unless that is given (--size): the input's is divided by the "
         "smallest whole number that brings it to this, px; 0: the input's size",
     )
+    frames: str = Field(
+        "",
+        pattern=r"^(-?\d{0,15}:-?\d{0,15}(:\d{0,15})?)?$",
+        description="which frames of the input are used, START:STOP or START:STOP:STEP as a Python slice has them, by "
+        "their positions from 0 on; empty: all (--frames)",
+    )
     fps: float | None = Field(None, gt=0, description="maximum frames per second, by the time stamps")
     skip_duplicates: bool = Field(
         True, description="leave out images of a video that repeat the last one, but for noise"

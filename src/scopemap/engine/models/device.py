@@ -46,6 +46,10 @@ def need_packages(what: str, *packages: str) -> None:
 
 def choose_device(device: str) -> str:
     """Return the torch device for a setting, "auto": the first CUDA device, else the CPU; raises `SettingsError`."""
+    if device == "cpu":
+        return device
+    if device != "auto":
+        need_packages(f"the device '{device}' (networks.device)", "torch")
     import torch
 
     if device == "auto":
@@ -56,4 +60,7 @@ def choose_device(device: str) -> str:
         raise SettingsError(f"unknown device '{device}': use auto, cpu or cuda") from None
     if kind == "cuda" and not torch.cuda.is_available():
         raise SettingsError(f"device '{device}' was asked for but torch sees no CUDA device: use auto or cpu")
+    backend = getattr(torch, kind, None)
+    if kind in ("mps", "xpu") and not (backend is not None and backend.is_available()):
+        raise SettingsError(f"device '{device}' was asked for but torch sees none: use auto or cpu")
     return device

@@ -81,6 +81,7 @@ class Dicom(Source):
         self._video = EncapsulatedVideo(first, rate_hz) if first.is_video else None
         self.rate_hz = rate_hz or self.rate_hz
         if (video := self._video) is not None:
+            self.left_out, self.resized = video.left_out, video.resized
             self.numbers, self.warnings, self.rate_hz = None, video.warnings, video.rate_hz
             self.width, self.height, self.count = video.width, video.height, video.count
             self.pixel_aspect = first.pixel_aspect or video.pixel_aspect
@@ -96,7 +97,7 @@ class Dicom(Source):
         return not image_files(path) and bool(_files(path)) if path.is_dir() else _is_dicom(path)
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames; one that cannot be decoded is left out with a warning."""
+        """Yield the selected frames without those that cannot be decoded, with a warning, or are of another size."""
         if self._video is not None:
             for frame in self._video.frames(selection):
                 time_s = self.times_s.get(frame.index, frame.time_s)
@@ -106,8 +107,9 @@ class Dicom(Source):
             if rgb is None:
                 self._warn(f"image {number} cannot be decoded and was left out")
                 continue
-            self._check_size(rgb, f"{self.path}: image {number}")
-            yield SourceFrame(number, self._time_s(number), rgb, str(number))
+            frame = self._of_one_size(SourceFrame(number, self._time_s(number), rgb, str(number)))
+            if frame is not None:
+                yield frame
 
     def media(self) -> str | None:
         """Return the video's stream; None where there is none."""

@@ -115,7 +115,7 @@ class RosBag(Source):
         return is_bag and not image_files(path)
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames; an unreadable one is left out with a warning, another size is an `InputError`."""
+        """Yield the selected frames; unreadable ones, with a warning, and those of another size are left out."""
         last_s = -np.inf
         with self._opened() as reader:
             messages = enumerate(self._as_far_as_read(reader, [self._topic.name]))
@@ -125,12 +125,13 @@ class RosBag(Source):
                 except InputError as error:
                     self._warn(f"image {number} of {self._topic.name} was left out: {error}")
                     continue
-                self._check_size(rgb, f"{self.path}: image {number} of {self._topic.name}")
                 time_s = self._time_of(message)
                 if time_s <= last_s:
                     self._warn(f"the stamps of {self._topic.name} do not increase: images stay as they were recorded")
                 last_s = time_s
-                yield SourceFrame(number, time_s, rgb, f"{self._topic.name}[{number}]")
+                frame = self._of_one_size(SourceFrame(number, time_s, rgb, f"{self._topic.name}[{number}]"))
+                if frame is not None:
+                    yield frame
 
     def stamps(self, selection: slice) -> list[tuple[int, float]]:
         """Return number and time of the selected frames, also of unreadable images; decodes none."""

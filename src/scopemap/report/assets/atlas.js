@@ -11,7 +11,7 @@ function whatIs(run, row) {
   const place = run.places[row], cause = run.causes[run.causeOf[row]];
   if (place >= 0) return { text: place ? `submap ${place}, by itself ${run.words[place]}` : "the result", tone: style(place ? "--other" : "--in"), place };
   if (place === OTHER_MAP) return { text: "submap too short to be kept", tone: style("--line") };
-  if (place === NOT_USED) return { text: "left out: repeated, or beyond the rate", tone: style("--line") };
+  if (place === NOT_USED) return { text: "left out: repeated, beyond the rate, or of another size", tone: style("--line") };
   return { text: `lost: ${cause || "no cause was kept"}`, tone: CAUSE_TONES[cause] || style(place === ROTATED ? "--rotated" : "--lost") };
 }
 
@@ -90,6 +90,7 @@ function openAtlas(run, choose) {
   }));
   const hint = "Bands: what each second is (R: the result). Arcs join parts of one submap: the thicker, the more loops; dashed: found again, without a loop.";
   put("atlas-note", hint);
+  put("submaps-title", run.used_part ? `The part of the video that was used: ${run.used_part}` : "The whole video");
   canvas.onclick = (event) => choose(rowAt(event));
   canvas.onpointerleave = () => put("atlas-note", hint);
   canvas.onpointermove = (event) => {
