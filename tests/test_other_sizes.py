@@ -14,12 +14,12 @@ from drawn_clips import tissue
 from drawn_inputs import picture, save
 from front_door import call
 from result_files import frame_rows
-from scopemap.result.run_folder import RunFolder
 
 from scopemap.engine.config import InputSettings
 from scopemap.engine.errors import InputError
 from scopemap.engine.notices import Notice
 from scopemap.input.opening import open_sequence
+from scopemap.result.result import Result
 
 WIDTH, HEIGHT = 320, 240
 FAST = ("--preset", "realtime", "--quiet")
@@ -135,7 +135,7 @@ def test_a_bag_leaves_them_out_too(tmp_path: Path) -> None:
 def test_the_frame_table_names_them(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "images", 12, {4: lambda rgb: rgb[:100], 8: lambda rgb: rgb[:, :-1]})
     call("run", folder, "--out", tmp_path / "result", *FAST)
-    run, rows = RunFolder(tmp_path / "result"), frame_rows(tmp_path / "result")
+    run, rows = Result(tmp_path / "result"), frame_rows(tmp_path / "result")
     assert (rows[4]["status"], rows[4]["reason"]) == ("skipped", "320x100 px, others are 320x240 px")
     assert rows[8]["status"] != "skipped"
     assert run.provenance["skipped"] == {"size": 1}

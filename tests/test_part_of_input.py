@@ -9,7 +9,6 @@ import pytest
 from drawn_videos import encode
 from front_door import call
 from result_files import frame_rows
-from scopemap.result.run_folder import RunFolder
 from tiny_phantom import only_images, write_tiny
 
 from scopemap.engine.config import Config
@@ -17,6 +16,7 @@ from scopemap.engine.errors import SettingsError
 from scopemap.input.opening import open_sequence
 from scopemap.report.page_data import page_data
 from scopemap.result.input_part import part_of_input
+from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
 from scopemap.runner.reconstruct import reconstruct
 
@@ -42,7 +42,7 @@ def test_a_part_is_said_and_repeated(
     call("run", video, "--out", first, f"--frames={frames}", "--set", "input.skip_duplicates=false", *FAST)
     said = capfd.readouterr().out
     assert f"input: {part}; shares are of these" in said
-    run = RunFolder(first)
+    run = Result(first)
     assert run.config.input.frames == frames
     assert run.provenance["selection"] == {"frames": frames, "of": 14}
     assert page_data(run, [run.mesh])["used_part"] == part
@@ -63,7 +63,7 @@ def test_a_part_that_python_selects_is_kept_too(video: Path, tmp_path: Path) -> 
 
 def test_a_whole_video_is_no_part(video: Path, tmp_path: Path) -> None:
     call("run", video, "--out", tmp_path / "o", "--quiet", *FAST)
-    run = RunFolder(tmp_path / "o")
+    run = Result(tmp_path / "o")
     assert (run.config.input.frames, part_of_input(run.provenance)) == ("", "")
 
 
