@@ -213,8 +213,9 @@ def import_closure(start: str) -> set[str]:
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.engine.pipeline")
     assert "scopemap.engine.mapping.backend" in closure
-    # With notices, causes of losses, local adjustment, its lens, other starts, moving tissue, the skin of its states.
-    assert len(closure) <= 75, "\n".join(sorted(closure))
+    # With notices, causes of losses, local adjustment, its lens, other starts, moving tissue, the skin of its states,
+    # and what stages keep.
+    assert len(closure) <= 76, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

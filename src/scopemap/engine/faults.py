@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scopemap.engine.errors import ScopemapError
+from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 
 _MOST_FAULTS = 3  # frames that may fail
@@ -13,6 +14,12 @@ _MOST_FAULTS_SHARE = 0.05  # more are no accident
 
 class StageFaults:
     """The frames that one stage could not process; each stage has its own, as a part of the state that it changes."""
+
+    frames: Kept[int]
+    failed: Kept[int]
+    without_depth: Kept[int]
+    first: Kept[tuple[int, str]]
+    first_without_depth: Kept[int]
 
     def __init__(self, stage: str) -> None:
         self._stage = stage

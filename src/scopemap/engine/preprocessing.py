@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from scopemap.engine.faults import StageFaults
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.warp import pull, resampled
+from scopemap.engine.kept import Kept
 from scopemap.engine.masking.masker import Masker, StoredMasks, without_instruments
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.causes import LossCause
@@ -34,13 +34,13 @@ _MOST_LOW_TEXTURE = 10
 class Estimators:
     """The interchangeable parts that look at images; a flow is not thread-safe, so each thread has its own."""
 
-    depth: DepthEstimator
-    anchor: AnchoredDepth
+    depth: Kept[DepthEstimator]
+    anchor: Kept[AnchoredDepth]
     flow: FlowEstimator  # between successive frames
     corner_flow: FlowEstimator  # of the keyframe's corners, in tracking
     keyframe_flow: FlowEstimator  # between keyframes, in mapping
     perceptual: PerceptualDistance
-    masks: StoredMasks | None = None
+    masks: Kept[StoredMasks | None] = None
     features: FeatureDetector = field(default_factory=SiftFeatures)
     tracker: Callable[[], FrameTracker] | None = None  # makes what tracks in place of `Tracker`
 
@@ -69,24 +69,21 @@ class PreprocessedFrame:
 class Preprocessing:
     """Masks frames and estimates their raw depth, in order, each once."""
 
-    STATE: ClassVar = (
-        "_masker",
-        "_quality",
-        "estimators",
-        "faults",
-        "skipped",
-        "propagated",
-        "_low_texture",
-        "_turn",
-        "_kind",
-    )
-    """What changes from frame to frame."""
+    _masker: Kept[Masker]
+    _quality: Kept[PictureQuality]
+    estimators: Kept[Estimators]
+    faults: Kept[StageFaults]
+    skipped: Kept[Counter[str]]
+    propagated: Kept[int]
+    _low_texture: Kept[int]
+    _turn: Kept[int]
+    _kind: Kept[DepthKind | None]
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._config, self.estimators = config, estimators
         self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
         self.faults, self._low_texture = StageFaults("depth"), 0
-        self.skipped: Counter[str] = Counter()
+        self.skipped = Counter()
         """How many frames were skipped, by the cause of their loss."""
         self.propagated = 0
         """How many frames got the depth of the one before."""
@@ -94,7 +91,7 @@ class Preprocessing:
         self._every, self._needs_previous = config.depth.constants.network_every, Mapis(config.mapis).needs_previous
         self._every = 1 if from_files else self._every
         self._turn = 0
-        self._kind: DepthKind | None = None  # of what the network said last; None: it looks at the next frame
+        self._kind = None  # of what the network said last; None: it looks at the next frame
 
     @property
     def notices(self) -> list[Notice]:
@@ -164,13 +161,14 @@ class Preprocessing:
 class Matching:
     """Finds the correspondence of each frame with the one before, where its depth is to be refined with it."""
 
-    STATE: ClassVar = ("_matcher", "_before", "faults")
-    """What changes from frame to frame."""
+    _matcher: Kept[DenseMatcher]
+    _before: Kept[Frame | None]
+    faults: Kept[StageFaults]
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
         self._needs_previous = Mapis(config.mapis).needs_previous
-        self._before: Frame | None = None
+        self._before = None
         self.faults = StageFaults("flow")
 
     def match(self, estimated: PreprocessedFrame) -> PreprocessedFrame:

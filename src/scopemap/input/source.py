@@ -12,6 +12,7 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.rectification import DepthSensor
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import TruthQuality
+from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.calibration import Calibration, fitted
 
@@ -90,13 +91,14 @@ class Source:
     depth_scale_mm: float | None = None
     depth_sensor: DepthSensor | None = None
     masks: Path | None = None
+    warnings: Kept[list[str | Notice]]
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.poses: dict[int, np.ndarray] = {}
         self.times_s: dict[int, float] = {}
         self.notes: list[str | Notice] = []
-        self.warnings: list[str | Notice] = []
+        self.warnings = []
 
     @staticmethod
     def recognises(path: Path) -> bool:

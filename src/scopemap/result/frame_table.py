@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scopemap.engine.errors import InputError, reporting
-from scopemap.engine.frame import RowTable
+from scopemap.engine.frame import Rows, RowTable
+from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY, SKIPPED, STATUSES, TRACKED, Trajectory
 
@@ -188,6 +189,10 @@ class GrowingFrameTable:
 
     table : where they are kept; as objects those of hours of video would take hundreds of megabytes.
     """
+
+    last_index: Kept[int]
+    _rows: Kept[Rows]
+    _texts: Kept[Rows]
 
     def __init__(self, table: RowTable) -> None:
         self._rows, self._texts = table("frame_table", _STORED), table("frame_texts", np.dtype(np.uint8))

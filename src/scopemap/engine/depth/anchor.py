@@ -12,6 +12,7 @@ from scopemap.engine.depth.estimate import DepthEstimate, DepthEstimator, DepthK
 from scopemap.engine.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.frame import Frame
+from scopemap.engine.kept import Kept
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
 _MIN_SHARE = 0.02
@@ -61,11 +62,19 @@ class AnchoredDepth:
     scale_is_known : whether it is measured, or anchored to a range or by Depth Pro. is_stated : whether to a range.
     """
 
+    reference: Kept[DepthEstimator]
+    conversion: Kept[AffineDisparity | DepthScale | None]
+    description: Kept[str]
+    scale_is_known: Kept[bool]
+    is_measured: Kept[bool]
+    is_stated: Kept[bool]
+    _frames_held: Kept[int]
+
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
         _check_range(settings)
         self._settings = settings
         self.reference = reference
-        self.conversion: AffineDisparity | DepthScale | None = None
+        self.conversion = None
         self.description = "not anchored: no usable frame yet"
         self.scale_is_known = self.is_measured = self.is_stated = False
         self._frames_held = 0

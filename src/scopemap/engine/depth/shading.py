@@ -10,6 +10,7 @@ from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.depth.guided import filled, guided_filter
 from scopemap.engine.depth.scopenet.planes import LINEAR
 from scopemap.engine.frame import Frame
+from scopemap.engine.kept import Kept
 
 # Red alone saturates on near tissue, green alone follows the blood, blue is mostly noise.
 _CHANNEL_WEIGHTS = np.array([0.5, 0.5, 0.0], dtype=np.float32)
@@ -37,11 +38,13 @@ class ShadingDepth:
     `settings.shading_median_mm`, and kept from then on, so that depth shrinks as the camera approaches.
     """
 
+    _scale_mm: Kept[float | None]
+
     name = "shading"
 
     def __init__(self, settings: DepthSettings) -> None:
         self._settings = settings
-        self._scale_mm: float | None = None
+        self._scale_mm = None
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return depth in mm by the prior, kind "depth", (H, W) float32.

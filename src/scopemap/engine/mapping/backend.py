@@ -13,9 +13,10 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
-from scopemap.engine.frame import Frame, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_adjustment import RIGID_SIGMA_PX, BundleSolution, adjust_in_windows, errors_px
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Points, Priors, State
 from scopemap.engine.mapping.depth_correction import (
@@ -28,14 +29,7 @@ from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatche
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TissueMotion, TrackedPose
 from scopemap.engine.mapping.lens_residual import lens_residual
 from scopemap.engine.mapping.loop_closure import LOOP, MOST_RECENT, Loop, LoopFinder
-from scopemap.engine.mapping.map_merging import (
-    AdjustedMaps,
-    Part,
-    errors_of_maps,
-    loop_support,
-    merge_maps,
-    split_maps,
-)
+from scopemap.engine.mapping.map_merging import AdjustedMaps, Part, errors_of_maps, loop_support, merge_maps, split_maps
 from scopemap.engine.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
 from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.engine.mapping.pose_graph import (
@@ -63,6 +57,18 @@ class Backend:
     loop closures over the keyframes. table : of observations until then. anchored : as `scale_by_network` takes it.
     """
 
+    _frames: Kept[list[int]]
+    _times_s: Kept[list[float]]
+    _tracked: Kept[list[TrackedPose]]
+    _steps: Kept[list[KeyframeStep]]
+    _log_scales: Kept[list[float]]
+    _depths_mm: Kept[Rows]
+    _grid_shape: Kept[tuple[int, int]]
+    _tracks: Kept[FeatureTracks]
+    _finder: Kept[LoopFinder | None]
+    _loops: Kept[Rows]
+    _camera: Kept[PinholeCamera | None]
+
     def __init__(
         self,
         settings: MappingSettings,
@@ -72,18 +78,12 @@ class Backend:
         anchored: bool = False,
     ) -> None:
         self.settings, self._anchored = settings.constants, anchored
-        self._frames: list[int] = []
-        self._times_s: list[float] = []
-        self._tracked: list[TrackedPose] = []
-        self._steps: list[KeyframeStep] = []
-        self._log_scales: list[float] = []
+        self._frames, self._times_s, self._tracked, self._steps, self._log_scales = [], [], [], [], []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
         self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
-        self._tracks = FeatureTracks(settings, flow, table)
+        self._tracks, self._loops = FeatureTracks(settings, flow, table), table("loops", LOOP)
         self._finder = LoopFinder(settings, table, features) if settings.constants.min_loop_inliers > 0 else None
-        self._loops = table("loops", LOOP)
-        self._all_weighed = False
-        self._camera: PinholeCamera | None = None
+        self._all_weighed, self._camera = False, None
         self.most_observations = MOST_OBSERVATIONS
         """About so many are adjusted."""
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")

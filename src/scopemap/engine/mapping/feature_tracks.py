@@ -26,9 +26,10 @@ from scopemap.engine.flow.corners import (
     refined_corners,
 )
 from scopemap.engine.flow.estimator import FlowEstimator, FlowPair
-from scopemap.engine.frame import Frame, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.geometry.uncertainty import relative_sigma
+from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.loop_closure import MOST_RECENT, Loop
 
@@ -98,6 +99,12 @@ class FeatureTracks:
     gaps : how many keyframes before it these are; None: `keyframe_gaps` of the settings.
     """
 
+    keyframe_count: Kept[int]
+    _recent: Kept[dict[int, deque[_FlowKeyframe]]]
+    _points: Kept[Rows]
+    _matches: Kept[Rows]
+    _camera: Kept[PinholeCamera | None]
+
     def __init__(
         self,
         settings: MappingSettings,
@@ -107,10 +114,10 @@ class FeatureTracks:
     ) -> None:
         self.settings, self._flow = settings.constants, flow
         self._gaps = gaps or self.settings.keyframe_gaps
-        self._recent: dict[int, deque[_FlowKeyframe]] = {}
+        self._recent = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
         self.keyframe_count = 0
-        self._camera: PinholeCamera | None = None
+        self._camera = None
 
     def add(self, keyframe: Frame, map_number: int = 0, known: KeyframeMatches | None = None) -> KeyframeMatches:
         """Take a keyframe with depth: its corners become points, and are matched with earlier keyframes.
@@ -125,7 +132,7 @@ class FeatureTracks:
         share = relative_sigma(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
         first = self._add_points(self.keyframe_count, corners, log_depth, np.nan_to_num(share, nan=0.0))
         # The map that was used last is the last one.
-        recent = self._recent[map_number] = self._recent.pop(map_number, deque(maxlen=max(self._gaps)))
+        recent = self._recent[map_number] = deque(self._recent.pop(map_number, ()), maxlen=max(self._gaps))
         for oldest in [*self._recent][:-_MOST_MAPS]:
             del self._recent[oldest]
         # With the flows, and the older keyframes, of each new map memory would grow by tens of megabytes.

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from scopemap.engine.geometry.local_contrast import local_mean
+from scopemap.engine.kept import Kept
 
 _FINE = 1 / 320  # of the picture's width: standard deviations of the two blurs
 _COARSE = 4 / 320
@@ -23,8 +24,10 @@ LEAST_QUALITY = 0.01
 class SharpnessMonitor:
     """Compares the sharpness of frames, in order, with the median of the last 30, unsharp ones included."""
 
+    _recent: Kept[deque[float]]
+
     def __init__(self) -> None:
-        self._recent: deque[float] = deque(maxlen=_FRAMES)
+        self._recent = deque(maxlen=_FRAMES)
 
     def relative_sharpness(self, rgb: np.ndarray, valid: np.ndarray) -> float:
         """Return the sharpness of an image as a share of the median before it; 1 for the first."""
@@ -41,8 +44,10 @@ class PictureQuality:
     are neither saturated nor too dark; and saturation of the colours, since tissue is red and haze is white.
     """
 
+    _recent: Kept[deque[tuple[float, float, float]]]
+
     def __init__(self) -> None:
-        self._recent: deque[tuple[float, float, float]] = deque(maxlen=_NEIGHBOURS)
+        self._recent = deque(maxlen=_NEIGHBOURS)
 
     def __call__(self, rgb: np.ndarray, valid: np.ndarray) -> float:
         """Return the quality, 0.01..1, of an image (H, W, 3) uint8 with valid pixels (H, W) bool."""

@@ -11,6 +11,7 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.engine.tracking.keyframe_alignment import (
@@ -40,12 +41,19 @@ _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 class KeyframeChoice:
     """When the next keyframe is due: by frames and motion since the last one, and by how well they still fit it."""
 
+    frames_since: Kept[int]
+    _quality: Kept[float]
+    _best_quality: Kept[float]
+    _first_agreement: Kept[float | None]
+    _last: Kept[Alignment | None]
+    _depth_mm: Kept[float]
+
     def __init__(self, settings: TrackingSettings) -> None:
         self._settings = settings
         self.frames_since = 0
         self._quality = self._best_quality = 0.0
-        self._first_agreement: float | None = None
-        self._last: Alignment | None = None
+        self._first_agreement = None
+        self._last = None
         self._depth_mm = 1.0
 
     def see(self, frame: Frame) -> None:
@@ -96,6 +104,19 @@ class Tracker(FrameTracker):
     in a row a new map begins, with its own world; later relocalisation may lead back to an older map.
     """
 
+    _motion: Kept[MotionModel]
+    _aligner: Kept[KeyframeAligner]
+    _relocaliser: Kept[Relocaliser]
+    _earlier_keyframes: Kept[deque[Frame]]
+    _choice: Kept[KeyframeChoice]
+    _sharpness: Kept[SharpnessMonitor]
+    _keyframe: Kept[Keyframe | None]
+    _last: Kept[Frame | None]
+    _sharp_frames_lost: Kept[int]
+    _is_unsharp: Kept[bool]
+    _after_close_up: Kept[bool]
+    _is_revisited: Kept[bool]
+
     def __init__(
         self, settings: TrackingSettings, flow: FlowEstimator | None = None, features: FeatureDetector | None = None
     ) -> None:
@@ -103,11 +124,11 @@ class Tracker(FrameTracker):
         self._motion = MotionModel()
         self._aligner = KeyframeAligner(settings, flow, self._motion)
         self._relocaliser = Relocaliser(settings, features or SiftFeatures())
-        self._earlier_keyframes: deque[Frame] = deque(maxlen=_EARLIER_KEYFRAMES)
+        self._earlier_keyframes = deque(maxlen=_EARLIER_KEYFRAMES)
         self._choice = KeyframeChoice(settings)
         self._sharpness = SharpnessMonitor()
-        self._keyframe: Keyframe | None = None
-        self._last: Frame | None = None
+        self._keyframe = None
+        self._last = None
         self._sharp_frames_lost = 0
         self._is_unsharp = self._after_close_up = self._is_revisited = False
 
