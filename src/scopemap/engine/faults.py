@@ -15,16 +15,14 @@ _MOST_FAULTS_SHARE = 0.05  # more are no accident
 class StageFaults:
     """The frames that one stage could not process; each stage has its own, as a part of the state that it changes."""
 
-    frames: Kept[int]
-    failed: Kept[int]
-    without_depth: Kept[int]
-    first: Kept[tuple[int, str]]
-    first_without_depth: Kept[int]
+    frames: Kept[int] = 0
+    failed: Kept[int] = 0
+    without_depth: Kept[int] = 0
+    first: Kept[tuple[int, str]] = (-1, "")
+    first_without_depth: Kept[int] = -1
 
     def __init__(self, stage: str) -> None:
         self._stage = stage
-        self.frames = self.failed = self.without_depth = 0
-        self.first, self.first_without_depth = (-1, ""), -1
 
     def has_no_depth(self, index: int) -> None:
         """Note a frame to which the network gave no depth."""

@@ -27,7 +27,6 @@ Kept = Annotated[_T, _MARK]
 PutArray = Callable[[np.ndarray], Any]
 """Stores an array, and returns what JSON holds of it: no string, number or list."""
 
-
 GetArray = Callable[..., np.ndarray]
 """Returns the array of what `PutArray` returned; with `shared=True` one that others get, too, and nobody changes."""
 
@@ -109,15 +108,14 @@ def _restored(kind: Any, stored: Any, get: GetArray, now: Any = None) -> Any:
 
 
 def _restored_container(kind: Any, stored: Any, get: GetArray, now: Any) -> Any:
+    """Return a container of a declared type; a dictionary or list stays the object that it is."""
     outer, of = get_origin(kind), get_args(kind)
     if issubclass(outer, Mapping):
         of_key, of_item = (*of, int)[:2]  # a counter names no type of its counts
-        parts = now if isinstance(of_item, type) and kept(of_item) else {}
-        keys = [of_key(key) for key in stored]
-        found = {
-            key: _restored(of_item, item, get, parts[key] if parts is now else None)
-            for key, item in zip(keys, stored.values(), strict=True)
-        }
+        is_part, found = isinstance(of_item, type) and kept(of_item), {}
+        for name, item in stored.items():
+            key = of_key(name)
+            found[key] = _restored(of_item, item, get, now[key] if is_part else None)  # which makes a part
         if now is None:
             return found
         now.clear()

@@ -59,8 +59,8 @@ class Odometry:
     _mapis: Kept[Mapis]
     _smooth: Kept[Wema]
     _rotation: Kept[RotationFollower]
-    _last_track: Kept[Track | None]
-    _last_frame: Kept[tuple[Frame, Track] | None]
+    _last_track: Kept[Track | None] = None
+    _last_frame: Kept[tuple[Frame, Track] | None] = None
 
     def __init__(
         self, config: Config, tracker: FrameTracker, mapper: Mapper, local: LocalAdjustment | None = None
@@ -69,7 +69,6 @@ class Odometry:
         self._mapis = Mapis(config.mapis)
         self._smooth = Wema(config.smoothing)
         self._rotation = RotationFollower()
-        self._last_track = self._last_frame = None
         self.faults = StageFaults("tracking")
 
     def track(self, preprocessed: PreprocessedFrame) -> Step:

@@ -74,24 +74,21 @@ class Preprocessing:
     estimators: Kept[Estimators]
     faults: Kept[StageFaults]
     skipped: Kept[Counter[str]]
-    propagated: Kept[int]
-    _low_texture: Kept[int]
-    _turn: Kept[int]
-    _kind: Kept[DepthKind | None]
+    """How many frames were skipped, by the cause of their loss."""
+    propagated: Kept[int] = 0
+    """How many frames got the depth of the one before."""
+    _low_texture: Kept[int] = 0
+    _turn: Kept[int] = 0
+    _kind: Kept[DepthKind | None] = None  # of what the network said last; None: it looks at the next frame
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._config, self.estimators = config, estimators
         self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
-        self.faults, self._low_texture = StageFaults("depth"), 0
+        self.faults = StageFaults("depth")
         self.skipped = Counter()
-        """How many frames were skipped, by the cause of their loss."""
-        self.propagated = 0
-        """How many frames got the depth of the one before."""
         from_files = config.depth.backend.startswith("files:") or config.mask.instruments == "auto"
         self._every, self._needs_previous = config.depth.constants.network_every, Mapis(config.mapis).needs_previous
         self._every = 1 if from_files else self._every
-        self._turn = 0
-        self._kind = None  # of what the network said last; None: it looks at the next frame
 
     @property
     def notices(self) -> list[Notice]:
@@ -162,13 +159,12 @@ class Matching:
     """Finds the correspondence of each frame with the one before, where its depth is to be refined with it."""
 
     _matcher: Kept[DenseMatcher]
-    _before: Kept[Frame | None]
+    _before: Kept[Frame | None] = None
     faults: Kept[StageFaults]
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
         self._needs_previous = Mapis(config.mapis).needs_previous
-        self._before = None
         self.faults = StageFaults("flow")
 
     def match(self, estimated: PreprocessedFrame) -> PreprocessedFrame:

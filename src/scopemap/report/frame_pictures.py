@@ -41,14 +41,13 @@ class FramePictures:
 
     _pictures: Kept[dict[int, tuple[bytes, bytes]]]
     _measures: Kept[Rows]
-    _every: Kept[int]
-    _count: Kept[int]
+    _every: Kept[int] = 1
+    _count: Kept[int] = 0
 
     def __init__(self, *, timed: bool = True) -> None:
         self._pictures = {}
         self._measures = Rows(_MEASURE)
-        self._every, self._timed, self._before = 1, timed, time.perf_counter()
-        self._count = 0
+        self._timed, self._before = timed, time.perf_counter()
 
     def __call__(self, step: Step) -> None:
         """Put the frame of a step in: an observer for `reconstruct`."""

@@ -63,21 +63,17 @@ class AnchoredDepth:
     """
 
     reference: Kept[DepthEstimator]
-    conversion: Kept[AffineDisparity | DepthScale | None]
-    description: Kept[str]
-    scale_is_known: Kept[bool]
-    is_measured: Kept[bool]
-    is_stated: Kept[bool]
-    _frames_held: Kept[int]
+    conversion: Kept[AffineDisparity | DepthScale | None] = None
+    description: Kept[str] = "not anchored: no usable frame yet"
+    scale_is_known: Kept[bool] = False
+    is_measured: Kept[bool] = False
+    is_stated: Kept[bool] = False
+    _frames_held: Kept[int] = 0
 
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
         _check_range(settings)
         self._settings = settings
         self.reference = reference
-        self.conversion = None
-        self.description = "not anchored: no usable frame yet"
-        self.scale_is_known = self.is_measured = self.is_stated = False
-        self._frames_held = 0
 
     @property
     def just_fitted(self) -> bool:

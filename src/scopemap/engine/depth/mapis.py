@@ -43,11 +43,10 @@ class DenseCorrespondence:
 class DenseMatcher:
     """Matches masked images, in order, with the previous one."""
 
-    _previous: Kept[tuple[np.ndarray, np.ndarray] | None]
+    _previous: Kept[tuple[np.ndarray, np.ndarray] | None] = None
 
     def __init__(self, settings: MapisSettings, flow: FlowEstimator, perceptual: PerceptualDistance) -> None:
         self._settings, self._flow, self._perceptual = settings, flow, perceptual
-        self._previous = None
 
     def match(self, rgb: np.ndarray, valid: np.ndarray, *, wanted: bool = True) -> DenseCorrespondence | None:
         """Return the correspondence of an image (H, W, 3) uint8 to the previous one; None without or not `wanted`."""
@@ -96,12 +95,11 @@ class _Propagated(NamedTuple):
 class Mapis:
     """Refines the raw depth of frames in order; `reset` starts a new chain after a lost frame."""
 
-    _propagated: Kept[_Propagated | None]
-    _scale: Kept[float]
+    _propagated: Kept[_Propagated | None] = None
+    _scale: Kept[float] = 1.0
 
     def __init__(self, settings: MapisSettings) -> None:
         self.settings = settings
-        self._propagated, self._scale = None, 1.0
 
     def refine(
         self,

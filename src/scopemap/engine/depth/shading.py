@@ -38,13 +38,12 @@ class ShadingDepth:
     `settings.shading_median_mm`, and kept from then on, so that depth shrinks as the camera approaches.
     """
 
-    _scale_mm: Kept[float | None]
+    _scale_mm: Kept[float | None] = None
 
     name = "shading"
 
     def __init__(self, settings: DepthSettings) -> None:
         self._settings = settings
-        self._scale_mm = None
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return depth in mm by the prior, kind "depth", (H, W) float32.

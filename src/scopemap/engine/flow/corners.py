@@ -71,18 +71,16 @@ class Correspondences2D3D:
 class KeyframeMatcher:
     """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow."""
 
-    _keyframe: Kept[Frame | None]
-    _flows: Kept[FlowPair | None]
+    _keyframe: Kept[Frame | None] = None
+    _flows: Kept[FlowPair | None] = None
     _patterns: Kept[np.ndarray]
-    _usual_coverage: Kept[float]
+    _usual_coverage: Kept[float] = 1.0
     _corners: Kept[np.ndarray]
     _points_mm: Kept[np.ndarray]
 
     def __init__(self, flow: FlowEstimator) -> None:
         self.flow = flow
-        self._keyframe = self._flows = None
         self._patterns = np.zeros((0, 0), np.uint8)
-        self._usual_coverage = 1.0
         self._corners = np.zeros((0, 2), dtype=int)
         self._points_mm = np.zeros((0, 3))
 

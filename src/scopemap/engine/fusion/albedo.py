@@ -43,11 +43,11 @@ _GREY = np.array([0.299, 0.587, 0.114], np.float32)
 class AlbedoPainter:
     """Turns the frames that are fused, in order, into pictures of albedo in one exposure."""
 
-    _log_level: Kept[float | None]
+    _log_level: Kept[float | None] = None
     _median_levels: Kept[list[float]]
 
     def __init__(self) -> None:
-        self._log_level, self._median_levels = None, []
+        self._median_levels = []
 
     @property
     def median_level(self) -> float | None:

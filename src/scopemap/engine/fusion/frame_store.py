@@ -55,12 +55,11 @@ class StoredFile:
     """
 
     name: Kept[str]
-    size: Kept[int]
-    crc: Kept[int]
+    size: Kept[int] = 0
+    crc: Kept[int] = 0
 
     def __init__(self, store: FrameStore, name: str) -> None:
-        self.name, self.size, self.crc = name, 0, 0
-        self._store = store
+        self.name, self._store = name, store
         self._file: IO[bytes] | None = None
 
     def append(self, content: bytes) -> None:
@@ -304,11 +303,11 @@ class SpreadFrames:
     """Every n-th of the frames with a pose that are put in, at most `_MOST_SPREAD`; n doubles as they grow more."""
 
     _kept: Kept[list[Frame | int]]
-    _every: Kept[int]
-    _count: Kept[int]
+    _every: Kept[int] = 1
+    _count: Kept[int] = 0
 
     def __init__(self) -> None:
-        self._kept, self._every, self._count = [], 1, 0
+        self._kept = []
 
     def put(self, frame: Frame, store: FrameStore | None = None) -> None:
         """Keep or skip a frame; store : where it is kept, as those of many maps fill the memory."""

@@ -206,7 +206,7 @@ class SurfaceFusion:
 
     store: Kept[FrameStore]
     _volumes: Kept[dict[int, TsdfVolume]]
-    _tracked_frames: Kept[int]
+    _tracked_frames: Kept[int] = 0
 
     def __init__(self, settings: FusionSettings, store: FrameStore, *, corrected: bool) -> None:
         self.settings, self.store = settings, store
@@ -217,7 +217,6 @@ class SurfaceFusion:
         self.coarser_beyond: int | None = None
         """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
         self._volumes = defaultdict(partial(TsdfVolume, settings))
-        self._tracked_frames = 0
 
     @property
     def at_once(self) -> bool:

@@ -63,11 +63,11 @@ class Backend:
     _steps: Kept[list[KeyframeStep]]
     _log_scales: Kept[list[float]]
     _depths_mm: Kept[Rows]
-    _grid_shape: Kept[tuple[int, int]]
+    _grid_shape: Kept[tuple[int, int]] = (0, 0)
     _tracks: Kept[FeatureTracks]
     _finder: Kept[LoopFinder | None]
     _loops: Kept[Rows]
-    _camera: Kept[PinholeCamera | None]
+    _camera: Kept[PinholeCamera | None] = None
 
     def __init__(
         self,
@@ -80,10 +80,10 @@ class Backend:
         self.settings, self._anchored = settings.constants, anchored
         self._frames, self._times_s, self._tracked, self._steps, self._log_scales = [], [], [], [], []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
-        self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
-        self._tracks, self._loops = FeatureTracks(settings, flow, table), table("loops", LOOP)
+        self._depths_mm, self._loops = table("depth_grids", np.dtype(np.float32)), table("loops", LOOP)
+        self._tracks = FeatureTracks(settings, flow, table)
         self._finder = LoopFinder(settings, table, features) if settings.constants.min_loop_inliers > 0 else None
-        self._all_weighed, self._camera = False, None
+        self._all_weighed = False
         self.most_observations = MOST_OBSERVATIONS
         """About so many are adjusted."""
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")

@@ -99,11 +99,11 @@ class FeatureTracks:
     gaps : how many keyframes before it these are; None: `keyframe_gaps` of the settings.
     """
 
-    keyframe_count: Kept[int]
+    keyframe_count: Kept[int] = 0
     _recent: Kept[dict[int, deque[_FlowKeyframe]]]
     _points: Kept[Rows]
     _matches: Kept[Rows]
-    _camera: Kept[PinholeCamera | None]
+    _camera: Kept[PinholeCamera | None] = None
 
     def __init__(
         self,
@@ -116,8 +116,6 @@ class FeatureTracks:
         self._gaps = gaps or self.settings.keyframe_gaps
         self._recent = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
-        self.keyframe_count = 0
-        self._camera = None
 
     def add(self, keyframe: Frame, map_number: int = 0, known: KeyframeMatches | None = None) -> KeyframeMatches:
         """Take a keyframe with depth: its corners become points, and are matched with earlier keyframes.

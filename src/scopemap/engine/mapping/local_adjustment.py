@@ -86,9 +86,9 @@ class LocalAdjustment:
     _corrections: Kept[dict[int, KeyframeCorrection]]
     _adjusted: Kept[Counter[int]]
     _refused: Kept[Counter[int]]
-    _lens_evidence: Kept[LensEvidence | None]
-    _lens: Kept[LensResidual]
-    _is_determined: Kept[bool]
+    _lens_evidence: Kept[LensEvidence | None] = None
+    _lens: Kept[LensResidual] = LensResidual()
+    _is_determined: Kept[bool] = False
     _shapes: Kept[dict[int, ShapeTest]]
 
     def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
@@ -97,9 +97,6 @@ class LocalAdjustment:
         self._window = deque(maxlen=settings.constants.local_window)
         self._corrections, self._shapes = {}, {}
         self._adjusted, self._refused = Counter[int](), Counter[int]()
-        self._lens_evidence = None
-        self._lens = LensResidual()
-        self._is_determined = False
 
     def corrected(self, frame: Frame, reference: int) -> Frame:
         """Return a frame, tracked against the keyframe of frame `reference`, with its depth corrected as that one's."""

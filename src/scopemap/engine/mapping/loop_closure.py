@@ -119,10 +119,10 @@ class LoopFinder:
     _rows: Kept[Rows]
     _views: Kept[Rows]
     _map_of: Kept[dict[int, int]]
-    _count: Kept[int]
-    _every: Kept[int]
+    _count: Kept[int] = 0
+    _every: Kept[int] = 1
     _loops_to: Kept[defaultdict[int, list[int]]]
-    _camera: Kept[PinholeCamera | None]
+    _camera: Kept[PinholeCamera | None] = None
 
     def __init__(
         self,
@@ -134,12 +134,9 @@ class LoopFinder:
         self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
         self._min_inliers, gaps = settings.constants.min_loop_inliers, settings.constants.keyframe_gaps
         self._max_gap = min(max(gaps), MOST_RECENT)
-        self._features = {}
         self._rows, self._views = table("features", self._kind), table("views", VIEW)
-        self._map_of = {}
-        self._count, self._every = 0, 1
+        self._features, self._map_of = {}, {}
         self._loops_to = defaultdict(list)
-        self._camera = None
 
     @property
     def _kind(self) -> np.dtype:

@@ -71,8 +71,8 @@ class Mapper:
 
     _backend: Kept[Backend | None]
     _rows: Kept[Rows]
-    _last: Kept[tuple[int, TrackedPose] | None]
-    _lost_frames: Kept[int]
+    _last: Kept[tuple[int, TrackedPose] | None] = None
+    _lost_frames: Kept[int] = 0
     _relocalised: Kept[set[tuple[Part, Part]]]
 
     def __init__(
@@ -86,9 +86,7 @@ class Mapper:
         links = settings.constants.global_adjustment and flow.name != "none"
         self._backend = Backend(settings, flow, table, features, anchored) if links else None
         self._rows = table("tracked_poses", _TRACKED)
-        self._last = None
         self._tracked: dict[int, TrackedPose] = {}
-        self._lost_frames = 0
         self._relocalised = set()
         # What follows changes after the last frame.
         self._changed: dict[int, TrackedPose] = {}

@@ -44,11 +44,8 @@ class FieldOfView:
     as far from pixels that the rectification could not fill, but not from the image's own edge.
     """
 
-    _lit: Kept[np.ndarray | None]
-    _field: Kept[np.ndarray | None]
-
-    def __init__(self) -> None:
-        self._lit = self._field = None
+    _lit: Kept[np.ndarray | None] = None
+    _field: Kept[np.ndarray | None] = None
 
     def __call__(self, lit: np.ndarray, rectified: np.ndarray) -> np.ndarray:
         """Return the field of view, (H, W) bool, and learn from this frame; lit, rectified : (H, W) bool."""
@@ -98,15 +95,13 @@ class Masker:
 
     _field: Kept[FieldOfView]
     _overlays: Kept[OverlayFinder | None]
-    _from_file: Kept[bool]
-    _instruments: Kept[np.ndarray | None]
+    _from_file: Kept[bool] = False
+    _instruments: Kept[np.ndarray | None] = None
 
     def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
         self._field = FieldOfView()
         self._overlays = OverlayFinder() if settings.constants.overlays else None
-        self._from_file = False
-        self._instruments = None
 
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with `valid` False also outside the field of view, at highlights, overlays, bad exposure.

@@ -21,14 +21,12 @@ class CameraAtRest(FrameTracker):
     """
 
     _matcher: Kept[KeyframeMatcher | None]
-    _keyframe: Kept[int | None]
-    _frames_since_keyframe: Kept[int]
+    _keyframe: Kept[int | None] = None
+    _frames_since_keyframe: Kept[int] = 0
 
     def __init__(self, settings: TrackingSettings, flow: FlowEstimator) -> None:
         self._settings = settings
         self._matcher = None if flow.name == "none" else KeyframeMatcher(flow)
-        self._keyframe = None
-        self._frames_since_keyframe = 0
 
     def track(self, frame: Frame) -> Track:
         """Return the identity, with the motion of the tissue since the keyframe; "lost" where little is usable."""

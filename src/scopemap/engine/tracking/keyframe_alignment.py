@@ -55,16 +55,14 @@ class Keyframe:
 class MotionModel:
     """Constant motion: the pose tracked last, (4, 4) in the world of `map`, the step to it, frames lost since."""
 
-    map: Kept[int]
-    _maps: Kept[int]
+    map: Kept[int] = 0
+    _maps: Kept[int] = 1
     T_world_last: Kept[np.ndarray]
     _T_step: Kept[np.ndarray]
-    frames_lost: Kept[int]
+    frames_lost: Kept[int] = 0
 
     def __init__(self) -> None:
-        self.map, self._maps = 0, 1
         self.T_world_last, self._T_step = np.eye(4), np.eye(4)
-        self.frames_lost = 0
 
     def predictions(self) -> list[np.ndarray]:
         """Return first guesses of T_world_camera: the last pose; after a loss also the extrapolated one."""

@@ -96,11 +96,8 @@ class RotationFollower:
     little, or does not fit, the rotation is lost, too.
     """
 
-    _depth_mm: Kept[np.ndarray | None]
-    _rotation: Kept[np.ndarray | None]
-
-    def __init__(self) -> None:
-        self._depth_mm = self._rotation = None
+    _depth_mm: Kept[np.ndarray | None] = None
+    _rotation: Kept[np.ndarray | None] = None
 
     def follow(self, track: Track, frame: Frame, correspondence: DenseCorrespondence | None) -> Track:
         """Return the track of each frame, in order, with its rotation where it is lost and followed, by raw depth."""

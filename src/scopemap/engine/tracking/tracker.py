@@ -41,20 +41,15 @@ _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 class KeyframeChoice:
     """When the next keyframe is due: by frames and motion since the last one, and by how well they still fit it."""
 
-    frames_since: Kept[int]
-    _quality: Kept[float]
-    _best_quality: Kept[float]
-    _first_agreement: Kept[float | None]
-    _last: Kept[Alignment | None]
-    _depth_mm: Kept[float]
+    frames_since: Kept[int] = 0
+    _quality: Kept[float] = 0.0
+    _best_quality: Kept[float] = 0.0
+    _first_agreement: Kept[float | None] = None
+    _last: Kept[Alignment | None] = None
+    _depth_mm: Kept[float] = 1.0
 
     def __init__(self, settings: TrackingSettings) -> None:
         self._settings = settings
-        self.frames_since = 0
-        self._quality = self._best_quality = 0.0
-        self._first_agreement = None
-        self._last = None
-        self._depth_mm = 1.0
 
     def see(self, frame: Frame) -> None:
         """Count a frame."""
@@ -110,12 +105,12 @@ class Tracker(FrameTracker):
     _earlier_keyframes: Kept[deque[Frame]]
     _choice: Kept[KeyframeChoice]
     _sharpness: Kept[SharpnessMonitor]
-    _keyframe: Kept[Keyframe | None]
-    _last: Kept[Frame | None]
-    _sharp_frames_lost: Kept[int]
-    _is_unsharp: Kept[bool]
-    _after_close_up: Kept[bool]
-    _is_revisited: Kept[bool]
+    _keyframe: Kept[Keyframe | None] = None
+    _last: Kept[Frame | None] = None
+    _sharp_frames_lost: Kept[int] = 0
+    _is_unsharp: Kept[bool] = False
+    _after_close_up: Kept[bool] = False
+    _is_revisited: Kept[bool] = False
 
     def __init__(
         self, settings: TrackingSettings, flow: FlowEstimator | None = None, features: FeatureDetector | None = None
@@ -127,10 +122,6 @@ class Tracker(FrameTracker):
         self._earlier_keyframes = deque(maxlen=_EARLIER_KEYFRAMES)
         self._choice = KeyframeChoice(settings)
         self._sharpness = SharpnessMonitor()
-        self._keyframe = None
-        self._last = None
-        self._sharp_frames_lost = 0
-        self._is_unsharp = self._after_close_up = self._is_revisited = False
 
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""
