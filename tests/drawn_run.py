@@ -35,7 +35,7 @@ GOOD_SURFACE = {"frames": 9, "coverage_mean": 0.94, "coverage_least": 0.9, "dept
 
 @dataclass(frozen=True)
 class Shown:
-    """What `FramePictures.observe` looks at."""
+    """What `FramePictures` looks at."""
 
     frame: Frame
 
@@ -123,7 +123,7 @@ def draw_run(
         valid[:, :4] = False
         frame = Frame(index, index / 25, seen.rgb, CAMERA, valid, seen.depth_mm, pose_of(index))
         write(frame)
-        kept.observe(Shown(frame))
+        kept(Shown(frame))
     if pictures:
         kept.save(folder)
     changed(drawn_result(name, **facts), states=states).save(folder)

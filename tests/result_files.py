@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from scopemap.result.checkpoint import SavedState
+
+_Owner = TypeVar("_Owner")
 
 # They hold times, or what holds times.
 NOT_COMPARED = {"provenance.json", "SHA256SUMS", "report.html", "frames/measures.csv"}
@@ -32,13 +34,11 @@ def compared_files(folder: Path) -> dict[str, bytes]:
     return {name: path.read_bytes() for name, path in names.items() if name not in NOT_COMPARED}
 
 
-def through_checkpoint(file: Path, value: object, now: object = None) -> Any:
-    """What comes back of a value that is saved in a checkpoint; `now`: what there is when it is read."""
-    written = SavedState(file)
-    written.put("part", value)
+def through_checkpoint(folder: Path, owner: object, other: _Owner) -> _Owner:
+    """Another object with what an owner keeps, by way of a checkpoint in a folder."""
+    folder.mkdir()
+    written = SavedState(folder)
+    written.put("part", owner)
     written.commit({"last": 1})
-    written.close()
-    read = SavedState(file)
-    found = read.restore("part", now)
-    read.close()
-    return found
+    SavedState(folder).restore("part", other)
+    return other

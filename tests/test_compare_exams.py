@@ -51,7 +51,7 @@ def examined(folder: Path, poses: list[np.ndarray], mesh: trimesh.Trimesh, world
         view = see(T)
         frame = Frame(index, index / 25, view.rgb, CAMERA, EVERYWHERE, np.float32(world.scale) * view.depth_mm, T)
         write(frame)
-        kept.observe(Shown(frame))
+        kept(Shown(frame))
         T_own = world.transform_poses(T[None])[0]
         rows.append({"index": index, "time_s": index / 25, "keyframe": index, "status": "ok", "T_world_camera": T_own})
     kept.save(folder)

@@ -42,7 +42,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write = DepthWriter(folder)
     for index, T in enumerate(KEYFRAMES):
         write(frame := frame_at(T, index))
-        kept.observe(Shown(frame))
+        kept(Shown(frame))
     kept.save(folder)
     worlds = [KEYFRAMES, [T_OTHER_WORLD @ T for T in KEYFRAMES]]
 

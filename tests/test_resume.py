@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import json
 import shutil
-import sqlite3
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from front_door import call, refused, warned
 from tiny_phantom import FRAMES, write_tiny
 
 from scopemap import Config, Result, open_sequence, reconstruct
 from scopemap.engine.errors import InputError
-from scopemap.engine.fusion.frame_store import StoredFile
+from scopemap.engine.frame import Frame
+from scopemap.engine.kept import Kept
 from scopemap.engine.odometry import Step
+from scopemap.engine.tracking.track import FrameTracker, Track
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.result.checkpoint import CHECKPOINT, SavedState
 from scopemap.result.result_folder import LOCK, UNFINISHED
@@ -169,32 +170,45 @@ def _flip(file: Path, at: int) -> None:
     file.write_bytes(content)
 
 
-_DATABASE_DAMAGE = {
-    "blobs": "update blobs set bytes = zeroblob(length(bytes))",
-    "a missing blob": "delete from blobs where hash in (select hash from blobs limit 1)",
-    "states": "update states set tree = zeroblob(length(tree))",
-    "the last frame": "update facts set value = value + 1 where name = 'last'",
-    "facts": "update facts set value = zeroblob(9)",
-}
-
-
-@pytest.mark.parametrize("damage", _DATABASE_DAMAGE)
-def test_a_damaged_database_is_never_resumed_from(damage: str, folder: Path, killed: Path, tmp_path: Path) -> None:
+def test_a_damaged_checkpoint_is_never_resumed_from(folder: Path, killed: Path, tmp_path: Path) -> None:
     identity, out, found = identity_of(open_sequence(folder), Config()), tmp_path / "run", list[str]()
     shutil.copytree(killed, out)
+    files = sorted((out / UNFINISHED / CHECKPOINT).iterdir())
     assert can_resume(out / UNFINISHED, identity, found)
-    with closing(sqlite3.connect(out / UNFINISHED / CHECKPOINT)) as database, database:
-        database.execute(_DATABASE_DAMAGE[damage])
-    assert not can_resume(out / UNFINISHED, identity, found)
-    assert "checkpoint.sqlite is damaged" in found[0]
-    with pytest.raises(InputError, match=r"is damaged; --no-resume begins a new one"):
+    for file in (files[-1], *files[:-1:20]):
+        content = file.read_bytes()
+        for at in (0, len(content) // 2, len(content) - 3):
+            _flip(file, at)
+            assert not can_resume(out / UNFINISHED, identity, found), (file, at)
+            assert f"{CHECKPOINT} is damaged: {file.name}" in found[-1]
+            file.write_bytes(content)
+        file.unlink()
+        assert file == files[-1] or not can_resume(out / UNFINISHED, identity, found)
+        file.write_bytes(content)
+    _flip(files[-1], 0)
+    with pytest.raises(InputError, match=r"is damaged: state.json .*; --no-resume begins a new one"):
         check_resumable(out, open_sequence(folder), Config())
+
+
+def test_numpy_and_json_open_a_checkpoint(folder: Path, killed: Path) -> None:
+    place = killed / UNFINISHED / CHECKPOINT
+    document = json.loads((place / "state.json").read_text())
+    last, state = document["facts"]["last"], document["state"]
+    assert {"preprocess", "match", "track", "fusion", "run"} <= state.keys()
+    assert state["track"]["_last_track"]["index"] == state["run"]["frames"]["last_index"] == last
+    keyframe = state["track"]["_tracker"]["_keyframe"]["frame"]
+    (name,) = keyframe["rgb"]["npy"]
+    camera = keyframe["camera"]
+    rgb = np.load(place / name)
+    assert (rgb.dtype, rgb.shape) == (np.uint8, (camera["height"], camera["width"], 3))
+    tracked = state["track"]["mapper"]["_backend"]["_tracked"]
+    poses = [np.reshape(one["T_world_camera"]["values"], one["T_world_camera"]["shape"]) for one in tracked]
+    np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-12)
 
 
 def test_a_flipped_byte_of_any_stored_file_is_noticed(folder: Path, killed: Path, tmp_path: Path) -> None:
     identity = identity_of(open_sequence(folder), Config())
-    with closing(SavedState(killed / UNFINISHED / CHECKPOINT)) as state:
-        sizes = {facts["name"]: facts["size"] for facts in state.check(StoredFile)}
+    sizes = {facts["name"]: facts["size"] for facts in SavedState(killed / UNFINISHED).check()}
     assert {"frames", "frame_entries", "frame_table", "frame_texts", "tracked_poses"} <= sizes.keys()
     for name, size in sizes.items():
         out = shutil.copytree(killed, tmp_path / name)
@@ -212,7 +226,7 @@ def test_a_flipped_byte_of_any_stored_file_is_noticed(folder: Path, killed: Path
             assert not can_resume(out / UNFINISHED, identity, found), name
 
 
-@pytest.mark.parametrize("name", ["stored_frames/frames", CHECKPOINT])
+@pytest.mark.parametrize("name", ["stored_frames/frames", f"{CHECKPOINT}/state.json"])
 def test_a_run_with_a_damaged_checkpoint_begins_anew_and_says_so(
     name: str, folder: Path, killed: Path, whole: tuple[str, Path], tmp_path: Path
 ) -> None:
@@ -221,7 +235,7 @@ def test_a_run_with_a_damaged_checkpoint_begins_anew_and_says_so(
         pytest.skip("the killed run is of the default preset")
     out, seen, told = shutil.copytree(killed, tmp_path / "run"), list[int](), list[str]()
     file = out / UNFINISHED / name
-    if name == CHECKPOINT:
+    if name.startswith(CHECKPOINT):
         file.write_bytes(file.read_bytes()[:3000])
     else:
         _flip(file, 5000)
@@ -253,12 +267,43 @@ def test_stored_frames_that_are_damaged_while_a_run_works_end_it(folder: Path, t
 def test_observers_are_resumed_and_saved_with_the_result(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(_Killed):
-        _run(folder, out, "realtime", observers=(FramePictures().observe, _killing(5)))
-    _run(folder, out, "realtime", observers=(FramePictures().observe,))
+        _run(folder, out, "realtime", observers=(FramePictures(), _killing(5)))
+    _run(folder, out, "realtime", observers=(FramePictures(),))
     assert len(list((out / "frames").glob("*_mask.png"))) == FRAMES
     assert "frames/measures.csv" in (out / "SHA256SUMS").read_text()
     left = {CHECKPOINT, LOCK, "stored_frames", UNFINISHED, "replaced", "moving"}
     assert not left & {path.name for path in out.rglob("*")}
+
+
+class _Counting(FrameTracker):
+    """A tracker of one's own, whose poses depend on all frames before."""
+
+    seen: Any = 0
+
+    def track(self, frame: Frame) -> Track:
+        self.seen += 1
+        T_world_camera = np.eye(4)
+        T_world_camera[0, 3] = self.seen
+        return Track(frame.index, "initial" if self.seen == 1 else "ok", "", T_world_camera, 0)
+
+    def needs_keyframe(self) -> bool:
+        return self.seen % 3 == 1
+
+    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
+        return True
+
+
+class _Keeping(_Counting):
+    seen: Kept[int] = 0
+
+
+@pytest.mark.parametrize("kind", [_Counting, _Keeping])
+def test_a_tracker_of_ones_own_goes_on_by_what_it_keeps(kind: type[_Counting], folder: Path, tmp_path: Path) -> None:
+    wanted = _run(folder, tmp_path / "whole", "realtime", tracker=kind())
+    _kill(folder, tmp_path / "run", "realtime", 5, tracker=kind())
+    found = _run(folder, tmp_path / "run", "realtime", tracker=kind())
+    assert (found.provenance["resumed_after_frame"] is not None) == (kind is _Keeping)
+    np.testing.assert_array_equal(found.frames["T_world_camera"], wanted.frames["T_world_camera"])
 
 
 def test_the_command_resumes_and_reports_it(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scopemap.engine.errors import ScopemapError
+from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 
 _MOST_FAULTS = 3  # by hand: frames that may fail
@@ -14,10 +15,14 @@ _MOST_FAULTS_SHARE = 0.05  # by hand: more are no accident
 class StageFaults:
     """The frames that one stage could not process; each stage has its own, as a part of the state that it changes."""
 
+    frames: Kept[int] = 0
+    failed: Kept[int] = 0
+    without_depth: Kept[int] = 0
+    first: Kept[tuple[int, str]] = (-1, "")
+    first_without_depth: Kept[int] = -1
+
     def __init__(self, stage: str) -> None:
         self._stage = stage
-        self.frames = self.failed = self.without_depth = 0
-        self.first, self.first_without_depth = (-1, ""), -1
 
     def has_no_depth(self, index: int) -> None:
         """Note a frame to which the network gave no depth."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import check_shape
+from scopemap.engine.kept import Kept
 
 REGIONS = 6, 8  # by hand
 """Rows and columns of the regions of a picture whose tissue is looked at for motion of its own."""
@@ -131,9 +132,11 @@ class Truth:
 class Rows:
     """Rows of one numpy type, put in one after the other, packed: objects would take ten times as much memory."""
 
+    _count: Kept[int]
+    _bytes: Kept[np.ndarray]
+
     def __init__(self, kind: np.dtype) -> None:
         self._kind, self._count = kind, 0
-        # Bytes: a checkpoint knows no names of columns.
         self._bytes = np.zeros((0, kind.itemsize), np.uint8)
 
     def __len__(self) -> int:

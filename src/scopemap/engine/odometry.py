@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from scopemap.engine.config import Config
 from scopemap.engine.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.engine.faults import StageFaults
 from scopemap.engine.frame import Frame
+from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.local_adjustment import LocalAdjustment
 from scopemap.engine.mapping.submaps import Mapper
 from scopemap.engine.notices import Notice
@@ -51,11 +52,15 @@ class Odometry:
     local : adjusts keyframes of predicted depth as they come; None: they are as tracked.
     """
 
-    STATE: ClassVar = (
-        *("_tracker", "_mapis", "_smooth", "mapper", "_last_track", "_last_frame"),
-        *("faults", "_rotation", "_local"),
-    )
-    """What changes from frame to frame."""
+    mapper: Kept[Mapper]
+    faults: Kept[StageFaults]
+    _tracker: Kept[FrameTracker]
+    _local: Kept[LocalAdjustment | None]
+    _mapis: Kept[Mapis]
+    _smooth: Kept[Wema]
+    _rotation: Kept[RotationFollower]
+    _last_track: Kept[Track | None] = None
+    _last_frame: Kept[tuple[Frame, Track] | None] = None
 
     def __init__(
         self, config: Config, tracker: FrameTracker, mapper: Mapper, local: LocalAdjustment | None = None
@@ -64,8 +69,6 @@ class Odometry:
         self._mapis = Mapis(config.mapis)
         self._smooth = Wema(config.smoothing)
         self._rotation = RotationFollower()
-        self._last_track: Track | None = None
-        self._last_frame: tuple[Frame, Track] | None = None
         self.faults = StageFaults("tracking")
 
     def track(self, preprocessed: PreprocessedFrame) -> Step:

@@ -60,7 +60,7 @@ class Pipeline:
 
     @property
     def stages(self) -> dict[str, Preprocessing | Matching | Odometry]:
-        """The stages whose `STATE` a checkpoint keeps, by their names; that of `fuse` is `fusion`."""
+        """The stages by their names, each in a thread of its own and with what it keeps; that of `fuse` is `fusion`."""
         return {"preprocess": self.preprocessing, "match": self.matching, "track": self.odometry}
 
     @property

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from scopemap.engine.estimators import Estimators
 from scopemap.engine.faults import StageFaults
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.warp import pull, resampled
+from scopemap.engine.kept import Kept
 from scopemap.engine.masking.masker import Masker, without_instruments
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.causes import LossCause
@@ -48,12 +48,13 @@ class PreprocessedFrame:
 class DepthTurns:
     """Which frames the network looks at: one in `every`; flow propagates its depth to the frames in between."""
 
+    propagated: Kept[int] = 0
+    """How many frames got the depth of the one before."""
+    _since: Kept[int] = 0  # frames since the network looked
+    _kind: Kept[DepthKind | None] = None  # of the depth that can be propagated; None: there is none
+
     def __init__(self, every: int) -> None:
         self._every = every
-        self.propagated = 0
-        """How many frames got the depth of the one before."""
-        self._since = 0  # frames since the network looked
-        self._kind: DepthKind | None = None  # of the depth that can be propagated; None: there is none
 
     def propagated_kind(self) -> DepthKind | None:
         """Return of which kind the depth is that the next frame gets from the one before; None: the network looks."""
@@ -80,15 +81,20 @@ class DepthTurns:
 class Preprocessing:
     """Masks frames and estimates their raw depth, in order, each once."""
 
-    STATE: ClassVar = ("_masker", "_quality", "_texture", "_turns", "estimators", "faults", "skipped")
-    """What changes from frame to frame."""
+    _masker: Kept[Masker]
+    _quality: Kept[PictureQuality]
+    _texture: Kept[TextureMonitor]
+    _turns: Kept[DepthTurns]
+    estimators: Kept[Estimators]
+    faults: Kept[StageFaults]
+    skipped: Kept[Counter[str]]
+    """How many frames were skipped, by the cause of their loss."""
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._config, self.estimators = config, estimators
         self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
         self._texture, self.faults = TextureMonitor(config.tracking), StageFaults("depth")
-        self.skipped: Counter[str] = Counter()
-        """How many frames were skipped, by the cause of their loss."""
+        self.skipped = Counter()
         from_files = config.depth.backend.startswith("files:") or config.mask.instruments == "auto"
         self._turns = DepthTurns(1 if from_files else config.depth.network_every)
         self._needs_previous = Mapis(config.mapis).needs_previous
@@ -162,13 +168,13 @@ class Preprocessing:
 class Matching:
     """Finds the correspondence of each frame with the one before, where its depth is to be refined with it."""
 
-    STATE: ClassVar = ("_matcher", "_before", "faults")
-    """What changes from frame to frame."""
+    _matcher: Kept[DenseMatcher]
+    _before: Kept[Frame | None] = None
+    faults: Kept[StageFaults]
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
         self._needs_previous = Mapis(config.mapis).needs_previous
-        self._before: Frame | None = None
         self.faults = StageFaults("flow")
 
     def match(self, estimated: PreprocessedFrame) -> PreprocessedFrame:

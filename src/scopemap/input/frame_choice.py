@@ -14,6 +14,7 @@ import numpy as np
 
 from scopemap.engine.errors import SettingsError
 from scopemap.engine.frame import is_constant
+from scopemap.engine.kept import Kept
 
 if TYPE_CHECKING:
     from scopemap.input.source import SourceFrame
@@ -57,7 +58,7 @@ class FrameChoice:
 
     fps: float | None = None
     skip_repeated: bool = False
-    skipped: dict[int, SkippedFrame] = field(default_factory=dict)
+    skipped: Kept[dict[int, SkippedFrame]] = field(default_factory=dict)
 
     def __call__(self, frames: Iterable[SourceFrame]) -> Iterator[SourceFrame]:
         """Yield the frames that are used; the first always is."""

@@ -11,6 +11,7 @@ import numpy as np
 from scopemap.engine.cameras.rectification import Rectifier
 from scopemap.engine.config import MaskSettings
 from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.kept import Kept
 from scopemap.engine.masking.masker import disc
 from scopemap.engine.notices import Notice
 from scopemap.input.decoding import by_number, frame_number, read_decoded
@@ -46,10 +47,12 @@ class MaskFiles:
     Raises `InputError` where the folder does not exist, holds no such image, or two for one frame.
     """
 
+    _asked: Kept[set[int]]
+
     def __init__(self, folder: Path, rectifier: Rectifier, grow_px: int = 0) -> None:
         self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
         self._files, self._single = _numbered(self._folder)
-        self._asked: set[int] = set()
+        self._asked = set()
 
     def covered(self, index: int) -> np.ndarray | None:
         """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.

@@ -13,6 +13,7 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.rectification import DepthSensor
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import TruthQuality
+from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.calibration import Calibration, fitted
 from scopemap.input.frame_choice import SkippedFrame
@@ -98,15 +99,17 @@ class Source:
     depth_scale_mm: float | None = None
     depth_sensor: DepthSensor | None = None
     masks: Path | None = None
+    warnings: Kept[list[str | Notice]]
+    left_out: Kept[dict[int, SkippedFrame]]
+    resized: Kept[dict[int, str]]
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.poses: dict[int, np.ndarray] = {}
         self.times_s: dict[int, float] = {}
         self.notes: list[str | Notice] = []
-        self.warnings: list[str | Notice] = []
-        self.left_out: dict[int, SkippedFrame] = {}
-        self.resized: dict[int, str] = {}
+        self.warnings = []
+        self.left_out, self.resized = {}, {}
 
     @staticmethod
     def recognises(path: Path) -> bool:

@@ -43,9 +43,6 @@ class DepthPreviews:
     folder : that of the result. Raises `InputError` where nothing can be written.
     """
 
-    NOT_IN_CHECKPOINT = ("_folder",)
-    """Not in a checkpoint: a run may go on under another name of its folder."""
-
     def __init__(self, folder: Path) -> None:
         self._folder = folder / "depth_preview"
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from scopemap.engine.errors import reporting
 from scopemap.engine.frame import Rows
+from scopemap.engine.kept import Kept
 from scopemap.engine.odometry import Step
 from scopemap.result.result import Result
 
@@ -38,16 +39,17 @@ class FramePictures:
     since the frame before.
     """
 
-    NOT_IN_CHECKPOINT = ("_before",)
-    """Not in a checkpoint: the time between runs is no frame's."""
+    _pictures: Kept[dict[int, tuple[bytes, bytes]]]
+    _measures: Kept[Rows]
+    _every: Kept[int] = 1
+    _count: Kept[int] = 0
 
     def __init__(self, *, timed: bool = True) -> None:
-        self._pictures: dict[int, tuple[bytes, bytes]] = {}
+        self._pictures = {}
         self._measures = Rows(_MEASURE)
-        self._every, self._timed, self._before = 1, timed, time.perf_counter()
-        self._count = 0
+        self._timed, self._before = timed, time.perf_counter()
 
-    def observe(self, step: Step) -> None:
+    def __call__(self, step: Step) -> None:
         """Put the frame of a step in: an observer for `reconstruct`."""
         self.put(step.frame.index, step.frame.rgb, step.frame.valid, step.frame.instruments)
 

@@ -1,334 +1,205 @@
-"""The checkpoint of a run: the state of its objects in one SQLite file, written whole or not at all.
+"""The checkpoint of a run: a folder with its state as JSON and arrays, which any tool opens.
 
-Structure of objects is JSON, arrays are blobs by hash; no code. What is no number, text, array, container or object of
-scopemap's classes (a network, a file, a thread) is not stored: the objects restored keep theirs.
+    checkpoint/  state.json  {"sum": ..., "facts": ..., "state": {part: {attribute: value}}}
+                 5f3c....npy (an array, named by the BLAKE2b sum of the file)
+
+A file with an array never changes, so one that two states share is written once. The state is that of `state.json`,
+which replaces the one before by renaming: it is written whole or not at all.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib
+import io
 import json
-import sqlite3
+import math
+import os
 import time
-from collections import Counter, defaultdict, deque
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
-from enum import Enum
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
+from weakref import WeakValueDictionary
 
 import numpy as np
 
-from scopemap.engine.config.settings import Settings
-from scopemap.engine.errors import InputError
+from scopemap.engine.errors import InputError, reporting
+from scopemap.engine.kept import restore, state_of
 
-CHECKPOINT = "checkpoint.sqlite"
-"""Name of the file within the folder of an unfinished run."""
+CHECKPOINT = "checkpoint"
+"""Name of the folder within the folder of an unfinished run."""
 
-_TABLES = """
-create table if not exists facts (name text primary key, value text not null);
-create table if not exists states (name text primary key, tree text not null);
-create table if not exists blobs (hash blob, part integer, bytes blob not null, primary key (hash, part));
-"""
-_DIGESTS = "digests"
-_SUM = "sum"
-_PART_BYTES = 64 << 20  # SQLite's blobs end at 1 GB
-_OWN = "scopemap."
-_OUTSIDE: dict[str, Any] = {"outside": True}
-_PLAIN = (list, tuple, set, frozenset, deque, dict, Counter, defaultdict)
-_NAMES = {kind.__name__: kind for kind in _PLAIN}
+_STATE = "state.json"
+_NEW = "new"  # a file until it is whole
+_WITHIN_JSON_BYTES = 2048  # a pose has 128
+_FILE_BYTES = 16 << 20  # of a volume that grows only what changed is written again
 
 
-def is_committed(file: Path) -> bool:
-    """Return whether a file holds a state to go on with."""
-    if not file.is_file():
-        return False
-    try:
-        with closing(SavedState(file)) as checkpoint:
-            return bool(checkpoint.facts)
-    except InputError:
-        return False
+def has_checkpoint(unfinished: Path) -> bool:
+    """Return whether the folder of an unfinished run holds a state to go on with, which may be damaged."""
+    return (unfinished / CHECKPOINT / _STATE).is_file()
+
+
+def discard_checkpoint(unfinished: Path) -> None:
+    """Have nothing resume from the folder of an unfinished run. Raises `OSError`."""
+    (unfinished / CHECKPOINT / _STATE).unlink(missing_ok=True)
 
 
 class SavedState:
-    """The state of a run by parts, valid when all are committed; `InputError` where `file` is damaged or read-only."""
+    """The state of a run by parts, in the folder of an unfinished run; valid when all are committed.
 
-    def __init__(self, file: Path) -> None:
-        self._file = file
+    Raises `InputError` where it is damaged, and where it cannot be written or read.
+    """
+
+    def __init__(self, unfinished: Path) -> None:
+        self._folder = unfinished / CHECKPOINT
         self._writing = Lock()
-        self._hashes: set[bytes] = set()
-        self._digests: dict[str, str] = {}
+        self._parts: dict[str, Any] = {}
+        self._used: set[str] = set()
+        self._whole: set[str] = set()  # of the files with arrays: what else there is a run has left that was killed
+        self._new: list[Path] = []
+        self._shared = WeakValueDictionary[str, np.ndarray]()
+        self._committed: dict[str, Any] | None = None
         self.seconds = 0.0
-        self._opened: sqlite3.Connection | None = None
+        """How long writing took so far."""
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Facts as committed last; {} where nothing was. Raises `InputError` where they are damaged."""
-        if not self._file.is_file():
-            return {}
-        with self._reported():
-            rows = dict(self._database.execute("select * from facts").fetchall())
-        if rows and rows.pop(_SUM, None) != _sum_of(rows):
-            raise self._damaged()
-        return {name: json.loads(value) for name, value in rows.items()}
+        """Facts as committed last; {} where nothing was."""
+        found: dict[str, Any] = self._document.get("facts", {})
+        return found
 
-    def put(self, part: str, value: object) -> None:
-        """Write the state of a part, to be committed with the others."""
+    def put(self, part: str, owner: object) -> None:
+        """Write what an object keeps as a part of the state, to be committed with the others."""
         started = time.perf_counter()
         with self._writing, self._reported():
-            if not self._database.in_transaction:
-                self._database.execute("begin")
-            tree = json.dumps(_Writer(self._put_blob).tree(value))
-            self._digests[part] = _digest(tree.encode()).hex()
-            self._database.execute("insert or replace into states values (?, ?)", (part, tree))
+            self._folder.mkdir(exist_ok=True)
+            self._parts[part] = state_of(owner, self._put)
         self.seconds += time.perf_counter() - started
 
     def commit(self, facts: dict[str, Any]) -> None:
         """Make what was put the state of the run, with facts that JSON can hold."""
         started = time.perf_counter()
+        text = _text({"facts": facts, "state": self._parts})
         with self._writing, self._reported():
-            facts = facts | {_DIGESTS: self._digests}
-            rows = {name: json.dumps(value) for name, value in facts.items()}
-            rows[_SUM] = _sum_of(rows)
-            self._database.execute("delete from facts")
-            self._database.executemany("insert into facts values (?, ?)", rows.items())
-            known = {row[0] for row in self._database.execute("select distinct hash from blobs")}
-            old = [(key,) for key in known - self._hashes]
-            self._database.executemany("delete from blobs where hash = ?", old)
-            self._database.execute("commit")
-            self._hashes = set()
+            new = self._folder / _NEW
+            new.write_bytes(f'{{"sum": "{_sum(text)}", '.encode() + text[1:])
+            _sync([*self._new, new])
+            new.replace(self._folder / _STATE)
+            for file in self._folder.glob("*.npy"):
+                if file.name not in self._used:
+                    file.unlink()
+        self._whole, self._used, self._new = self._used, set(), []
+        self._parts, self._committed = {}, None
         self.seconds += time.perf_counter() - started
 
-    def restore(self, part: str, value: object) -> Any:
-        """Return the committed state of a part, with what is not stored from `value`, whose objects are changed."""
-        return _Reader(self._blob).value(self._tree(part), value)
+    def restore(self, part: str, owner: object) -> None:
+        """Give an object what it kept in a part of the committed state; without such a part it stays as it is."""
+        if part in self._document["state"]:
+            restore(owner, self._document["state"][part], self._array)
 
-    def check(self, kind: type) -> list[dict[str, Any]]:
-        """Return the attributes of all objects of one of scopemap's classes, by name, as JSON holds them.
-
-        Raises `InputError` where anything in the checkpoint is damaged.
-        """
-        name, blobs, found = _name_of(kind), set[str](), []
-        for part in self.facts[_DIGESTS]:
-            for node in _nodes(self._tree(part)):
-                blobs |= {node[key] for key in ("blob", "bytes") if key in node}
-                found += [node["attributes"]] if node.get("of") == name else []
-        for blob in blobs:
-            self._blob(blob)
-        return found
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._opened is not None:
-            self._opened.close()
+    def check(self) -> list[dict[str, Any]]:
+        """Return what `StoredFile`s keep in the committed state, all of which is read."""
+        nodes = list(_nodes(self._document))
+        for name in {name for node in nodes for name in node.get("npy", ())}:
+            self._read(name)
+        return [node for node in nodes if "crc" in node]
 
     @property
-    def _database(self) -> sqlite3.Connection:
-        if self._opened is None:
-            self._opened = sqlite3.connect(self._file, check_same_thread=False, isolation_level=None)
-            self._opened.executescript(_TABLES)
-        return self._opened
+    def _document(self) -> dict[str, Any]:
+        """What `state.json` holds; {} where there is none."""
+        if self._committed is None and (self._folder / _STATE).is_file():
+            with reporting(f"the checkpoint {self._folder} is damaged: {_STATE}"):
+                found = json.loads((self._folder / _STATE).read_bytes())
+                is_whole = found.pop("sum") == _sum(_text(found))
+            if not is_whole:
+                raise self._damaged(_STATE)
+            self._committed = found
+        return self._committed or {}
 
-    def _put_blob(self, content: bytes | memoryview) -> str:
-        key = _digest(content)
-        if key not in self._hashes:
-            self._hashes.add(key)
-            if self._database.execute("select 1 from blobs where hash = ?", (key,)).fetchone() is None:
-                starts = range(0, max(1, len(content)), _PART_BYTES)
-                parts = ((key, n, content[start : start + _PART_BYTES]) for n, start in enumerate(starts))
-                self._database.executemany("insert into blobs values (?, ?, ?)", parts)
-        return key.hex()
+    def _put(self, array: np.ndarray) -> dict[str, Any]:
+        """Write an array, in files where it is large; return what JSON holds of it."""
+        if array.nbytes <= _WITHIN_JSON_BYTES and array.dtype.kind in "biuf":
+            order: Literal["C", "F"] = "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
+            flat = [value if math.isfinite(value) else str(value) for value in array.ravel(order).tolist()]
+            return {"dtype": array.dtype.str, "shape": array.shape, "order": order, "values": flat}
+        parts = [array]
+        if array.nbytes > _FILE_BYTES:
+            rows = max(1, _FILE_BYTES * len(array) // array.nbytes)
+            parts = [array[start : start + rows] for start in range(0, len(array), rows)]
+        return {"npy": [self._put_file(part) for part in parts]}
 
-    def _blob(self, name: str) -> bytes:
-        query = "select bytes from blobs where hash = ? order by part"
+    def _put_file(self, array: np.ndarray) -> str:
+        content = io.BytesIO()
+        np.save(content, array, allow_pickle=False)
+        name = f"{_sum(content.getbuffer())}.npy"
+        if name not in self._whole:
+            (self._folder / _NEW).write_bytes(content.getbuffer())
+            (self._folder / _NEW).replace(self._folder / name)
+            self._new.append(self._folder / name)
+            self._whole.add(name)
+        self._used.add(name)
+        return name
+
+    def _array(self, stored: dict[str, Any], *, shared: bool = False) -> np.ndarray:
+        if "values" in stored:
+            flat = np.array(stored["values"], stored["dtype"])
+            return flat.reshape(stored["shape"], order=stored["order"])
+        key = "".join(stored["npy"])
+        if shared and key in self._shared:
+            return self._shared[key]
+        parts = [self._read(name) for name in stored["npy"]]
+        # Of one part a copy, which owns its data: volumes grow in place.
+        found = parts[0].copy(order="K") if len(parts) == 1 else np.concatenate(parts)
+        if shared:
+            self._shared[key] = found
+        return found
+
+    def _read(self, name: str) -> np.ndarray:
         with self._reported():
-            content = b"".join(row[0] for row in self._database.execute(query, (bytes.fromhex(name),)))
-        self._check(content, name)
-        return content
+            content = (self._folder / name).read_bytes()
+        if f"{_sum(content)}.npy" != name:
+            raise self._damaged(name)
+        self._whole.add(name)
+        found: np.ndarray = np.load(io.BytesIO(content), allow_pickle=False)
+        return found
 
-    def _tree(self, part: str) -> Any:
-        with self._reported():
-            row = self._database.execute("select tree from states where name = ?", (part,)).fetchone()
-        tree = str(row[0]) if row else ""
-        self._check(tree.encode(), self.facts[_DIGESTS].get(part, ""))
-        return json.loads(tree)
-
-    def _check(self, content: bytes, digest: str) -> None:
-        if _digest(content).hex() != digest:
-            raise self._damaged()
-
-    def _damaged(self) -> InputError:
-        return InputError(f"the checkpoint {self._file} is damaged")
+    def _damaged(self, name: str) -> InputError:
+        return InputError(f"the checkpoint {self._folder} is damaged: {name}")
 
     @contextmanager
     def _reported(self) -> Iterator[None]:
         try:
             yield
-        except sqlite3.Error as error:
-            if self._opened is not None:
-                with suppress(sqlite3.Error):
-                    self._opened.rollback()
-            raise InputError(f"cannot write or read the checkpoint {self._file}: {error}") from None
+        except OSError as error:
+            raise InputError(f"cannot write or read the checkpoint {self._folder}: {error.strerror or error}") from None
+
+
+def _sync(files: list[Path]) -> None:
+    """Have the disk hold files: many at once take hardly longer than one."""
+
+    def sync(file: Path) -> None:
+        with file.open("rb+") as opened:
+            os.fsync(opened.fileno())
+
+    with ThreadPoolExecutor(max_workers=16, thread_name_prefix="sync") as pool:
+        list(pool.map(sync, files))
+
+
+def _text(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, allow_nan=False).encode()
+
+
+def _sum(content: bytes | memoryview) -> str:
+    return hashlib.blake2b(content, digest_size=20).hexdigest()
 
 
 def _nodes(tree: Any) -> Iterator[dict[str, Any]]:
-    """Yield what `_Writer` has made of each object in a tree."""
+    """Yield all objects of a JSON document."""
     if isinstance(tree, dict):
         yield tree
-        tree = [part for key, item in tree.items() for part in (item.values() if key == "attributes" else [item])]
+        tree = list(tree.values())
     for part in tree if isinstance(tree, list) else ():
         yield from _nodes(part)
-
-
-def _sum_of(rows: dict[str, str]) -> str:
-    return _digest(repr(sorted(rows.items())).encode()).hex()
-
-
-def _digest(content: bytes | memoryview) -> bytes:
-    return hashlib.blake2b(content, digest_size=20).digest()
-
-
-class _Writer:
-    """Turns objects into a tree that JSON can hold; an object that is met again is referred to by its number."""
-
-    def __init__(self, put_blob: Any) -> None:
-        self._put_blob = put_blob
-        self._numbers: dict[int, int] = {}
-        self._met: list[object] = []  # so that no number is given twice
-
-    def tree(self, value: Any) -> Any:
-        if value is None or type(value) in (bool, int, float, str):
-            return value
-        if isinstance(value, Enum):
-            return {"member": value.value, "of": _name_of(type(value))}
-        if isinstance(value, np.generic):
-            return {"scalar": value.dtype.str, "hex": value.tobytes().hex()}
-        if isinstance(value, type):
-            return {"class": _name_of(value)} if _is_known(value) else _OUTSIDE
-        if isinstance(value, Settings):
-            return {"settings": _name_of(type(value)), "json": value.model_dump_json()}
-        if id(value) in self._numbers:
-            return {"again": self._numbers[id(value)]}
-        if not (_is_known(type(value)) or isinstance(value, np.ndarray | bytes | Path)):
-            return _OUTSIDE
-        self._numbers[id(value)] = len(self._met)
-        self._met.append(value)
-        return self._shared(value)
-
-    def _shared(self, value: Any) -> dict[str, Any]:
-        if isinstance(value, np.ndarray):
-            order: Literal["C", "F"] = "F" if value.flags.f_contiguous and not value.flags.c_contiguous else "C"
-            blob = self._put_blob(value.ravel(order=order).view(np.uint8).data if value.size else b"")
-            return {"array": value.dtype.str, "shape": value.shape, "order": order, "blob": blob}
-        if isinstance(value, bytes):
-            return {"bytes": self._put_blob(value)}
-        if isinstance(value, Path):
-            return {"path": str(value)}
-        name = _name_of(type(value))
-        if isinstance(value, dict):
-            items = [[self.tree(key), self.tree(item)] for key, item in value.items()]
-            factory = self.tree(value.default_factory) if isinstance(value, defaultdict) else None
-            return {"of": name, "items": items, "factory": factory}
-        if isinstance(value, list | tuple | set | frozenset | deque):
-            longest = value.maxlen if isinstance(value, deque) else None
-            return {"of": name, "values": [self.tree(item) for item in value], "longest": longest}
-        return {"of": name, "attributes": {key: self.tree(item) for key, item in _attributes(value).items()}}
-
-
-class _Reader:
-    """Turns a tree back into objects, those that exist already in place."""
-
-    def __init__(self, blob: Any) -> None:
-        self._blob = blob
-        self._met: list[Any] = []
-
-    def value(self, tree: Any, now: Any) -> Any:
-        if not isinstance(tree, dict):
-            return tree
-        if "outside" in tree:
-            return now
-        if "again" in tree:
-            return self._met[tree["again"]]
-        if "member" in tree:
-            return _class_of(tree["of"])(tree["member"])
-        if "scalar" in tree:
-            return np.frombuffer(bytes.fromhex(tree["hex"]), tree["scalar"])[0]
-        if "class" in tree:
-            return _class_of(tree["class"])
-        if "settings" in tree:
-            return _class_of(tree["settings"]).model_validate_json(tree["json"])
-        number = len(self._met)
-        self._met.append(None)
-        return self._shared(tree, now, number)
-
-    def _shared(self, tree: dict[str, Any], now: Any, number: int) -> Any:
-        if "array" in tree:
-            flat = np.frombuffer(self._blob(tree["blob"]), tree["array"])
-            # A copy owns its data: volumes grow in place.
-            found: Any = flat.reshape(tree["shape"], order=tree["order"]).copy(order="K")
-        elif "bytes" in tree:
-            found = self._blob(tree["bytes"])
-        elif "path" in tree:
-            found = Path(tree["path"])
-        else:
-            found = self._own(tree, now, number)
-        self._met[number] = found
-        return found
-
-    def _own(self, tree: dict[str, Any], now: Any, number: int) -> Any:
-        kind = _class_of(tree["of"])
-        now = now if type(now) is kind else None
-        if "items" in tree:
-            found = kind()
-            if kind is defaultdict:
-                found.default_factory = self.value(tree["factory"], getattr(now, "default_factory", None))
-            self._met[number] = found
-            for key, item in tree["items"]:
-                key = self.value(key, None)
-                found[key] = self.value(item, None if now is None else now.get(key))
-            return found
-        if "values" in tree:
-            counterparts = [*(now or ())] if kind in (list, tuple) or hasattr(kind, "_fields") else []
-            counterparts += [None] * (len(tree["values"]) - len(counterparts))
-            values = [self.value(item, other) for item, other in zip(tree["values"], counterparts, strict=False)]
-            if hasattr(kind, "_fields"):
-                return kind(*values)
-            return deque(values, tree["longest"]) if kind is deque else kind(values)
-        found = kind.__new__(kind) if now is None else now
-        self._met[number] = found
-        for name, item in tree["attributes"].items():
-            # Frozen classes forbid the usual way.
-            object.__setattr__(found, name, self.value(item, getattr(now, name, None)))
-        return found
-
-
-def _attributes(value: object) -> dict[str, Any]:
-    """Return what an object holds by name, without what its class excludes in `NOT_IN_CHECKPOINT`."""
-    slots = [name for kind in type(value).__mro__ for name in getattr(kind, "__slots__", ())]
-    held = {name: getattr(value, name) for name in slots if hasattr(value, name)} | getattr(value, "__dict__", {})
-    return {name: item for name, item in held.items() if name not in getattr(value, "NOT_IN_CHECKPOINT", ())}
-
-
-def _is_known(kind: type) -> bool:
-    return kind in _PLAIN or kind.__module__.startswith(_OWN)
-
-
-def _name_of(kind: type) -> str:
-    return kind.__name__ if kind in _PLAIN else f"{kind.__module__}:{kind.__qualname__}"
-
-
-def _class_of(name: str) -> Any:
-    """Return a class by its name. Raises `InputError` where it is none of scopemap's."""
-    if name in _NAMES:
-        return _NAMES[name]
-    module, _, path = name.partition(":")
-    if not module.startswith(_OWN):
-        raise InputError(f"the checkpoint names {name}, which is not scopemap's")
-    found: Any = importlib.import_module(module)
-    for part in path.split("."):
-        found = getattr(found, part, None)
-    if not isinstance(found, type):
-        raise InputError(f"the checkpoint names {name}, which this version does not have")
-    return found

@@ -11,6 +11,7 @@ import numpy as np
 
 from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.frame import Frame
+from scopemap.engine.kept import Kept
 from scopemap.input.decoding import read_decoded, write_encoded
 
 DEPTH_SCALE_MM = 0.01
@@ -32,8 +33,7 @@ class DepthWriter:
     Raises `InputError` where nothing can be written.
     """
 
-    NOT_IN_CHECKPOINT = ("_folder", "_sigma_folder")
-    """Not in a checkpoint: a run may go on under another name of its folder."""
+    _histogram: Kept[np.ndarray]
 
     def __init__(self, folder: Path, largest_mm: float = 0.0) -> None:
         self._folder, self._sigma_folder = (Path(folder) / name for name in ("depth", "depth_sigma"))

@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scopemap.engine.errors import InputError, reporting
-from scopemap.engine.frame import RowTable
+from scopemap.engine.frame import Rows, RowTable
+from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.input.frame_choice import SkippedFrame
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY, SKIPPED, STATUSES, TRACKED, Trajectory
@@ -217,10 +218,13 @@ class GrowingFrameTable:
     table : where they are kept; as objects those of hours of video would take hundreds of megabytes.
     """
 
+    last_index: Kept[int] = -1
+    """Number of the last frame, -1 before the first."""
+    _rows: Kept[Rows]
+    _texts: Kept[Rows]
+
     def __init__(self, table: RowTable) -> None:
         self._rows, self._texts = table("frame_table", _STORED), table("frame_texts", np.dtype(np.uint8))
-        self.last_index = -1
-        """Number of the last frame, -1 before the first."""
 
     def __len__(self) -> int:
         """Return the number of rows."""

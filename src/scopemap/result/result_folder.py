@@ -17,7 +17,7 @@ except ImportError:  # Windows, where a file that is open cannot be removed
     fcntl = None  # type: ignore[assignment]
 
 from scopemap.engine.errors import InputError
-from scopemap.result.checkpoint import CHECKPOINT, is_committed
+from scopemap.result.checkpoint import CHECKPOINT, discard_checkpoint, has_checkpoint
 
 UNFINISHED = ".unfinished"
 """Folder within a result's folder, in which a run writes until it is finished."""
@@ -28,7 +28,7 @@ LOCK = "process"
 STORED = "stored_frames"
 """Folder there with the frames that are fused after the last one; it is not of the result."""
 
-NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT, f"{CHECKPOINT}-journal")
+NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT)
 """Files and folders there that a run needs to go on, and that go with the folder."""
 
 _REPLACED = "replaced"
@@ -66,7 +66,7 @@ def result_folder(
             yield unfinished
             _put_in_place(unfinished, folder)
         except BaseException as error:
-            if is_committed(unfinished / CHECKPOINT):
+            if has_checkpoint(unfinished):
                 error.add_note(
                     f"a checkpoint is kept in {folder}: the same command resumes from there, --no-resume begins anew"
                 )
@@ -190,7 +190,7 @@ def _put_in_place(unfinished: Path, folder: Path) -> None:
         moving.unlink()
         with suppress(OSError):
             # First: a run that resumed from it would miss the files that were moved.
-            (unfinished / CHECKPOINT).unlink()
+            discard_checkpoint(unfinished)
     except OSError as error:
         raise InputError(f"cannot write the result to {folder}: {error.strerror or error}") from None
     shutil.rmtree(unfinished, ignore_errors=True)

@@ -3,33 +3,34 @@
 from __future__ import annotations
 
 import time
-from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError, reporting
-from scopemap.engine.fusion.frame_store import StoredFile, check_stored
+from scopemap.engine.fusion.frame_store import check_stored
 from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
 from scopemap.input.sequence import Sequence
-from scopemap.result.checkpoint import CHECKPOINT, SavedState
+from scopemap.result.checkpoint import SavedState, discard_checkpoint, has_checkpoint
 from scopemap.result.checksums import input_checksum
 from scopemap.result.result_folder import STORED, UNFINISHED
 from scopemap.runner.provenance import package_versions
+from scopemap.runner.run import FrameWriter
 
-# A checkpoint is due after so many seconds, and so long after the last one that they take a 50th of the time.
-_LEAST_S = 10.0
+# Writing takes a 50th of the time, unless that is less often than once a minute: so much is done again at most.
 _SHARE = 0.02
-_RUN = ("frames", "checked", "kept_maps", "writers")
+_LEAST_S = 10.0
+_MOST_S = 60.0
 _SHOWN_DIFFERENCES = 4
 
 
-class HasState(Protocol):
-    """A run: what its attributes `_RUN` hold, and its pipeline."""
+class ResumableRun(Protocol):
+    """A run, which keeps something itself, and what it is made of."""
 
     sequence: Sequence
     pipeline: Pipeline
+    writers: tuple[FrameWriter, ...]
 
 
 class Checkpoints:
@@ -38,41 +39,53 @@ class Checkpoints:
     The stages of the pipeline are some frames apart: the state of each is written when a certain frame has passed it,
     so that together they are the state of the run after that frame.
 
-    folder : where the file is. identity : what a run must have in common with this one to resume it, as JSON holds it.
-    kept : further objects that go with the run, such as observers. Raises `InputError` as `SavedState` does.
+    folder : of the unfinished run. identity : what a run must have in common with this one to resume it, as JSON holds
+    it. observers : that go with the run. Raises `InputError` as `SavedState` does.
     """
 
-    def __init__(self, folder: Path, identity: dict[str, Any], run: HasState, kept: tuple[object, ...] = ()) -> None:
-        self._file = SavedState(folder / CHECKPOINT)
-        self._identity, self._run, self._kept = identity, run, kept
-        self._first_s = self._next_s = time.perf_counter() + _LEAST_S
+    def __init__(
+        self, folder: Path, identity: dict[str, Any], run: ResumableRun, observers: tuple[object, ...] = ()
+    ) -> None:
+        self._state = SavedState(folder)
+        self._identity, self._run = identity, run
+        sequence, fusion = run.sequence, run.pipeline.fusion
+        others = {"run": run, "fusion": fusion, "frame choice": sequence.choice, "source": sequence.source}
+        others |= {f"writer {number}": writer for number, writer in enumerate(run.writers)}
+        self._others = others | {f"observer {number}": observer for number, observer in enumerate(observers)}
+        self._begun_s = time.perf_counter()
+        self._first_s = self._next_s = self._begun_s + _LEAST_S
         self._open = False
 
     @property
     def exist(self) -> bool:
         """Whether there is a state to go on with."""
-        return bool(self._file.facts)
+        return bool(self._state.facts)
 
     def due(self) -> bool:
         """Return whether the frame that is read now should be one after which the state is written."""
-        if self._open or time.perf_counter() < self._next_s:
+        now = time.perf_counter()
+        if self._open or now < self._next_s:
             return False
-        self._open, self._file.seconds = True, 0.0
+        self._open, self._begun_s, self._state.seconds = True, now, 0.0
         return True
 
     def keep(self, stage: str) -> None:
         """Write the state of a stage of the pipeline, called in the thread that changes it."""
         if stage == "track":
             self._run.pipeline.mapper.settle()
-        self._file.put(stage, self._stage(stage))
+        self._state.put(stage, self._run.pipeline.stages[stage])
 
     def commit(self, last: int, *, complete: bool = False) -> None:
         """Write the rest; the state of the run is now that after the frame `last`, `complete`: after all frames."""
         with reporting("cannot write the stored frames"):
             self._run.pipeline.fusion.store.sync()
-        self._file.put("run", self._rest())
-        self._file.commit({"identity": self._identity, "last": last, "complete": complete})
-        self._next_s, self._open = time.perf_counter() + max(_LEAST_S, self._file.seconds / _SHARE), False
+        for name, owner in self._others.items():
+            self._state.put(name, owner)
+        self._state.commit({"identity": self._identity, "last": last, "complete": complete})
+        # A run that is killed just before the next commit has lost the time between two frames and that of writing.
+        most_s = _MOST_S - (time.perf_counter() - self._begun_s)
+        self._next_s = self._begun_s + min(max(_LEAST_S, self._state.seconds / _SHARE), most_s)
+        self._open = False
 
     def commit_all(self, last: int) -> None:
         """Write the state after all frames, when no stage is at work; that of a short run is not worth it."""
@@ -84,41 +97,14 @@ class Checkpoints:
 
     def restore(self) -> tuple[int, bool]:
         """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
+        facts = self._state.facts
         with reporting("cannot resume from the checkpoint; --no-resume begins anew"):
-            return self._restored()
-
-    def _restored(self) -> tuple[int, bool]:
-        pipeline, facts = self._run.pipeline, self._file.facts
-        for stage, owner in pipeline.stages.items():
-            for name, value in self._file.restore(stage, self._stage(stage)).items():
-                setattr(owner, name, value)
-        found = self._file.restore("run", self._rest())
-        for name in _RUN:
-            setattr(self._run, name, found[name])
-        self._run.sequence.choice.skipped.update(found["skipped"])
-        if facts["complete"]:
-            source = self._run.sequence.source
-            source.warnings[:] = found["warnings"]
-            source.left_out.update(found["left_out"])
-            source.resized.update(found["resized"])
-        pipeline.fusion.store.reopen()
+            for name, owner in (self._run.pipeline.stages | self._others).items():
+                # What reading frames finds is found again where they are read again.
+                if name != "source" or facts["complete"]:
+                    self._state.restore(name, owner)
+            self._run.pipeline.fusion.store.reopen()
         return int(facts["last"]), bool(facts["complete"])
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-    def _stage(self, stage: str) -> dict[str, Any]:
-        owner = self._run.pipeline.stages[stage]
-        return {name: getattr(owner, name) for name in owner.STATE}
-
-    def _rest(self) -> dict[str, Any]:
-        sequence = self._run.sequence
-        found = {name: getattr(self._run, name) for name in _RUN}
-        source = sequence.source
-        read = {"skipped": dict(sequence.choice.skipped), "warnings": list(source.warnings)}
-        read |= {"left_out": dict(source.left_out), "resized": dict(source.resized)}
-        return found | read | {"fusion": self._run.pipeline.fusion, "kept": self._kept}
 
 
 def identity_of(sequence: Sequence, config: Config, tracker: object = None) -> dict[str, Any]:
@@ -161,13 +147,12 @@ def can_resume(folder: Path, identity: dict[str, Any], damage: list[str]) -> boo
 
     `damage` takes why one is not whole: the run then begins anew.
     """
-    if not (folder / CHECKPOINT).is_file():
-        return False
+    state = SavedState(folder)
     try:
-        with reporting(f"cannot read the checkpoint in {folder}"), closing(SavedState(folder / CHECKPOINT)) as file:
-            if not file.facts or _differences(file.facts, identity):
+        with reporting(f"cannot read the checkpoint in {folder}"):
+            if not state.facts or _differences(state.facts, identity):
                 return False
-            check_stored(folder / STORED, file.check(StoredFile))
+            check_stored(folder / STORED, state.check())
     except InputError as fault:
         damage.append(str(fault))
         return False
@@ -176,12 +161,11 @@ def can_resume(folder: Path, identity: dict[str, Any], damage: list[str]) -> boo
 
 def check_resumable(out: Path, sequence: Sequence, config: Config) -> None:
     """Raise `InputError` where what a killed run left in `out` is damaged, or with what makes the result another."""
-    if not (out / UNFINISHED / CHECKPOINT).is_file():
+    if not has_checkpoint(out / UNFINISHED):
         return
     identity, found = identity_of(sequence, config), list[str]()
     if not can_resume(out / UNFINISHED, identity, found) and not found:
-        with closing(SavedState(out / UNFINISHED / CHECKPOINT)) as file:
-            found = _differences(file.facts, identity)
+        found = _differences(SavedState(out / UNFINISHED).facts, identity)
     if found:
         raise InputError(
             f"cannot resume the run in {out}: {'; '.join(found[:_SHOWN_DIFFERENCES])}; --no-resume begins a new one"
@@ -190,8 +174,7 @@ def check_resumable(out: Path, sequence: Sequence, config: Config) -> None:
 
 def discard_unfinished(out: Path) -> None:
     """Have the next run in `out` begin anew."""
-    with suppress(FileNotFoundError):
-        (out / UNFINISHED / CHECKPOINT).unlink()
+    discard_checkpoint(out / UNFINISHED)
 
 
 def _differences(facts: dict[str, Any], identity: dict[str, Any]) -> list[str]:

@@ -21,9 +21,6 @@ SURFACES = "surfaces"
 class SurfaceWriter:
     """Writes surfaces/000000.ply, ...: usable pixels, spaced as the depth estimate's. Raises `InputError`."""
 
-    NOT_IN_CHECKPOINT = ("_folder", "_config", "_estimators")
-    """Not in a checkpoint: nothing changes."""
-
     def __init__(self, folder: Path, config: Config, estimators: Estimators) -> None:
         self._folder, self._config, self._estimators = folder / SURFACES, config, estimators
 

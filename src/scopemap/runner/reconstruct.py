@@ -5,10 +5,10 @@ from __future__ import annotations
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from scopemap.engine.config import Config
 from scopemap.engine.fusion.frame_store import FrameStore
+from scopemap.engine.kept import kept
 from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
 from scopemap.engine.tracking.track import FrameTracker
@@ -29,7 +29,7 @@ from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import refuse_own_input
-from scopemap.runner.run import Clock, FrameWriter, Observer, Progress, Run
+from scopemap.runner.run import Clock, FrameWriter, KeptObserver, Observer, Progress, Run
 
 _NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
 
@@ -47,8 +47,8 @@ def reconstruct(
     """Turn a sequence, or a video, into poses, depth and a surface.
 
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
-    result; where that is damaged it begins anew, which a notice says. Observers that are methods of an object with an
-    attribute `NOT_IN_CHECKPOINT` are resumed and saved with it.
+    result; where that is damaged it begins anew, which a notice says. So it does where a `tracker` of your own keeps
+    nothing (`Kept`). Observers of the kind `KeptObserver` are resumed and saved with it.
 
     The settings in the result are the resolved ones: the TSDF parameters are numbers. Of several submaps the one with
     most frames is the result, and `others` holds the others. With `out` the result is read from that folder.
@@ -106,14 +106,13 @@ def _reconstruct(
         writers: tuple[FrameWriter, ...] = tuple(each for each in (write_depth, previews) if each is not None)
         if folder is not None and config.tracking.camera_at_rest:
             writers += (SurfaceWriter(folder, config, estimators),)
+        lasting = tuple(observer for observer in observers if isinstance(observer, KeptObserver))
         with closing(store):
             pipeline = Pipeline(config, estimators, store, tracker)
             run = Run(sequence, pipeline, clock, writers, progress, plan)
-            if folder is None:
-                run.track(observers)
-            else:
-                with closing(Checkpoints(folder, identity, run, _kept_with(observers))) as checkpoints:
-                    run.track(observers, checkpoints)
+            place = folder if tracker is None or kept(tracker.__class__) else None
+            # Without a name, since it holds the run, which goes before the result is written.
+            run.track(observers, None if place is None else Checkpoints(place, identity, run, lasting))
             result = run.result(notices)
         result.provenance.update(stated_input(sequence.path, None if out is None else Path(out)))
         changes = input_changes(identity, result.provenance["input_content"], sequence.path)
@@ -126,8 +125,8 @@ def _reconstruct(
             if range_mm := write_depth.finish(scale_known=scale_known):
                 previews.finish(range_mm, scale_known=scale_known)
             result.save(folder)
-            for owner in _kept_with(observers):
-                owner.save(folder)
+            for observer in lasting:
+                observer.save(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
     return result if out is None else Result(out)
 
@@ -138,9 +137,3 @@ def _with_selection(config: Config, sequence: Sequence) -> Config:
         return config
     chosen = config.input.model_copy(update={"frames": selection_text(sequence.selection)})
     return config.model_copy(update={"input": chosen})
-
-
-def _kept_with(observers: tuple[Observer, ...]) -> tuple[Any, ...]:
-    """Return the objects that observe a run by a method, and are resumed and saved with it."""
-    owners = (getattr(observer, "__self__", None) for observer in observers)
-    return tuple(owner for owner in owners if hasattr(owner, "NOT_IN_CHECKPOINT"))

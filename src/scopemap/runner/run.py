@@ -9,13 +9,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numba.core.event import TimingListener, register
 
 from scopemap.engine.finishing import SubmapFinishing, SubmapSurface, TrackedFrames
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import SpreadFrames
+from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.submaps import Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
@@ -31,6 +33,19 @@ from scopemap.runner.submap_frames import check_tracked, frames_of_submap
 
 Observer = Callable[[Step], bool | None]
 """Called with each step; True: no further frame is read, and the result is of the frames until then."""
+
+
+@runtime_checkable
+class KeptObserver(Protocol):
+    """An `Observer` that is resumed with a run, by what it marks as `Kept`, and saved with the result."""
+
+    def __call__(self, step: Step) -> bool | None:
+        """Take a step."""
+
+    def save(self, run: Path) -> None:
+        """Write what was observed to the folder of the result."""
+
+
 Progress = Callable[[str, int, int], None]
 """Called with what is done outside of tracking (such as "fusing"), frames done, and all frames; 0: not in frames."""
 FrameWriter = Callable[[Frame], None]
@@ -69,9 +84,9 @@ class KeptMaps:
     """Which maps and frames a run without an end keeps, by its limits; `forgotten` counts frames."""
 
     limits: Limits = field(default_factory=Limits)
-    map: int = 0
-    frames_of_map: Counter[int] = field(default_factory=Counter)
-    forgotten: int = 0
+    map: Kept[int] = 0
+    frames_of_map: Kept[Counter[int]] = field(default_factory=Counter)
+    forgotten: Kept[int] = 0
 
     def beyond(self, track: Track, *, is_full: bool) -> list[int]:
         """Count a frame, and return the numbers of the maps whose surface is to be forgotten."""
@@ -97,12 +112,12 @@ class Run:
     writers: tuple[FrameWriter, ...] = ()
     progress: Progress = lambda doing, done, total: None
     plan: MemoryPlan = field(default_factory=MemoryPlan)
-    kept_maps: KeptMaps = field(default_factory=KeptMaps)
+    kept_maps: Kept[KeptMaps] = field(default_factory=KeptMaps)
     stopped: bool = False
     interrupted: bool = False
     resumed_after: int | None = None
-    frames: GrowingFrameTable = field(init=False)
-    checked: dict[int, SpreadFrames] = field(default_factory=lambda: defaultdict(SpreadFrames))
+    frames: Kept[GrowingFrameTable] = field(init=False)
+    checked: Kept[dict[int, SpreadFrames]] = field(default_factory=lambda: defaultdict(SpreadFrames))
 
     def __post_init__(self) -> None:
         self.frames = GrowingFrameTable(self.pipeline.fusion.store.table)

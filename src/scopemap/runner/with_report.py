@@ -24,7 +24,7 @@ def reconstruct_with_report(
     progress: Progress = lambda doing, done, total: None,
 ) -> Result:
     """Write the result of a sequence to a folder, with report.html and summary.png; as `reconstruct` otherwise."""
-    seen = (FramePictures().observe, *observers)
+    seen: tuple[Observer, ...] = (FramePictures(), *observers)
     result = reconstruct(sequence, config, out=out, overwrite=overwrite, observers=seen, progress=progress)
     trim_memory()
     progress("writing the report", 0, 0)

@@ -5,7 +5,7 @@
 Killed: a process that reconstructs a small phantom gets SIGKILL at a random instant and is run again, until one ends.
 Writing fails: the N-th call that writes, renames or syncs raises `OSError` (a full disk), for N spread over all of
 them. Each time the files of the run that follows are compared with those of an undisturbed run. A checkpoint is written
-as often as there is time, where a user's run has one every five seconds at most. Needs `fork`.
+as often as there is time, where a user's run has one every ten seconds at most. Needs `fork`.
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def run_clip(
         if step.frame.index in drawn:
             raw_mm[step.frame.index], refined_mm[step.frame.index] = step.raw_mm, np.asarray(step.frame.depth_mm)
 
-    seen = (*observers, keep_depth, FramePictures().observe)
+    seen: tuple[Observer, ...] = (*observers, keep_depth, FramePictures())
     result = reconstruct(sequence, config, out=out / "run", overwrite=True, observers=seen, progress=progress)
     write_report(out / "run")
     return Demonstration(clip, sequence, result, raw_mm, refined_mm)

@@ -97,7 +97,7 @@ def live(
         def observe(step: Step, _: Reconstructor) -> None:
             interruption.observe(step)
             if folder is not None:
-                pictures.observe(step)
+                pictures(step)
 
         kept = KeptDepth(Path(stack.enter_context(TemporaryDirectory())))
         covered = stack.enter_context(LiveCoverage(kept))

@@ -7,7 +7,7 @@ points of any unit and unprojects to rays with z = 1. Lenses that bend straight 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -70,11 +70,10 @@ class PinholeCamera:
         """The (3, 3) intrinsic matrix."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    @cached_property
+    @property
     def rays(self) -> np.ndarray:
         """(H, W, 3) float32 rays with z = 1, one per pixel."""
-        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        return self.unproject(np.stack([u, v], -1)).astype(np.float32)
+        return _rays(self)
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return pixels (..., 2) of points (..., 3); NaN for points not in front of the camera."""
@@ -97,3 +96,9 @@ class PinholeCamera:
     def cropped(self, x: int, y: int, width: int, height: int) -> PinholeCamera:
         """Return the camera of the part (width, height) of the image whose top-left pixel is (x, y)."""
         return replace(self, cx=self.cx - x, cy=self.cy - y, width=width, height=height)
+
+
+@lru_cache(maxsize=16)
+def _rays(camera: PinholeCamera) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return camera.unproject(np.stack([u, v], -1)).astype(np.float32)

@@ -12,6 +12,7 @@ from scopemap.engine.depth.estimate import DepthEstimate, DepthEstimator, DepthK
 from scopemap.engine.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.frame import Frame
+from scopemap.engine.kept import Kept
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
 _MIN_SHARE = 0.02  # by hand
@@ -61,14 +62,18 @@ class AnchoredDepth:
     scale_is_known : whether it is measured, or anchored to a range or by Depth Pro. is_stated : whether to a range.
     """
 
+    reference: Kept[DepthEstimator]
+    conversion: Kept[AffineDisparity | DepthScale | None] = None
+    description: Kept[str] = "not anchored: no usable frame yet"
+    scale_is_known: Kept[bool] = False
+    is_measured: Kept[bool] = False
+    is_stated: Kept[bool] = False
+    _frames_held: Kept[int] = 0
+
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
         _check_range(settings)
         self._settings = settings
         self.reference = reference
-        self.conversion: AffineDisparity | DepthScale | None = None
-        self.description = "not anchored: no usable frame yet"
-        self.scale_is_known = self.is_measured = self.is_stated = False
-        self._frames_held = 0
 
     @property
     def just_fitted(self) -> bool:

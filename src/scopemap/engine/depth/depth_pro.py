@@ -24,8 +24,6 @@ class DepthPro(PretrainedNetwork):
     """
 
     name = "depth-pro"
-    NOT_IN_CHECKPOINT = ("_last",)
-    """Not in a checkpoint: tensors, without which the image would be taken for known."""
 
     def __init__(
         self,

@@ -19,6 +19,7 @@ from scopemap.engine.errors import check_shape
 from scopemap.engine.flow.estimator import FlowEstimator, pair_flow
 from scopemap.engine.geometry.uncertainty import blended_sigma, by_variance, faded_sigma, relative_sigma
 from scopemap.engine.geometry.warp import bilateral_filtered, moved_depth, pull
+from scopemap.engine.kept import Kept
 
 # Share of the image that must be known in both depths for a scale to be fitted; across a cut 0.06 is so by chance.
 _MIN_OVERLAP = 0.2
@@ -42,9 +43,10 @@ class DenseCorrespondence:
 class DenseMatcher:
     """Matches masked images, in order, with the previous one."""
 
+    _previous: Kept[tuple[np.ndarray, np.ndarray] | None] = None
+
     def __init__(self, settings: MapisSettings, flow: FlowEstimator, perceptual: PerceptualDistance) -> None:
         self._settings, self._flow, self._perceptual = settings, flow, perceptual
-        self._previous: tuple[np.ndarray, np.ndarray] | None = None
 
     def match(self, rgb: np.ndarray, valid: np.ndarray, *, wanted: bool = True) -> DenseCorrespondence | None:
         """Return the correspondence of an image (H, W, 3) uint8 to the previous one; None without or not `wanted`."""
@@ -91,10 +93,11 @@ class _Propagated(NamedTuple):
 class Mapis:
     """Refines the raw depth of frames in order; `reset` starts a new chain after a lost frame."""
 
+    _propagated: Kept[_Propagated | None] = None
+    _scale: Kept[float] = 1.0
+
     def __init__(self, settings: MapisSettings) -> None:
         self.settings = settings
-        self._propagated: _Propagated | None = None
-        self._scale = 1.0
 
     def refine(
         self,

@@ -10,6 +10,7 @@ from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.depth.guided import filled, guided_filter
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.srgb import LINEAR
+from scopemap.engine.kept import Kept
 
 # By trial: on the real frames of `scopemap_bench.scripts.depth_without_download`.
 # Red alone saturates on near tissue, green alone follows the blood, blue is mostly noise.
@@ -38,11 +39,12 @@ class ShadingDepth:
     `settings.shading_median_mm`, and kept from then on, so that depth shrinks as the camera approaches.
     """
 
+    _scale_mm: Kept[float | None] = None
+
     name = "shading"
 
     def __init__(self, settings: DepthSettings) -> None:
         self._settings = settings
-        self._scale_mm: float | None = None
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return depth in mm by the prior, kind "depth", (H, W) float32.

@@ -18,6 +18,7 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.frame import REGIONS, Frame, Rows
+from scopemap.engine.kept import Kept
 
 # ln of millimetres in 16 bits: 0.0001 mm (standard deviations are small) to 34 m in steps of 0.03 %; 0 = unknown.
 _LOG_STEP = 3e-4
@@ -54,12 +55,12 @@ class StoredFile:
     Raises `InputError` where the folder is full or read-only, and where what is read is not what was put in.
     """
 
-    NOT_IN_CHECKPOINT = ("_store",)
-    """Not in a checkpoint: a store holds its files."""
+    name: Kept[str]
+    size: Kept[int] = 0
+    crc: Kept[int] = 0
 
     def __init__(self, store: FrameStore, name: str) -> None:
-        self.name, self.size, self.crc = name, 0, 0
-        self._store = store
+        self.name, self._store = name, store
         self._file: IO[bytes] | None = None
 
     def append(self, content: bytes) -> None:
@@ -130,6 +131,8 @@ def check_stored(folder: Path, files: Iterable[Mapping[str, Any]]) -> None:
 class StoredRows(Rows):
     """Rows in a file of a frame store, which is created with the first; one thread at a time may use them."""
 
+    _file: Kept[StoredFile]
+
     def __init__(self, kind: np.dtype, file: StoredFile) -> None:
         super().__init__(kind)
         self._file = file
@@ -155,8 +158,9 @@ class FrameStore:
     deleted then.
     """
 
-    NOT_IN_CHECKPOINT = ("_folder", "_files", "_known")
-    """Not in a checkpoint: a run may go on under another name of its folder, and who made a table holds its state."""
+    _images: Kept[StoredFile]
+    _entries: Kept[StoredRows]
+    _cameras: Kept[list[PinholeCamera]]
 
     def __init__(self, folder: Path | None = None, advice: str = "", name: str = "") -> None:
         self._folder, self._name = Path(tempfile.gettempdir() if folder is None else folder), name
@@ -164,7 +168,7 @@ class FrameStore:
         self._images = StoredFile(self, "frames")
         self._files = [self._images]
         self._entries = self.table("frame_entries", _ENTRY)
-        self._cameras: list[PinholeCamera] = []
+        self._cameras = []
         self._known: tuple[np.ndarray, dict[int, int]] | None = None
         self._reading = Lock()
 
@@ -299,9 +303,12 @@ class FrameStore:
 class SpreadFrames:
     """Every n-th of the frames with a pose that are put in, at most `_MOST_SPREAD`; n doubles as they grow more."""
 
+    _kept: Kept[list[Frame | int]]
+    _every: Kept[int] = 1
+    _count: Kept[int] = 0
+
     def __init__(self) -> None:
-        self._kept: list[Frame | int] = []
-        self._every, self._count = 1, 0
+        self._kept = []
 
     def put(self, frame: Frame, store: FrameStore | None = None) -> None:
         """Keep or skip a frame; store : where it is kept, as those of many maps fill the memory."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -30,6 +32,7 @@ from scopemap.engine.fusion.tsdf import (
 )
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.geometry.uncertainty import depth_trust
+from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 
 # Below this cosine a slanted wall cannot be distinguished from a depth edge, whatever the setting.
@@ -84,6 +87,10 @@ def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = 
 
 class TsdfVolume:
     """An unbounded truncated signed distance field; `ValueError` where the parameters do not set `voxel_mm`."""
+
+    parameters: Kept[TsdfParameters]
+    _blocks: Kept[VoxelBlocks]
+    _painter: Kept[AlbedoPainter | None]
 
     def __init__(self, settings: FusionSettings, parameters: TsdfParameters | None = None) -> None:
         self.settings = settings
@@ -197,6 +204,10 @@ class FusedSurface:
 class SurfaceFusion:
     """Fuses tracked frames: at once, or after the last one where they are corrected then or voxels follow the scene."""
 
+    store: Kept[FrameStore]
+    _volumes: Kept[dict[int, TsdfVolume]]
+    _tracked_frames: Kept[int] = 0
+
     def __init__(self, settings: FusionSettings, store: FrameStore, *, corrected: bool) -> None:
         self.settings, self.store = settings, store
         self.at_end = corrected or (settings.enabled and settings.voxel_mm is None)
@@ -205,8 +216,7 @@ class SurfaceFusion:
         """Blocks in all volumes beyond which nothing more is fused at once; None: no limit."""
         self.coarser_beyond: int | None = None
         """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
-        self._volumes: dict[int, TsdfVolume] = {}
-        self._tracked_frames = 0
+        self._volumes = defaultdict(partial(TsdfVolume, settings))
 
     @property
     def at_once(self) -> bool:
@@ -237,7 +247,7 @@ class SurfaceFusion:
         if self.at_end:
             self.store.put(frame)
         elif self.at_once and frame.T_world_camera is not None:
-            volume = self._volumes.setdefault(map_number, TsdfVolume(self.settings))
+            volume = self._volumes[map_number]
             if self._tracked_frames % self.settings.every == 0 and not self.is_full:
                 volume.integrate(frame)
                 self._coarsen(list(self._volumes.values()))

@@ -13,9 +13,10 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
-from scopemap.engine.frame import Frame, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.adjusted_maps import AdjustedMaps, MapKeyframes, adjust_maps
 from scopemap.engine.mapping.bundle_adjustment import errors_px
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State
@@ -50,6 +51,18 @@ class Backend:
     loop closures over the keyframes. table : of observations until then. anchored : as `scale_by_network` takes it.
     """
 
+    _frames: Kept[list[int]]
+    _times_s: Kept[list[float]]
+    _tracked: Kept[list[TrackedPose]]
+    _steps: Kept[list[KeyframeStep]]
+    _log_scales: Kept[list[float]]
+    _depths_mm: Kept[Rows]
+    _grid_shape: Kept[tuple[int, int]] = (0, 0)
+    _tracks: Kept[FeatureTracks]
+    _finder: Kept[LoopFinder | None]
+    _loops: Kept[Rows]
+    _camera: Kept[PinholeCamera | None] = None
+
     def __init__(
         self,
         settings: MappingSettings,
@@ -59,18 +72,12 @@ class Backend:
         anchored: bool = False,
     ) -> None:
         self._settings, self._anchored = settings, anchored
-        self._frames: list[int] = []
-        self._times_s: list[float] = []
-        self._tracked: list[TrackedPose] = []
-        self._steps: list[KeyframeStep] = []
-        self._log_scales: list[float] = []
+        self._frames, self._times_s, self._tracked, self._steps, self._log_scales = [], [], [], [], []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
-        self._depths_mm, self._grid_shape = table("depth_grids", np.dtype(np.float32)), (0, 0)
+        self._depths_mm, self._loops = table("depth_grids", np.dtype(np.float32)), table("loops", LOOP)
         self._tracks = FeatureTracks(settings, flow, table)
         self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
-        self._loops = table("loops", LOOP)
         self._all_weighed = False
-        self._camera: PinholeCamera | None = None
         self.most_observations = MOST_OBSERVATIONS
         """About so many are adjusted."""
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")

@@ -26,9 +26,10 @@ from scopemap.engine.flow.corners import (
     refined_corners,
 )
 from scopemap.engine.flow.estimator import FlowEstimator, FlowPair
-from scopemap.engine.frame import Frame, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.geometry.uncertainty import relative_sigma
+from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.loop_closure import MOST_RECENT, Loop
 
@@ -99,6 +100,12 @@ class FeatureTracks:
     gaps : how many keyframes before it these are; None: `keyframe_gaps` of the settings.
     """
 
+    keyframe_count: Kept[int] = 0
+    _recent: Kept[dict[int, deque[_FlowKeyframe]]]
+    _points: Kept[Rows]
+    _matches: Kept[Rows]
+    _camera: Kept[PinholeCamera | None] = None
+
     def __init__(
         self,
         settings: MappingSettings,
@@ -108,10 +115,8 @@ class FeatureTracks:
     ) -> None:
         self.settings, self._flow = settings, flow
         self._gaps = gaps or self.settings.keyframe_gaps
-        self._recent: dict[int, deque[_FlowKeyframe]] = {}
+        self._recent = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
-        self.keyframe_count = 0
-        self._camera: PinholeCamera | None = None
 
     def add(self, keyframe: Frame, map_number: int = 0, known: KeyframeMatches | None = None) -> KeyframeMatches:
         """Take a keyframe with depth: its corners become points, and are matched with earlier keyframes.
@@ -126,7 +131,7 @@ class FeatureTracks:
         share = relative_sigma(keyframe.depth_mm, keyframe.depth_sigma_mm)[rows, columns]
         first = self._add_points(self.keyframe_count, corners, log_depth, np.nan_to_num(share, nan=0.0))
         # The map that was used last is the last one.
-        recent = self._recent[map_number] = self._recent.pop(map_number, deque(maxlen=max(self._gaps)))
+        recent = self._recent[map_number] = deque(self._recent.pop(map_number, ()), maxlen=max(self._gaps))
         for oldest in [*self._recent][:-_MOST_MAPS]:
             del self._recent[oldest]
         # With the flows, and the older keyframes, of each new map memory would grow by tens of megabytes.

@@ -18,6 +18,7 @@ from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_adjustment import HELD_SIGMA, RIGID_SIGMA_PX, BundleSolution, adjust
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
@@ -80,16 +81,22 @@ class LocalAdjustment:
     settings : with `local_window`, keyframes that are adjusted together. flow : between keyframes, in one thread.
     """
 
+    _tracks: Kept[FeatureTracks]
+    _window: Kept[deque[_WindowKeyframe]]
+    _corrections: Kept[dict[int, KeyframeCorrection]]
+    _adjusted: Kept[Counter[int]]
+    _refused: Kept[Counter[int]]
+    _lens_evidence: Kept[LensEvidence | None] = None
+    _lens: Kept[LensResidual] = LensResidual()
+    _is_determined: Kept[bool] = False
+    _shapes: Kept[dict[int, ShapeTest]]
+
     def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
         self._settings, self._flow = settings, flow
         self._tracks = FeatureTracks(settings, flow, gaps=settings.local_gaps)
-        self._window: deque[_WindowKeyframe] = deque(maxlen=settings.local_window)
-        self._corrections: dict[int, KeyframeCorrection] = {}
+        self._window = deque(maxlen=settings.local_window)
+        self._corrections, self._shapes = {}, {}
         self._adjusted, self._refused = Counter[int](), Counter[int]()
-        self._lens_evidence: LensEvidence | None = None
-        self._lens = LensResidual()
-        self._is_determined = False
-        self._shapes: dict[int, ShapeTest] = {}
 
     def corrected(self, frame: Frame, reference: int) -> Frame:
         """Return a frame, tracked against the keyframe of frame `reference`, with its depth corrected as that one's."""

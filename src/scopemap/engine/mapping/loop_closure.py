@@ -19,9 +19,10 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.corners import usable_pixels
-from scopemap.engine.frame import Frame, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.geometry.se3 import transform
+from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.features import FeatureDetector, Features, SiftFeatures, relative_pose_pnp, similarity
 
 _STRONGEST_VALUES = 8192  # by hand: of the descriptors of the strongest features, by which candidates are ranked
@@ -114,6 +115,15 @@ class LoopFinder:
     kept what only this needs. detector : of features; None: SIFT.
     """
 
+    _features: Kept[dict[int, _KeptFeatures]]
+    _rows: Kept[Rows]
+    _views: Kept[Rows]
+    _map_of: Kept[dict[int, int]]
+    _count: Kept[int] = 0
+    _every: Kept[int] = 1
+    _loops_to: Kept[defaultdict[int, list[int]]]
+    _camera: Kept[PinholeCamera | None] = None
+
     def __init__(
         self,
         settings: MappingSettings,
@@ -124,12 +134,9 @@ class LoopFinder:
         self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
         self._min_inliers, gaps = settings.min_loop_inliers, settings.keyframe_gaps
         self._max_gap = min(max(gaps), MOST_RECENT)
-        self._features: dict[int, _KeptFeatures] = {}
         self._rows, self._views = table("features", self._kind), table("views", VIEW)
-        self._map_of: dict[int, int] = {}
-        self._count, self._every = 0, 1
-        self._loops_to: defaultdict[int, list[int]] = defaultdict(list)
-        self._camera: PinholeCamera | None = None
+        self._features, self._map_of = {}, {}
+        self._loops_to = defaultdict(list)
 
     @property
     def _kind(self) -> np.dtype:

@@ -10,8 +10,9 @@ import numpy as np
 
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
-from scopemap.engine.frame import Frame, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
 from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.backend import Backend
 from scopemap.engine.mapping.feature_tracks import KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
@@ -68,8 +69,11 @@ class Mapper:
     anchored : as `scale_by_network` takes it.
     """
 
-    NOT_IN_CHECKPOINT = ("_read",)
-    """Not in a checkpoint: `_rows` holds it."""
+    _backend: Kept[Backend | None]
+    _rows: Kept[Rows]
+    _last: Kept[tuple[int, TrackedPose] | None] = None
+    _lost_frames: Kept[int] = 0
+    _relocalised: Kept[set[tuple[Part, Part]]]
 
     def __init__(
         self,
@@ -82,11 +86,9 @@ class Mapper:
         links = settings.global_adjustment and flow.name != "none"
         self._backend = Backend(settings, flow, table, features, anchored) if links else None
         self._rows = table("tracked_poses", _TRACKED)
-        self._last: tuple[int, TrackedPose] | None = None
         self._tracked: dict[int, TrackedPose] = {}
-        self._lost_frames = 0
-        self._relocalised: set[tuple[Part, Part]] = set()
-        # Changes after the last frame: a checkpoint has what was before.
+        self._relocalised = set()
+        # What follows changes after the last frame.
         self._changed: dict[int, TrackedPose] = {}
         self._extended: set[int] = set()
         self._read: dict[int, TrackedPose] = {}

@@ -10,6 +10,7 @@ import numpy as np
 
 from scopemap.engine.config import MaskSettings
 from scopemap.engine.frame import Frame, is_constant, percentiles
+from scopemap.engine.kept import Kept
 from scopemap.engine.masking.overlays import OverlayFinder
 from scopemap.engine.notices import Notice
 
@@ -43,9 +44,8 @@ class FieldOfView:
     as far from pixels that the rectification could not fill, but not from the image's own edge.
     """
 
-    def __init__(self) -> None:
-        self._lit: np.ndarray | None = None
-        self._field: np.ndarray | None = None
+    _lit: Kept[np.ndarray | None] = None
+    _field: Kept[np.ndarray | None] = None
 
     def __call__(self, lit: np.ndarray, rectified: np.ndarray) -> np.ndarray:
         """Return the field of view, (H, W) bool, and learn from this frame; lit, rectified : (H, W) bool."""
@@ -93,12 +93,15 @@ class StoredMasks(Protocol):
 class Masker:
     """Narrows `Frame.valid` to usable tissue, in the field of view of all frames so far and outside of mask `files`."""
 
+    _field: Kept[FieldOfView]
+    _overlays: Kept[OverlayFinder | None]
+    _from_file: Kept[bool] = False
+    _instruments: Kept[np.ndarray | None] = None
+
     def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
         self._field = FieldOfView()
         self._overlays = OverlayFinder() if settings.overlays else None
-        self._from_file = False
-        self._instruments: np.ndarray | None = None
 
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with `valid` False also outside the field of view, at highlights, overlays, bad exposure.

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from scopemap.engine.kept import Kept
+
 # The green channel: red tissue is dark there, so both white and black text have contrast.
 _CHANNEL = 1
 # Camera motion is detected in a small copy without its local mean, divided into parts; grey levels of 255.
@@ -73,11 +75,16 @@ class OverlayFinder:
     overlays whose content changes all the time, are not found.
     """
 
+    count: Kept[int] = 0
+    _last: Kept[np.ndarray]
+    _mean: Kept[np.ndarray]
+    _change: Kept[np.ndarray]
+    _calm_change: Kept[np.ndarray]
+    _found: Kept[_Found | None] = None
+
     def __init__(self) -> None:
-        self.count = 0
-        self._last: np.ndarray = np.zeros((0, 0), np.float32)
+        self._last = np.zeros((0, 0), np.float32)
         self._mean, self._change, self._calm_change = self._last, self._last, self._last
-        self._found: _Found | None = None
 
     def __call__(self, rgb: np.ndarray, field: np.ndarray, outside: np.ndarray | None = None) -> np.ndarray | None:
         """Return the overlays, (H, W) bool; None where there are none, or the camera has moved too little so far.

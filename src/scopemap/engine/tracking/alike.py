@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from functools import lru_cache
 from importlib import resources
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -41,7 +40,6 @@ class AlikeFeatures:
     """
 
     name, descriptor_size, max_ratio = "alike", 64, 1.0
-    NOT_IN_CHECKPOINT: ClassVar = ("_kept",)
 
     def __init__(self) -> None:
         self._kept: deque[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = deque(maxlen=_MOST_KEPT)

@@ -8,6 +8,7 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.flow.corners import KeyframeMatcher
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
+from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.corner_pose import nonrigidity
 from scopemap.engine.tracking.track import FrameTracker, Track
 
@@ -19,11 +20,13 @@ class CameraAtRest(FrameTracker):
     measured.
     """
 
+    _matcher: Kept[KeyframeMatcher | None]
+    _keyframe: Kept[int | None] = None
+    _frames_since_keyframe: Kept[int] = 0
+
     def __init__(self, settings: TrackingSettings, flow: FlowEstimator) -> None:
         self._settings = settings
         self._matcher = None if flow.name == "none" else KeyframeMatcher(flow)
-        self._keyframe: int | None = None
-        self._frames_since_keyframe = 0
 
     def track(self, frame: Frame) -> Track:
         """Return the identity, with the motion of the tissue since the keyframe; "lost" where little is usable."""

@@ -14,6 +14,7 @@ from scopemap.engine.depth.mapis import DenseCorrespondence
 from scopemap.engine.flow.corners import Correspondences2D3D
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, transform
+from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.corner_pose import pose_from_correspondences, reprojection_error_px
 from scopemap.engine.tracking.features import (
     FeatureDetector,
@@ -95,9 +96,8 @@ class RotationFollower:
     little, or does not fit, the rotation is lost, too.
     """
 
-    def __init__(self) -> None:
-        self._depth_mm: np.ndarray | None = None
-        self._rotation: np.ndarray | None = None
+    _depth_mm: Kept[np.ndarray | None] = None
+    _rotation: Kept[np.ndarray | None] = None
 
     def follow(self, track: Track, frame: Frame, correspondence: DenseCorrespondence | None) -> Track:
         """Return the track of each frame, in order, with its rotation where it is lost and followed, by raw depth."""
@@ -134,12 +134,16 @@ def rotation_by_flow(
 class Relocaliser:
     """Recent keyframes of the current map and of other maps, in which a lost camera is searched."""
 
+    _keyframes: Kept[deque[Keyframe]]
+    _of_other_maps: Kept[deque[Keyframe]]
+    _frames_of_map: Kept[Counter[int]]
+
     def __init__(self, settings: TrackingSettings, detector: FeatureDetector) -> None:
         self.settings, self.detector = settings, detector
-        self._keyframes: deque[Keyframe] = deque(maxlen=settings.relocalisation_keyframes)
-        self._of_other_maps: deque[Keyframe] = deque(maxlen=2 * settings.relocalisation_keyframes)
+        self._keyframes = deque(maxlen=settings.relocalisation_keyframes)
+        self._of_other_maps = deque(maxlen=2 * settings.relocalisation_keyframes)
         self._features: dict[int, Features] = {}
-        self._frames_of_map: Counter[int] = Counter()
+        self._frames_of_map = Counter()
 
     def add(self, keyframe: Keyframe) -> None:
         """Add a keyframe of the current map."""

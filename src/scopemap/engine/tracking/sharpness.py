@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from scopemap.engine.geometry.local_contrast import local_mean
+from scopemap.engine.kept import Kept
 
 _FINE = 1 / 320  # by hand: of the picture's width: standard deviations of the two blurs
 _COARSE = 4 / 320  # by hand
@@ -26,8 +27,10 @@ _LEAST_MEASURES = np.array([1e-6, 1e-6, 0.02])
 class SharpnessMonitor:
     """Compares the sharpness of frames, in order, with the median of the last 30, unsharp ones included."""
 
+    _recent: Kept[deque[float]]
+
     def __init__(self) -> None:
-        self._recent: deque[float] = deque(maxlen=_FRAMES)
+        self._recent = deque(maxlen=_FRAMES)
 
     def relative_sharpness(self, rgb: np.ndarray, valid: np.ndarray) -> float:
         """Return the sharpness of an image as a share of the median before it; 1 for the first."""
@@ -45,8 +48,10 @@ class PictureQuality:
     the clear frames lack, too, as a video without colours lacks saturation, does not count.
     """
 
+    _recent: Kept[deque[tuple[float, float, float]]]
+
     def __init__(self) -> None:
-        self._recent: deque[tuple[float, float, float]] = deque(maxlen=_NEIGHBOURS)
+        self._recent = deque(maxlen=_NEIGHBOURS)
 
     def __call__(self, rgb: np.ndarray, valid: np.ndarray) -> float:
         """Return the quality, 0.01..1, of an image (H, W, 3) uint8 with valid pixels (H, W) bool."""

@@ -11,15 +11,18 @@ import numpy as np
 
 from scopemap.engine.config import SmoothingSettings
 from scopemap.engine.geometry.se3 import mean_near
+from scopemap.engine.kept import Kept
 
 
 class Wema:
     """Weighted exponential moving average of the last three poses; without effect where `settings.method` is "none"."""
 
+    _past: Kept[list[np.ndarray]]
+    _count: Kept[int] = 0
+
     def __init__(self, settings: SmoothingSettings) -> None:
         self.settings = settings
-        self._past: list[np.ndarray] = []
-        self._count = 0
+        self._past = []
 
     def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the smoothed pose; the first two, also after `reset`, have too short a past and stay as they are."""

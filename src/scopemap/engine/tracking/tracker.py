@@ -12,6 +12,7 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.engine.tracking.keyframe_alignment import (
@@ -51,13 +52,15 @@ class _Failure(NamedTuple):
 class KeyframeChoice:
     """When the next keyframe is due: by frames and motion since the last one, and by how well they still fit it."""
 
+    frames_since: Kept[int] = 0
+    _quality: Kept[float] = 0.0
+    _best_quality: Kept[float] = 0.0
+    _first_agreement: Kept[float | None] = None
+    _last: Kept[Alignment | None] = None
+    _depth_mm: Kept[float] = 1.0
+
     def __init__(self, settings: TrackingSettings) -> None:
         self._settings = settings
-        self.frames_since = 0
-        self._quality = self._best_quality = 0.0
-        self._first_agreement: float | None = None
-        self._last: Alignment | None = None
-        self._depth_mm = 1.0
 
     def see(self, frame: Frame) -> None:
         """Count a frame."""
@@ -107,6 +110,19 @@ class Tracker(FrameTracker):
     in a row a new map begins, with its own world; later relocalisation may lead back to an older map.
     """
 
+    _motion: Kept[MotionModel]
+    _aligner: Kept[KeyframeAligner]
+    _relocaliser: Kept[Relocaliser]
+    _earlier_keyframes: Kept[deque[Frame]]
+    _choice: Kept[KeyframeChoice]
+    _sharpness: Kept[SharpnessMonitor]
+    _keyframe: Kept[Keyframe | None] = None
+    _last: Kept[Frame | None] = None
+    _sharp_frames_lost: Kept[int] = 0
+    _is_unsharp: Kept[bool] = False
+    _after_close_up: Kept[bool] = False
+    _is_revisited: Kept[bool] = False
+
     def __init__(
         self, settings: TrackingSettings, flow: FlowEstimator | None = None, features: FeatureDetector | None = None
     ) -> None:
@@ -114,13 +130,9 @@ class Tracker(FrameTracker):
         self._motion = MotionModel()
         self._aligner = KeyframeAligner(settings, flow, self._motion)
         self._relocaliser = Relocaliser(settings, features or SiftFeatures())
-        self._earlier_keyframes: deque[Frame] = deque(maxlen=_EARLIER_KEYFRAMES)
+        self._earlier_keyframes = deque(maxlen=_EARLIER_KEYFRAMES)
         self._choice = KeyframeChoice(settings)
         self._sharpness = SharpnessMonitor()
-        self._keyframe: Keyframe | None = None
-        self._last: Frame | None = None
-        self._sharp_frames_lost = 0
-        self._is_unsharp = self._after_close_up = self._is_revisited = False
 
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""

@@ -99,9 +99,9 @@ class Dicom(Source):
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames without those that cannot be decoded, with a warning, or are of another size."""
         if self._video is not None:
-            for frame in self._video.frames(selection):
-                time_s = self.times_s.get(frame.index, frame.time_s)
-                yield replace(frame, time_s=time_s, name=str(frame.index))
+            for read in self._video.frames(selection):
+                time_s = self.times_s.get(read.index, read.time_s)
+                yield replace(read, time_s=time_s, name=str(read.index))
             return
         for number, rgb in self._selected(selection):
             if rgb is None:
