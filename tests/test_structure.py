@@ -142,7 +142,8 @@ def test_no_function_takes_keywords_it_does_not_name() -> None:
 CEILINGS = {
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 110),
     "lines of pipeline.py": (lambda: _read(SOURCE / "engine" / "pipeline.py").lines, 106),
-    "settings": (lambda: len(setting_names()), 46),
+    # 47: a result that does not say which frames it is of cannot be repeated.
+    "settings": (lambda: len(setting_names()), 47),
 }
 
 

@@ -24,7 +24,7 @@ from scopemap.engine.fusion.mesh_files import save_mesh, save_mesh_over_time
 from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.engine.notices import scale_words
 from scopemap.input.camera_files.writing import write_calibration
-from scopemap.input.frame_choice import SkippedFrame
+from scopemap.input.source import SkippedFrame
 from scopemap.input.trajectory.trajectory import SKIPPED, Trajectory, write_tum
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result_actions import ResultActions

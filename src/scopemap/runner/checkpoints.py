@@ -116,7 +116,7 @@ class Checkpoints:
         sequence = self._run.sequence
         found = {name: getattr(self._run, name) for name in _RUN}
         source = sequence.source
-        read = {"skipped": dict(sequence.choice.skipped), "warnings": list(source.warnings)}
+        read: dict[str, Any] = {"skipped": dict(sequence.choice.skipped), "warnings": list(source.warnings)}
         read |= {"left_out": dict(source.left_out), "resized": dict(source.resized)}
         return found | read | {"fusion": self._run.pipeline.fusion, "kept": self._kept}
 
