@@ -23,7 +23,18 @@ from scopemap import __version__
 from scopemap.cli.app import app, main
 
 Capture = pytest.CaptureFixture[str]
-JSON_KEYS = ["input", "dataset", "frames", "tracked", "lost", "rotation_only", "in_other_maps", "skipped", "camera"]
+JSON_KEYS = [
+    "input",
+    "dataset",
+    "frames",
+    "tracked",
+    "lost",
+    "rotation_only",
+    "in_other_maps",
+    "selection",
+    "skipped",
+    "camera",
+]
 JSON_KEYS += ["scale", "estimators", "notices", "seconds", "versions", "machine", "surface"]
 JSON_KEYS += ["loops", "interrupted_at_frame", "resumed_after_frame", "input_absolute", "input_relative"]
 JSON_KEYS += ["input_content"]

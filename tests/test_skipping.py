@@ -13,7 +13,7 @@ from tiny_phantom import write_tiny
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.config import Config
 from scopemap.engine.preprocessing import DepthTurns
-from scopemap.input.frame_choice import is_at_rest
+from scopemap.input.picture_difference import is_at_rest
 from scopemap.result.depth_maps import DepthReader
 
 FRAMES = 24

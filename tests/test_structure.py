@@ -151,7 +151,8 @@ def _advanced_settings() -> int:
 CEILINGS = {
     "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 131),
     "lines of pipeline.py": (lambda: _read(SOURCE / "engine" / "pipeline.py").lines, 106),
-    "settings but the advanced ones": (lambda: len(setting_names()) - _advanced_settings(), 46),
+    # 47: a result that does not say which frames it is of cannot be repeated.
+    "settings but the advanced ones": (lambda: len(setting_names()) - _advanced_settings(), 47),
 }
 
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +24,10 @@ from scopemap.input.datasets.rosbag import RosBag
 from scopemap.input.decoding import most_pixels
 from scopemap.input.frame_choice import FrameChoice, selection_text, slice_of
 from scopemap.input.images import ImageFolder
+from scopemap.input.pair_check import check_pair
 from scopemap.input.plugins import plugins
 from scopemap.input.prepared import UNKNOWN_MAKE, of_one_view, prepared
+from scopemap.input.sampling import SAMPLED_EVERY
 from scopemap.input.scopes import SCOPES
 from scopemap.input.sequence import Sequence
 from scopemap.input.source import Source, assumed_camera
@@ -37,6 +40,7 @@ _WITHOUT_LAYOUT = (RosBag, Dicom, VideoFile, ImageFolder)
 _IMAGES = "images"
 VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".wmv", ".webm", ".ts", ".mts", ".m2ts")
 _MOST_NAMED = 5
+_PAIRS = 4  # of views are looked at
 _USUAL_FOV_DEG = 70.0
 _SMALLEST_SIDE_PX = 32  # OpenCV's `remap` ends at 32767
 _LARGEST_SIDE_PX = 32_000
@@ -109,7 +113,7 @@ def sequence_of(
     with _errors_of_the_system(reader.path):
         source = _prepared(reader, settings)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings)
-    pair = _pair_of(source, camera, settings.camera_fit) if settings.uses_both_views else None
+    pair = _pair_of(source, camera, settings.camera_fit, frames or slice(None)) if settings.uses_both_views else None
     size_source = "chosen" if size is None else "given (--size)"
     size = size or working_size(source.width, source.height, settings.longest_side_px)
     working = f"the working size {size[0]}x{size[1]} px"
@@ -262,13 +266,19 @@ def _soften_interlacing(source: Source, height: int) -> None:
         source.notes.append(Notice("input-interlaced-averaged"))
 
 
-def _pair_of(source: Source, file: Path | str | None, camera_fit: str) -> StereoPair | CalibrationError:
-    """Return the cameras of both views, of a file or of that beside the images, or why they are not known."""
+def _pair_of(source: Source, file: Path | str | None, camera_fit: str, frames: slice) -> StereoPair | CalibrationError:
+    """Return the cameras of both views, of a file or of that beside the images, or why they are not known.
+
+    Some of the frames must fit them.
+    """
     beside = None if source.calibration is None else source.calibration.file
     if (file or beside) is None:
         return CalibrationError(NEEDS_PAIR)
     try:
         pair = read_pair(Path(file or beside or ""), (source.width, source.height), camera_fit)
+        samples = islice(source.frames(frames), 0, _PAIRS * SAMPLED_EVERY, SAMPLED_EVERY)
+        if doubt := check_pair(pair, [(one.rgb, one.second) for one in samples if one.second is not None]):
+            source.warnings.append(doubt)
     except CalibrationError as fault:
         return fault
     source.notes.append(f"stereo: depth is measured from both views: {pair.source}")

@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 
-from scopemap.input.frame_choice import is_repeat
+from scopemap.input.picture_difference import is_repeat
 
 SAMPLED_EVERY = 10
 """A picture out of so many is looked at where an input can only be read in order."""

@@ -17,8 +17,8 @@ from scopemap.engine.cameras.rectification import Rectifier, StereoPair, working
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.engine.frame import Frame, Truth
 from scopemap.engine.notices import Notice
-from scopemap.input.frame_choice import FrameChoice, SkippedFrame, selection_text
-from scopemap.input.source import Source, SourceFrame, assumed_camera
+from scopemap.input.frame_choice import FrameChoice, selection_text
+from scopemap.input.source import SkippedFrame, Source, SourceFrame, assumed_camera
 
 CameraOrigin = Literal["calibrated", "stated", "estimated", "assumed"]
 

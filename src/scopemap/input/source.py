@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,7 +17,6 @@ from scopemap.engine.frame import TruthQuality
 from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.calibration import Calibration, fitted
-from scopemap.input.frame_choice import SkippedFrame
 from scopemap.input.sampling import SampledPair, pairs_in_order
 
 ASSUMED_RATE_HZ = 30.0
@@ -42,6 +42,17 @@ class SourceFrame:
     rgb: np.ndarray
     name: str = ""
     second: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A frame that was read and not used: its index, time and name, and why, in one word and as a phrase."""
+
+    index: int
+    time_s: float
+    name: str
+    kind: Literal["repeated", "thinned", "size"]
+    reason: str
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.frame import Rows, RowTable
 from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.causes import LossCause
-from scopemap.input.frame_choice import SkippedFrame
+from scopemap.input.source import SkippedFrame
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY, SKIPPED, STATUSES, TRACKED, Trajectory
 
 LOST = -1

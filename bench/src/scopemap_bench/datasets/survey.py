@@ -17,7 +17,7 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import ScopemapError
 from scopemap.engine.geometry.se3 import inverse, transform
-from scopemap.input.frame_choice import is_repeat
+from scopemap.input.picture_difference import is_repeat
 from scopemap.input.sequence import Sequence
 from scopemap.input.trajectory.trajectory import path_length_mm
 

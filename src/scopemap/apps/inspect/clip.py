@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from scopemap.apps.inspect.frame_measures import FrameMeasures
-from scopemap.input.frame_choice import LEAST_DIFFERENCE
+from scopemap.input.picture_difference import LEAST_DIFFERENCE
 
 _NAMED = 4
 Severity = Literal["error", "warning", "info"]

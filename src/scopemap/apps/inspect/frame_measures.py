@@ -11,7 +11,7 @@ from scopemap.engine.config import MaskSettings
 from scopemap.engine.frame import Frame, is_constant
 from scopemap.engine.masking.masker import BRIGHT_LEVEL, FieldOfView, Masker, darker_channels, is_lit, specular
 from scopemap.engine.tracking.sharpness import sharpness
-from scopemap.input.frame_choice import LEAST_DIFFERENCE, mean_difference
+from scopemap.input.picture_difference import LEAST_DIFFERENCE, mean_difference
 from scopemap.report.frame_pictures import shrunk
 
 _SMALL_PX = 320

@@ -164,3 +164,16 @@ class StereoPair:
     right: CameraModel
     T_right_left: np.ndarray
     source: str
+
+    def rectification(self, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return R_left, R_right (3, 3), P_left, P_right (3, 4) of OpenCV's `stereoRectify` for views of a size, px.
+
+        R turns a camera's rays to the rectified one's, without the lenses; -P_right[0, 3] is focal length times
+        baseline, px mm.
+        """
+        left, right = (one.central.resized(*size).matrix for one in (self.left, self.right))
+        turned = self.T_right_left[:3, :3], self.T_right_left[:3, 3]
+        R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
+            left, np.zeros(4), right, np.zeros(4), size, *turned, flags=cv2.CALIB_ZERO_DISPARITY
+        )
+        return R_left, R_right, P_left, P_right

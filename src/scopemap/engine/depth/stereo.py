@@ -41,16 +41,7 @@ class StereoDepth:
         self._size = working_size(round(central.width * central.fy / central.fx), central.height, _LONGEST_SIDE_PX)
         left, right = (one.resized(*self._size) for one in (pair.left, pair.right))
         # The lenses are in the maps below, whatever their model.
-        R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
-            left.central.matrix,
-            np.zeros(4),
-            right.central.matrix,
-            np.zeros(4),
-            self._size,
-            R=pair.T_right_left[:3, :3],
-            T=pair.T_right_left[:3, 3],
-            flags=cv2.CALIB_ZERO_DISPARITY,
-        )
+        R_left, R_right, P_left, P_right = pair.rectification(self._size)
         self._maps = _map(left, R_left, P_left, self._size), _map(right, R_right, P_right, self._size)
         self._focal_mm = float(-P_right[0, 3])  # focal length times baseline, px mm
         rays = camera.rays @ R_left.T

@@ -107,9 +107,8 @@ class Dicom(Source):
             if rgb is None:
                 self._warn(f"image {number} cannot be decoded and was left out")
                 continue
-            frame = self._of_one_size(SourceFrame(number, self._time_s(number), rgb, str(number)))
-            if frame is not None:
-                yield frame
+            if (shown := self._of_one_size(SourceFrame(number, self._time_s(number), rgb, str(number)))) is not None:
+                yield shown
 
     def media(self) -> str | None:
         """Return the video's stream; None where there is none."""
