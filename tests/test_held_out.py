@@ -33,6 +33,7 @@ from scopemap.engine.fusion.agreement import (
     vertex_sigmas,
 )
 from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.terminal.figures import show
 from scopemap_bench.evaluation.surface import distances_mm
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
@@ -90,6 +91,16 @@ def test_without_usable_pixels_there_is_no_figure() -> None:
     assert agreement_figures([blind]) == {"frames": 1} | {
         f"{name}_{of}": value for name, value in nothing.items() for of in ("mean", "least")
     }
+
+
+def test_figures_are_printed_by_what_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    kinds = dict.fromkeys(
+        ("held_out", "fused", "nearest_frame"), agreement_figures([_compared(_wall(), BLACK, _depth())])
+    )
+    show({"against_video": kinds | {"worst_frames": "1, 2"}}, "table")
+    said = capsys.readouterr().out
+    assert "frames kept out of fusion" in said
+    assert "_" not in said
 
 
 @pytest.fixture(scope="module")

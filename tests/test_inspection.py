@@ -163,6 +163,13 @@ def test_a_picture_in_the_picture_is_found_and_its_mask_is_read_by_runs(tmp_path
     assert not mask[:, :210].any()
 
 
+def test_the_mask_of_a_clip_without_overlays_leaves_nothing_out(tmp_path: Path) -> None:
+    found = inspected(tmp_path)
+    assert not write_mask(found, tmp_path / "masks")
+    mask = MaskFiles(tmp_path / "masks", open_sequence(found.path, size=SIZE).rectifier).covered(0)
+    assert mask is None or not mask.any()
+
+
 @pytest.mark.parametrize(
     ("change", "code", "segment", "advice"),
     [(blurred, "blurred", (15, 24), "the longest part without them: --frames 25:"),

@@ -88,6 +88,7 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, capfd: pytest.Captur
     said = refused(capfd, "compare", first, "--truth", few)
     assert f"{few} is a run, which is no truth: `scopemap compare A B`" in said
     assert "name the true poses by --truth" in refused(capfd, "compare", first)
+    assert "nowhere: no such file or folder" in refused(capfd, "compare", first, tmp_path / "nowhere")
     assert "need --truth: two runs alone have none" in refused(capfd, "compare", first, few, "--align", "se3")
     assert "with itself: give two runs" in refused(capfd, "compare", first, tmp_path / "few" / ".." / "a")
     assert "2 runs: 1 names" in refused(capfd, "compare", first, few, "--names", "A")
