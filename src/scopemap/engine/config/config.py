@@ -5,9 +5,9 @@ named by any of them. A range of depth (`depth.near_far_mm`) becomes the anchor 
 one, and another `depth.backend` than the preset's does not get the preset's `depth.model`. An unknown key is an error
 that names the nearest key. Each stage's `method` names a set of its constants.
 
-METHOD below is arXiv 2508.11282. It publishes none of its constants (section "WEMA-RTDL"): those of the tracker were
-chosen by trial on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are
-plausible values that were not searched.
+"The paper" is arXiv 2508.11282. It publishes none of its constants: those of the tracker were chosen by trial on the
+sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are plausible values that were not
+searched.
 """
 
 from __future__ import annotations

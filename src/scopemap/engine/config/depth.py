@@ -122,7 +122,7 @@ MAPIS: dict[str, dict[str, Any]] = {
 
 
 class MapisSettings(StageSettings):
-    """Depth consistency over time (METHOD section MAPIS-Depth)."""
+    """Depth consistency over time: MAPIS-Depth of the paper."""
 
     METHODS = MAPIS
     method: str = Field("scopemap", description="constants of depth consistency")

@@ -71,7 +71,7 @@ TRACKING: dict[str, dict[str, Any]] = {
 
 
 class TrackingSettings(StageSettings):
-    """Tracking against the keyframe (METHOD section WEMA-RTDL)."""
+    """Tracking against the keyframe: WEMA-RTDL of the paper."""
 
     METHODS = TRACKING
     method: str = Field("scopemap", description="constants of tracking")
@@ -99,7 +99,7 @@ SMOOTHING: dict[str, dict[str, Any]] = {"none": {}, "wema": {}, "wema-constant":
 
 
 class SmoothingSettings(StageSettings):
-    """WEMA: weighted mean of the last three poses, on the group (METHOD section WEMA)."""
+    """WEMA: weighted mean of the last three poses, on the group (equation 13 of the paper)."""
 
     METHODS = SMOOTHING
     method: str = Field("none", description="wema: smooth poses; wema-constant: with weights that do not change")
