@@ -130,6 +130,34 @@ def test_rows_of_a_straight_path_are_marked_in_every_table_of_poses() -> None:
     assert "straight" not in tables([run("tube", "ours", 0.5)])["overview"].markdown()
 
 
+@pytest.mark.parametrize("group", ["poses", "surface"])
+def test_figures_that_the_turn_does_not_determine_are_not_printed_and_not_the_best(group: str) -> None:
+    def finished(sequence: str, method: str, error: float, turn: str) -> RunResult:
+        result = run(sequence, method, error)
+        result.figures["surface"] = {"accuracy_mean_mm": error, "coverage_2mm": 0.5, "turn": ""}
+        result.figures[group]["turn"] = turn
+        return result
+
+    turned = finished("colon", "ours", 0.1, "not determined")
+    known = [finished("colon", "Park", 1.5, ""), finished("colon", "SB", 2.5, ""), finished("tube", "ours", 0.7, "")]
+    found = tables([turned, *known])
+    columns = {"poses": [("table1", "R_avg deg"), ("table1", "R_max deg"), ("table3", "R_fin deg")]}
+    columns |= {
+        "surface": [("overview", "mesh accuracy mm"), ("overview", "mesh coverage %"), ("surface", "accuracy mean mm")]
+    }
+    for name, column in columns[group]:
+        rows = {tuple(row.values())[:2]: row[column] for row in cells(found[name])}
+        assert rows["colon", "ours"] == "not determined", column
+        assert rows["colon", "Park"].startswith("**"), column
+        assert rows["tube", "ours"][0].isdecimal(), column
+    mean_deg = math.degrees(np.mean([row.figures["paper"]["r_avg_rad"] for row in (turned, known[-1])]))
+    # A mean over sequences of which one is not determined is none, either.
+    assert cells(found["table2"], framework="ours")[0]["R_avg deg"] == (
+        "not determined" * (group == "poses") or f"{mean_deg:.3f}"
+    )
+    assert cells(found["table1"], framework="ours")[0]["R_avg unaligned deg"].strip("*")[0].isdecimal()
+
+
 @pytest.mark.parametrize(("name", "file"), [*zip(("table1", "table2", "table3"), PUBLISHED, strict=True)])
 def test_published_rows_are_the_files(name: str, file: str) -> None:
     text = (resources.files("scopemap_bench") / "published" / f"{file}.csv").read_text()
@@ -182,7 +210,7 @@ def test_every_column_names_a_figure_that_is_measured() -> None:
         | {"jitter": scale_jitter(np.ones(3))}
         | {"metric_consistency": metric_consistency(np.ones(3), 1.0)},
         "consistency": ConsistencyMeter(PinholeCamera(50, 50, 10, 10, 20, 20)).report() | {"flow": "dis"},
-        "surface": surface,
+        "surface": surface | {"turn": ""},
     }
     rows = summarise(RESULTS)
     own = [read_table(name, rows) for name in ("overview", "tracking", "consistency", "depth", "surface")]

@@ -26,7 +26,18 @@ from scopemap.input.trajectory.trajectory import write_kitti
 from scopemap_bench.cli.evaluate import MEASURES
 
 KEYS = [
-    *("frames", "tracked", "align", "straight", "scale", "ate_rmse_mm", "ate_hold_rmse_mm", "ate_mean_mm"),
+    *(
+        "frames",
+        "tracked",
+        "align",
+        "straight",
+        "turn",
+        "turn_sigma_deg",
+        "scale",
+        "ate_rmse_mm",
+        "ate_hold_rmse_mm",
+        "ate_mean_mm",
+    ),
     *("rotation_mean_deg", "rotation_max_deg", "rotation_unaligned_mean_deg", "rotation_unaligned_max_deg"),
     *("rpe_1_mm", "rpe_1_deg", "rpe_10_mm", "rpe_10_deg", "tlr"),
     *("ate_median_mm", "ate_max_mm", "rpe_10mm_path_mm", "rpe_10mm_path_deg"),

@@ -79,19 +79,20 @@ def test_a_case_worked_out_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("ate_mm", "tfr_percent", "duration_share", "by_hand"),
+    ("ate_mm", "rpe_deg", "tfr_percent", "duration_share", "by_hand"),
     [
-        (4.0, 100.0, 0.7, 4.0),
-        (4.0, 80.0, 1.5, 4.0 * 1.1 * 1.25),
-        (8.0, 60.0, 3.0, 8.0 * 1.2 * 1.5),
-        (1.0, 50.0, 0.5, 56.25),
-        (float("nan"), 0.0, 1.0, 56.25),
+        (4.0, 2.0, 100.0, 0.7, (4.0, 2.0)),
+        (4.0, 2.0, 80.0, 1.5, (4.0 * 1.1 * 1.25, 2.0 * 1.1 * 1.25)),
+        (8.0, 5.0, 60.0, 3.0, (8.0 * 1.2 * 1.5, 5.0 * 1.2 * 1.5)),
+        (1.0, 1.0, 50.0, 0.5, (56.25, 45.0)),
+        (float("nan"), float("nan"), 0.0, 1.0, (56.25, 45.0)),
     ],
 )
-def test_the_score_is_that_made_by_hand(
-    ate_mm: float, tfr_percent: float, duration_share: float, by_hand: float
+def test_the_scores_are_those_made_by_hand(
+    ate_mm: float, rpe_deg: float, tfr_percent: float, duration_share: float, by_hand: tuple[float, float]
 ) -> None:
-    assert climb_score(ate_mm, tfr_percent, duration_share) == pytest.approx(by_hand)
+    score = climb_score(ate_mm, rpe_deg, tfr_percent, duration_share)
+    assert (score.ate, score.rotation) == pytest.approx(by_hand)
 
 
 def test_a_run_that_says_how_long_it_took_has_a_score(tmp_path: Path) -> None:
@@ -108,6 +109,7 @@ def test_a_run_that_says_how_long_it_took_has_a_score(tmp_path: Path) -> None:
     (other / "runtime.txt").write_text("init_seconds=1.0\nprocessing_seconds=9.0\n")
     figures = evaluated(other, truth)
     assert figures["climb_score"] == pytest.approx(1.25 * figures["climb_ate_mean_mm"], rel=0.01)
+    assert figures["climb_rotation_score"] == pytest.approx(1.25 * figures["climb_rpe_40_mean_deg"], rel=0.01, abs=1e-9)
     # Frames that are lost at the end belong to the clip: it is as long.
     part = write_foreign_run(tmp_path / "part", (noisy[:270], [*range(1, 271)]))
     (part / "runtime.txt").write_text("preprocessing_seconds=99\ninit_seconds=1.0\nprocessing_seconds = 6.0\n")

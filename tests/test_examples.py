@@ -18,6 +18,7 @@ PROMISED = {
     "01_reconstruct.py": r"8 of 8 frames tracked, \d+\.\d mm\nsurface: [1-9]\d* vertices, .*\nscale: .*scopenet",
     "02_evaluate.py": r"origin: ATE (0|1)\.\d+ mm.*\nse3 .*\nsim3  : ATE 0\.\d+ mm.*8 of 8 frames tracked",
     "03_depth_from_files.py": r"depth: 8 files in .* \(measured\)\n8 of 8 frames tracked\nsurface: [1-9]\d* faces",
+    "05_the_paper_frame_by_frame.py": r"(frame \d: \d+\.\d mm deep, at .*\n){6}surface: [1-9]\d* faces",
     "04_ask_a_result.py": r"(?s)not seen: \d+%.*look again at .*area: .*diameter: .*\n1[0-6] of 16 frames located",
 }
 

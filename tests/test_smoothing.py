@@ -1,4 +1,4 @@
-"""WEMA: METHOD's formula in closed form, its schedule, its lag, and what it does not touch."""
+"""WEMA: the paper's formula in closed form, its schedule, its lag, and what it does not touch."""
 
 from __future__ import annotations
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -14,9 +16,10 @@ from scopemap.engine.errors import AlignmentError, InputError
 from scopemap.engine.flow.estimator import FlowEstimator, pair_flow
 from scopemap.engine.flow.flows import create_flow
 from scopemap.engine.fusion.mesh_files import read_mesh
-from scopemap.engine.geometry.align import AlignMode, Similarity
+from scopemap.engine.geometry.align import AlignMode
 from scopemap.engine.masking.masker import Masker
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
+from scopemap.evaluation.turn import NOT_DETERMINED
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
 from scopemap.input.trajectory.trajectory import Trajectory
@@ -47,7 +50,7 @@ def score(
     if "climb" in figures and reference is not None:
         figures["climb"] = with_score(figures["climb"], folder, estimate, reference)
     if matched is not None and protocol.surface:
-        surface = surface_figures_of(folder, sequence, matched.similarity, icp=protocol.icp)
+        surface = surface_figures_of(folder, sequence, matched, icp=protocol.icp)
         figures |= {"surface": surface} if surface else {}
     depth = DepthReader(folder)
     if depth.present and protocol.depth:
@@ -84,12 +87,14 @@ def pose_groups(
 
 
 def surface_figures_of(
-    run: Path, truth: Sequence | Path, similarity: Similarity, *, icp: bool = False
-) -> dict[str, float]:
+    run: Path, truth: Sequence | Path, matched: MatchedTrajectories, *, icp: bool = False
+) -> dict[str, Any]:
     """Return the figures of a run's mesh.ply against the true surface of a data set; {} where there is none.
 
-    `similarity` takes the run's world to the true one. A sequence tells what of the true surface its views show, where
-    the data set does not. Raises `InputError` for a mesh that cannot be read.
+    `matched` takes the run's world to the true one. A sequence tells what of the true surface its views show, where the
+    data set does not. "turn" is "not determined", and what is measured before ICP is NaN, where the distance may be the
+    alignment's own; else "".
+    Raises `InputError` for a mesh that cannot be read.
     """
     file = run / "mesh.ply"
     if not file.is_file():
@@ -98,11 +103,15 @@ def surface_figures_of(
     true_surface = read_true_surface(truth) if isinstance(truth, Path) else _seen_surface(truth)
     if true_surface is None:
         return {}
-    moved = trimesh.Trimesh(similarity.transform_points(np.asarray(mesh.vertices)), mesh.faces, process=False)
+    moved = trimesh.Trimesh(matched.similarity.transform_points(np.asarray(mesh.vertices)), mesh.faces, process=False)
     camera = None
     if true_surface.T_view is not None:
         camera = (open_sequence(truth) if isinstance(truth, Path) else truth).camera
-    return measure_surface(moved, true_surface, camera=camera, icp=icp)
+    figures = measure_surface(moved, true_surface, camera=camera, icp=icp)
+    if matched.turn.determines_surface(np.asarray(moved.vertices), figures["accuracy_mean_mm"]):
+        return figures | {"turn": ""}
+    kept = {name: value for name, value in figures.items() if "icp" in name or name == "observed_share"}
+    return dict.fromkeys(figures, math.nan) | kept | {"turn": NOT_DETERMINED}
 
 
 def _seen_surface(sequence: Sequence) -> TrueSurface | None:

@@ -39,7 +39,7 @@ smaller errors."""
 
 _LONGEST_ERROR = 80
 # Columns of text, and where the runs keep their words: rows compete where the figures were measured alike.
-_WORDS = {"alignment": "poses.align", "path": "poses.straight"}
+_WORDS = {"alignment": "poses.align", "path": "poses.straight", "turn": "poses.turn", "surface turn": "surface.turn"}
 _WORDS |= {"flow": "consistency.flow", "scaling": "depth.scaling", "depth": "facts.depth"}
 
 
@@ -48,7 +48,8 @@ class Figure:
     """A column of figures.
 
     key : "group.name". digits : behind the point. better : which value is the best. factor : from the stored to the
-    printed unit. spread_key : what stands behind "±"; empty: the half range over the seeds, if `seeds`.
+    printed unit. spread_key : what stands behind "±"; empty: the half range over the seeds, if `seeds`. unless : column
+    of text whose word stands instead of the figure, which then does not compete.
     """
 
     key: str
@@ -59,6 +60,7 @@ class Figure:
     spread_key: str = ""
     factor: float = 1.0
     seeds: bool = False
+    unless: str = ""
 
     @property
     def head(self) -> str:
@@ -76,7 +78,16 @@ class Figure:
         """Return the figures and what stands behind "±", both in the printed unit, NaN where there is none."""
         spread_key = self.spread_key or (self.key + SPREAD if self.seeds else "")
         found = rows.reindex(columns=[self.key, spread_key]).astype(float) * self.factor
+        found = found.where(self._words(rows) == "")
         return found[self.key], found[spread_key]
+
+    def _words(self, rows: pd.DataFrame) -> pd.Series:
+        return rows[self.unless] if self.unless else pd.Series("", index=rows.index)
+
+    def texts(self, rows: pd.DataFrame) -> list[str]:
+        """Return the figures as they are printed, the word of `unless` instead of them, "" where there is none."""
+        values = zip(*self.values(rows), self._words(rows), strict=True)
+        return [word or self.text(value, spread) for value, spread, word in values]
 
     def text(self, value: float, spread: float = math.nan) -> str:
         """Return a figure as it is printed; "" for NaN."""
@@ -160,9 +171,8 @@ class Table:
         cells = self.rows[list(self.texts)].map(escape)
         groups = [self.rows[name] for name in self.compete_within]
         for number, figure in enumerate(self.figures):
-            values, spreads = figure.values(self.rows)
-            texts = [figure.text(value, spread) for value, spread in zip(values, spreads, strict=True)]
-            column = pd.Series(texts, index=cells.index, dtype=object).map(escape)
+            values, _ = figure.values(self.rows)
+            column = pd.Series(figure.texts(self.rows), index=cells.index, dtype=object).map(escape)
             best = figure.best(values.where(self.rows["competes"]), groups or [values.map(bool)])
             column = column.where(~best, column.map(bold.format))
             if number == 0:
@@ -193,7 +203,8 @@ def summarise(results: Iterable[RunResult]) -> pd.DataFrame:
 
     Figures are medians over the seeds, by "group.name", with half their range under the same name and `SPREAD`. Further
     columns: "sequence", "method", "runs", "frames tracked", "alignment", "path", "depth", "flow", "scaling", "failure",
-    "done", "competes", "tracked", "frames". A sequence whose name ends with its seed ("colon, seed 1") is that one.
+    "done", "competes", "tracked", "frames", "turn", "surface turn". A sequence with its seed ("colon, seed 1")
+    is without it.
     """
     runs = _runs(results)
     order = {name: place for place, name in enumerate(dict.fromkeys(runs["sequence"]))}

@@ -25,6 +25,7 @@ PublishedTable = Literal["table1_pose_scared", "table2_methods_scared", "table3_
 
 _SECTIONS = {"tracking": "poses", "consistency": "consistency", "depth": "depth", "surface": "surface"}
 _OWN_GROUPS = {"paper", *_SECTIONS.values()}
+_JOINED = ("alignment", "path", "turn", "depth")
 _FACTS = ("machine", "device", "commit", "versions", "truth")
 _UNITS = {"_mm": "mm", "_deg": "deg", "_rad": "rad", "_percent": "%", "_px": "px", "_s": "s"}
 
@@ -110,7 +111,7 @@ def published_rows(table: PublishedTable) -> pd.DataFrame:
     """
     with (resources.files("scopemap_bench") / "published" / f"{table}.csv").open(encoding="utf-8") as file:
         rows = pd.read_csv(file)
-    empty = dict.fromkeys(("depth", "frames tracked", "sequences", "path", "failure"), "")
+    empty = dict.fromkeys(("depth", "frames tracked", "sequences", "path", "turn", "failure"), "")
     return rows.assign(competes=False, alignment="not stated", source="published", **empty)
 
 
@@ -127,7 +128,7 @@ def _means_over_sequences(rows: pd.DataFrame) -> pd.DataFrame:
         .assign(
             **{"frames tracked": of_frames(done[["tracked", "frames"]].sum().reindex(methods))},
             sequences=[f"{count} of {sequences}" for count in finished],
-            **{key: rows.groupby("method")[key].agg(joined).reindex(methods) for key in ("alignment", "path", "depth")},
+            **{key: rows.groupby("method")[key].agg(joined).reindex(methods) for key in _JOINED},
             failure=rows.groupby("method")["failure"].first().reindex(methods).where(finished == 0, ""),
             competes=whole & (scored == finished),
         )

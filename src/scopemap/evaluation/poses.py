@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scopemap.engine.errors import AlignmentError
 from scopemap.engine.geometry.align import AlignMode, Similarity, align_trajectories
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.evaluation.turn import NOT_DETERMINED, Turn
 from scopemap.input.trajectory.trajectory import Trajectory, path_length_mm
 from scopemap.result.trajectories import read_trajectory
 
@@ -122,6 +123,7 @@ class MatchedTrajectories:
         alignment.
     tracked : (N,) bool, False where the estimate is lost.
     align, similarity : mode of the alignment, fitted on the tracked frames, and its result.
+    turn : of the alignment, and how well it is determined.
     reference_frames, reference_in_span : reference poses, and those between the estimate's first and last frame.
     """
 
@@ -131,8 +133,16 @@ class MatchedTrajectories:
     tracked: np.ndarray
     align: AlignMode
     similarity: Similarity
+    turn: Turn
     reference_frames: int
     reference_in_span: int
+
+    @property
+    def turned(self) -> tuple[np.ndarray, np.ndarray]:
+        """Aligned and true poses (M, 4, 4) of the tracked frames; none where the turn does not tell their rotation."""
+        aligned, reference = self.aligned[self.tracked], self.reference[self.tracked]
+        known = self.turn.determines_rotation(float(rotation_errors_rad(aligned, reference).mean()))
+        return (aligned, reference) if known else (aligned[:0], reference[:0])
 
     @property
     def coverage(self) -> float:
@@ -178,7 +188,10 @@ def match(
         raise AlignmentError(_too_few(estimate, known, int(np.count_nonzero(tracked))))
     estimated = _with_last_pose(estimate)[rows_estimate]
     truth = known.T_world_camera[rows_reference]
-    _, similarity = align_trajectories(estimated[tracked], truth[tracked], align, first=first, by_orientations=True)
+    pairs = (estimated[tracked], truth[tracked])
+    aligned, similarity = align_trajectories(*pairs, align, first=first, by_orientations=True)
+    by_positions = align in ("se3", "sim3")
+    turn = Turn.of(aligned[:first], pairs[1][:first], by_positions=by_positions, straight=similarity.straight)
     stamps, true_stamps, gap = _stamps(estimate, known)
     in_span = (true_stamps >= stamps.min() - gap) & (true_stamps <= stamps.max() + gap)
     return MatchedTrajectories(
@@ -188,6 +201,7 @@ def match(
         tracked=tracked,
         align=align,
         similarity=similarity,
+        turn=turn,
         reference_frames=len(known),
         reference_in_span=int(np.count_nonzero(in_span)),
     )
@@ -231,6 +245,8 @@ def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
     frames, tracked : matched frames, and those of them that are not lost.
     align, scale : mode of the alignment, and the scale that it found.
     straight : "straight path" where the turn about it was fitted to the orientations; else "".
+    turn : "not determined" where rotation errors after the alignment may be its own, and are NaN; else "".
+    turn_sigma_deg : standard deviation of the alignment's turn, ATE over the path's extent (`evaluation/turn.py`).
     ate_... : absolute translation error after the alignment; ate_hold_rmse_mm with lost frames held at the last pose.
     rotation_mean_deg, rotation_max_deg : absolute rotation error after the alignment.
     rotation_unaligned_mean_deg, rotation_unaligned_max_deg : rotation since the first tracked frame, no alignment.
@@ -243,11 +259,9 @@ def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
     """
     ok = matched.tracked
     held_mm = translation_errors_mm(matched.aligned, matched.reference)
-    error_mm, error_deg = held_mm[ok], np.degrees(rotation_errors_rad(matched.aligned[ok], matched.reference[ok]))
+    error_mm, error_deg = held_mm[ok], np.degrees(rotation_errors_rad(*matched.turned))
     ate, rotation = ErrorSummary.of(error_mm), ErrorSummary.of(error_deg)
-    rows = np.flatnonzero(ok)
-    since_first = np.stack([np.full(len(rows), rows[0]), rows], axis=1)
-    unaligned_rad = ErrorSummary.of(relative_errors(matched.estimated, matched.reference, since_first)[1])
+    unaligned_rad = ErrorSummary.of(unaligned_rotation_errors_rad(matched))
     (rpe_1_mm, rpe_1_rad), (rpe_10_mm, rpe_10_rad) = rpe_over_frames(matched, 1), rpe_over_frames(matched, 10)
     rpe_path_mm, rpe_path_rad = rpe_over_path(matched, 10.0)
     return {
@@ -255,6 +269,8 @@ def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
         "tracked": int(np.count_nonzero(ok)),
         "align": matched.align,
         "straight": "straight path" if matched.similarity.straight else "",
+        "turn": "" if len(error_deg) else NOT_DETERMINED,
+        "turn_sigma_deg": float(np.degrees(matched.turn.sigma_rad)),
         "scale": matched.similarity.scale,
         "ate_rmse_mm": ate.rmse,
         "ate_hold_rmse_mm": ErrorSummary.of(held_mm).rmse,
@@ -279,6 +295,13 @@ def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
         "longest_tracked": longest_run(ok),
         "frames_until_loss": frames_until_loss(ok),
     }
+
+
+def unaligned_rotation_errors_rad(matched: MatchedTrajectories) -> np.ndarray:
+    """Return the errors of the rotation since the first tracked frame, (N,) rad of the tracked frames, no alignment."""
+    rows = np.flatnonzero(matched.tracked)
+    since_first = np.stack([np.full(len(rows), rows[0]), rows], axis=1)
+    return relative_errors(matched.estimated, matched.reference, since_first)[1]
 
 
 def rpe_over_frames(matched: MatchedTrajectories, step: int) -> tuple[ErrorSummary, ErrorSummary]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -21,18 +22,30 @@ def climb(
     videos: Annotated[
         Path | None, typer.Option(help="Folder of the challenge's videos: each must have its clip.")
     ] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="Folder of the references, CLIP/results_txt/images.txt: scores the submission.")
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write each run as the five runs of a clip, and check the submission by the challenge's rules (exit code 1)."""
+    """Convert runs into a CLiMB submission, and check it by the challenge's rules (exit code 1).
+
+    With --truth the submission is scored: the mean over all clips of their scores, failed ones included.
+    """
+    from scopemap_bench.climb.ranking import ranking_of
     from scopemap_bench.climb.submission import submission_problems, write_submission
 
     written = [write_submission(run, out, clip) for run in runs or []]
     problems = submission_problems(out, videos)
+    ranking = None if truth is None else ranking_of(out, truth)
     if as_json:
         facts = {"out": str(out), "format": "climb", "written": written, "problems": problems}
-        typer.echo(json.dumps(facts, indent=2))
+        scores = {} if ranking is None else {"final": asdict(ranking.final), **asdict(ranking)}
+        typer.echo(json.dumps(facts | scores, indent=2))
     elif not quiet:
         typer.echo("\n".join(problems) or f"{out}: valid")
+        for name, score in {} if ranking is None else {**ranking.clips, "mean over the clips": ranking.final}.items():
+            failed = ", failed" if ranking is not None and name in ranking.failed else ""
+            typer.echo(f"{name}: score {score.ate:.3f}, rotation {score.rotation:.3f} (decides a tie){failed}")
     if problems:
         raise InputError(f"{out}: {len(problems)} problems, the first: {problems[0]}")

@@ -46,7 +46,7 @@ def surface(
         place = open_truth(run, truth)
     except InputError:  # poses and a surface, but no frames that would tell what was seen of it
         place = truth
-    found = surface_figures_of(run, place, compared.matched.similarity, icp=icp)
+    found = surface_figures_of(run, place, compared.matched, icp=icp)
     if not found:
         return {}
     short = {"mesh_accuracy_mm": "accuracy_mean_mm", "mesh_accuracy_p90_mm": "accuracy_p90_mm"}

@@ -1,10 +1,12 @@
 """Pose errors as the CLiMB challenge (EndoVis at MICCAI 2026) computes them: every submap by its own Sim(3).
 
-Source: EndoCartoScope/climb-challenge at 79d7435, evaluation/evaluation_utils.py. One difference: where no two frames
-are as far apart as an RPE asks for, it is NaN here and 0 there.
+Source: EndoCartoScope/climb-challenge at 79d7435, evaluation/evaluation_utils.py, and README.md for the score. One
+difference: where no two frames are as far apart as an RPE asks for, it is NaN here and 0 there.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,8 +17,8 @@ from scopemap.input.trajectory.trajectory import Trajectory
 LEAST_FRAMES = 250
 """Frames of the reference that a submap needs to count, 5 s of video; 100 before the challenge's commit 79d7435."""
 
-# The score's factors, at most, and the error of a clip of which not more than half is found, mm.
-_MOST_WEIGHT, _FAILED_MM, _LEAST_TFR_PERCENT = 1.5, 25.0, 50.0
+# What a factor of the score adds at most, and the errors of a clip of which not more than half is found.
+_MOST_ADDED, _FAILED_MM, _FAILED_DEG, _LEAST_TFR_PERCENT = 0.5, 25.0, 20.0, 50.0
 _RPE_FRAMES = (1, 10, 20, 40)
 _RPE_NAMES = tuple(f"rpe_{step}_mean_{unit}" for step in _RPE_FRAMES for unit in ("mm", "deg"))
 _ERRORS = ("ate_mean_mm", "ate_median_mm", "ate_std_mm", *_RPE_NAMES)
@@ -49,19 +51,28 @@ def climb_figures(estimate: Trajectory, reference: Trajectory) -> dict[str, floa
     }
 
 
-def climb_score(ate_mean_mm: float, tfr_percent: float, duration_share: float) -> float:
-    """Return the challenge's score of a clip, lower is better: ATE times W_rtf times W_t.
+@dataclass(frozen=True)
+class ClimbScore:
+    """The challenge's scores of a clip, or their means over clips; lower is better.
 
-    duration_share : processing time over the clip's duration. W_rtf grows from 1 with all frames found to 1.5 with
-    none; W_t from 1 up to the clip's duration to 1.5 from twice that. A clip with a TFR of 50 % or less has 25 mm and
-    both factors at their most. The challenge does not publish the factors: these give what a competitor quotes of the
-    board (JmeesInc/CLiMB26-jmees at c286e1f): W_rtf 1.094 at 81.3 %, W_t 1 at 0.020, 1.15 at 0.026 and 1.5 at 0.077 s a
-    frame of 50 a second, 56.25 for a failed clip.
+    ate : Score_ATE, mm, which ranks. rotation : Score_Rot, degrees, which ranks where ATE scores are within 5 %.
+    """
+
+    ate: float
+    rotation: float
+
+
+def climb_score(ate_mean_mm: float, rpe_40_deg: float, tfr_percent: float, duration_share: float) -> ClimbScore:
+    """Return the scores of a clip: ATE, and rotational RPE over 40 frames, times W_rtf W_t.
+
+    duration_share : processing time over the clip's duration, T x fps. W_rtf = 1 + 0.5 (1 - RTF), RTF the TFR as a
+    fraction; W_t = 1 + 0.5 min(1, max(0, T fps - 1)). A clip with a TFR of 50 % or less, or without a valid map, enters
+    with ATE 25 mm, 20 degrees, RTF 0 and W_t 1.5. Source: README.md, "Final score and ranking".
     """
     if not tfr_percent > _LEAST_TFR_PERCENT:
-        return _FAILED_MM * _MOST_WEIGHT**2
-    weights = np.array([1 - tfr_percent / 100, np.clip(duration_share - 1, 0, 1)]) * (_MOST_WEIGHT - 1) + 1
-    return float(ate_mean_mm * weights.prod())
+        ate_mean_mm, rpe_40_deg, tfr_percent, duration_share = _FAILED_MM, _FAILED_DEG, 0.0, np.inf
+    weights = 1 + _MOST_ADDED * np.array([1 - tfr_percent / 100, np.clip(duration_share - 1, 0, 1)])
+    return ClimbScore(float(ate_mean_mm * weights.prod()), float(rpe_40_deg * weights.prod()))
 
 
 def _errors(estimated: np.ndarray, reference: np.ndarray, frames: np.ndarray) -> list[float]:

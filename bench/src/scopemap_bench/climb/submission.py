@@ -11,6 +11,7 @@ import math
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.input.trajectory.text import text_lines
 from scopemap.input.trajectory.trajectory import Trajectory
+from scopemap.input.video import VideoFile
 from scopemap.result.result import Result
 from scopemap.result.trajectory_folders import read_run, submap_folders
 from scopemap_bench.climb.figures import climb_score
@@ -28,6 +30,7 @@ from scopemap_bench.trajectories.climb import read_submap, write_submap
 
 RUNS = ("1", "2", "3", "4", "5")
 RUNTIME_KEYS = ("init_seconds", "processing_seconds")
+_TIMES_REAL_TIME = 5.0
 
 # Points serve to look at: a mesh's 100,000 vertices, five times a clip, would fill a disk.
 _MOST_POINTS = 20_000
@@ -56,20 +59,23 @@ def write_submission(run: Path, out: Path, clip: str = "") -> str:
 
 
 def with_score(figures: dict[str, float], run: Path, estimate: Trajectory, reference: Trajectory) -> dict[str, float]:
-    """Return the protocol's figures with "climb_score", where the folder says how long its run took.
+    """Return the protocol's figures with "climb_score" and "climb_rotation_score", where the folder says how long its
+    run took; "climb_duration_share" is that time over the clip's duration.
 
     The clip is as long as the frames of both trajectories, at the intervals of the estimate's time stamps.
     """
     try:
         file = run / "runtime.txt"
-        processing_s = _stated_s(file)[RUNTIME_KEYS[1]] if file.is_file() else _times_s(Result(run).provenance)[1]
+        processing_s = stated_s(file)[RUNTIME_KEYS[1]] if file.is_file() else _times_s(Result(run).provenance)[1]
     except (InputError, LookupError, ValueError, TypeError, AttributeError):
         return figures
     frames = np.concatenate([one.indices for one in (estimate, *estimate.others, reference)])
     frame_s = float(np.median(np.diff(estimate.times_s) / np.diff(estimate.indices)))
-    duration_s = (np.ptp(frames) + 1) * frame_s
-    score = climb_score(figures["climb_ate_mean_mm"], figures["climb_tfr_percent"], processing_s / duration_s)
-    return figures | {"climb_score": score}
+    share = processing_s / ((np.ptp(frames) + 1) * frame_s)
+    named = (figures["climb_ate_mean_mm"], figures["climb_rpe_40_mean_deg"], figures["climb_tfr_percent"])
+    score = climb_score(*named, share)
+    scores = {"climb_score": score.ate, "climb_rotation_score": score.rotation, "climb_duration_share": share}
+    return figures | scores
 
 
 def _times_s(facts: dict[str, Any]) -> tuple[float, float]:
@@ -103,11 +109,42 @@ def _points(mesh_file: Path, submap: Trajectory) -> np.ndarray:
 
 
 def submission_problems(submission: Path, videos: Path | None = None) -> list[str]:
-    """Return what breaks the rules, a sentence each; `videos` holds the clips (*.mp4) that must be there, None: any."""
+    """Return what breaks the rules, a sentence each; `videos` holds the clips (*.mp4) that must be there, None: any.
+
+    With `videos` the times that the runs state are held to the time limit, too.
+    """
     clips = _folders(submission) if videos is None else sorted(file.stem for file in videos.glob("*.mp4"))
     if not clips:
         return [f"{videos or submission}: no clip"]
-    return [problem for clip in clips for problem in _clip_problems(submission / clip)]
+    problems = [problem for clip in clips for problem in _clip_problems(submission / clip)]
+    return problems if videos is None else problems + _time_problems(submission, videos)
+
+
+def _time_problems(submission: Path, videos: Path) -> list[str]:
+    """Return that the runs took longer than the limit: 5 times the duration of all clips times their 5 runs.
+
+    Equal copies of a run took its time once.
+    """
+    stated: set[tuple[str, float, float]] = set()
+    for file in submission.glob(f"*/[{RUNS[0]}-{RUNS[-1]}]/runtime.txt"):
+        with suppress(InputError):  # a problem of its own
+            times = stated_s(file)
+            stated.add((file.parts[-3], times[RUNTIME_KEYS[0]], times[RUNTIME_KEYS[1]]))
+    took_s = sum(init_s + processing_s for _, init_s, processing_s in stated)
+    limit_s = _TIMES_REAL_TIME * len(RUNS) * sum(map(_duration_s, videos.glob("*.mp4")))
+    if took_s <= limit_s:
+        return []
+    rule = f"{_TIMES_REAL_TIME:g} times the duration of all clips times {len(RUNS)} runs, {limit_s:.0f} s"
+    return [f"{submission}: its runs state {took_s:.0f} s, and the limit is {rule}; a run beyond it is aborted"]
+
+
+def _duration_s(video: Path) -> float:
+    """Return how long a video is, s; infinite where it cannot be told, so that no limit is."""
+    with suppress(InputError):
+        source = VideoFile(video)
+        if source.count:
+            return source.count / source.rate_hz
+    return math.inf
 
 
 def _clip_problems(clip: Path) -> Iterator[str]:
@@ -120,7 +157,7 @@ def _clip_problems(clip: Path) -> Iterator[str]:
 
 def _run_problems(run: Path) -> Iterator[str]:
     maps, trajectories = run / "3D_maps", run / "camera_trajectory"
-    checks: list[tuple[Callable[[Path], object], Path]] = [(_stated_s, run / "runtime.txt")]
+    checks: list[tuple[Callable[[Path], object], Path]] = [(stated_s, run / "runtime.txt")]
     names, expected = _folders(maps), set[Path]()
     if not names:
         yield f"{maps}: no map"
@@ -142,7 +179,7 @@ def _run_problems(run: Path) -> Iterator[str]:
             yield str(error)
 
 
-def _stated_s(file: Path) -> dict[str, float]:
+def stated_s(file: Path) -> dict[str, float]:
     """Return the times that runtime.txt states; raises `InputError` where one is missing."""
     lines = [line.replace(" ", "") for line in text_lines(file)]
     stated = {}

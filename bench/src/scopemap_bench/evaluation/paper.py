@@ -22,6 +22,7 @@ from scopemap.evaluation.poses import (
     rpe_over_frames,
     rpe_over_path,
     translation_errors_mm,
+    unaligned_rotation_errors_rad,
 )
 
 _PATH_MM = 10.0
@@ -43,7 +44,8 @@ def paper_figures(matched: MatchedTrajectories) -> dict[str, Any]:
     ok = matched.tracked
     aligned, reference = matched.aligned[ok], matched.reference[ok]
     t = ErrorSummary.of(translation_errors_mm(aligned, reference))
-    r = ErrorSummary.of(rotation_errors_rad(aligned, reference))
+    r = ErrorSummary.of(rotation_errors_rad(*matched.turned))
+    r_unaligned = ErrorSummary.of(unaligned_rotation_errors_rad(matched))
     drift_mm, drift_rad = _end_point_drift(matched, 1.0)
     figures: dict[str, Any] = {
         "t_avg_mm": t.mean,
@@ -59,7 +61,7 @@ def paper_figures(matched: MatchedTrajectories) -> dict[str, Any]:
         "t_fin_origin_scaled_mm": _end_point_drift(matched, matched.similarity.scale)[0],
     }
     angles_rad = {"r_avg": r.mean, "r_std": r.std, "r_rmse": r.rmse, "r_fin": r.final, "r_max": r.max}
-    angles_rad["r_fin_origin"] = drift_rad
+    angles_rad |= {"r_unaligned": r_unaligned.mean, "r_unaligned_std": r_unaligned.std, "r_fin_origin": drift_rad}
     rpe = {"rpe_1_frame": rpe_over_frames(matched, 1), "rpe_10_mm_path": rpe_over_path(matched, _PATH_MM)}
     for name, (translation, rotation) in rpe.items():
         figures |= {f"{name}_mm": translation.mean, f"{name}_std_mm": translation.std}
@@ -67,12 +69,16 @@ def paper_figures(matched: MatchedTrajectories) -> dict[str, Any]:
     figures |= {f"{name}_rad": angle for name, angle in angles_rad.items()}
     figures |= {f"{name}_deg": float(np.degrees(angle)) for name, angle in angles_rad.items()}
     along_axes_mm = (aligned[:, :3, 3] - reference[:, :3, 3]) @ matched.reference[0, :3, :3]
-    about_axes_rad = Rotation.from_matrix(rotation_errors(aligned, reference)).as_euler("xyz")
+    about_axes_rad = _euler_xyz_rad(rotation_errors(*matched.turned))
     return figures | {
         "t_axes_mm": _per_axis(along_axes_mm),
         "r_axes_rad": _per_axis(about_axes_rad),
         "r_axes_deg": _per_axis(np.degrees(about_axes_rad)),
     }
+
+
+def _euler_xyz_rad(R: np.ndarray) -> np.ndarray:
+    return Rotation.from_matrix(R).as_euler("xyz") if len(R) else np.empty((0, 3))
 
 
 def _per_axis(errors: np.ndarray) -> dict[str, dict[str, float]]:

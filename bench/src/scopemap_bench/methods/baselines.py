@@ -6,7 +6,7 @@ point-to-plane (Chen and Medioni, 1992). Its defaults are made for rooms in metr
 A frame is lost where no pixels correspond or the linear system is singular.
 
 Endo-Depth-and-Motion (Recasens, Lamarca, Facil, Montiel and Civera, RA-L 2021, arXiv 2103.16525), re-derived: our
-tracker with the parts taken off that it does not have, by METHOD of arXiv 2508.11282, which grew out of it:
+tracker with the parts taken off that it does not have, by arXiv 2508.11282, which grew out of it:
 Gauss-Newton on the residual lifted with the keyframe's depth, rotation before the whole motion, a keyframe every 2
 frames, two scales, a robust error. No code of that project was used. Ours to choose: Huber's threshold (1.345 robust
 standard deviations), no motion as the start, 30 steps per scale, half the working size for the rotation. A frame is

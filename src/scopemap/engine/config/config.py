@@ -6,9 +6,9 @@ one, and another `depth.backend` than the preset's does not get the preset's `de
 that names the nearest key. Each stage's `method` chooses its advanced settings; one that is given itself counts before
 the method, but a later source that names a method replaces what earlier ones have for these.
 
-METHOD below is arXiv 2508.11282. It publishes none of its constants (section "WEMA-RTDL"): those of the tracker were
-chosen by trial on the sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are
-plausible values that were not searched.
+"The paper" is arXiv 2508.11282. It publishes none of its constants: those of the tracker were chosen by trial on the
+sequences of BENCHMARK.md; tau, the filter's sigmas, rho and WEMA's weights and omega are plausible values that were not
+searched.
 """
 
 from __future__ import annotations

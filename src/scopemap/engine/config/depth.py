@@ -85,7 +85,7 @@ class DepthSettings(StageSettings):
 
 
 class MapisSettings(StageSettings):
-    """Depth consistency over time (METHOD section MAPIS-Depth)."""
+    """Depth consistency over time: MAPIS-Depth of the paper."""
 
     METHODS: ClassVar[Methods] = {
         "scopemap": {},

@@ -14,7 +14,7 @@ _CHOSEN = "chosen on cecum_t1_a (C3VD) and four phantoms"
 
 
 class TrackingSettings(StageSettings):
-    """Tracking against the keyframe (METHOD section WEMA-RTDL)."""
+    """Tracking against the keyframe: WEMA-RTDL of the paper."""
 
     METHODS: ClassVar[Methods] = {
         "scopemap": {},
@@ -124,7 +124,7 @@ class TrackingSettings(StageSettings):
 
 
 class SmoothingSettings(StageSettings):
-    """WEMA: weighted mean of the last three poses, on the group (METHOD section WEMA)."""
+    """WEMA: weighted mean of the last three poses, on the group (equation 13 of the paper)."""
 
     METHODS: ClassVar[Methods] = {"none": {}, "wema": {}}
     method: str = Field("none", description="wema: smooth poses")

@@ -1,4 +1,7 @@
-"""The metric anchor: converts a depth estimate of any kind to mm, fitted once, on the first frame (MAPIS steps 1-4)."""
+"""The metric anchor: converts a depth estimate of any kind to mm, fitted once, on the first frame.
+
+With Depth Pro as the anchor of disparity: equation 1 of arXiv 2508.11282 (MAPIS-Depth).
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""MAPIS: depth that keeps its scale from frame to frame (METHOD section MAPIS-Depth, steps 5-8).
+"""MAPIS: depth that keeps its scale from frame to frame.
 
-The previous depth is warped along the flow, filtered, and blended with the current estimate by a weight from their
-perceptual distance, by the paper's text; `blend = "paper-equation"` does the reverse. The weight's odds are multiplied
+Equations 2 to 4 of arXiv 2508.11282, section "MAPIS-Depth Module": the previous depth is warped along the flow,
+filtered (2), and blended (4) with the current estimate by a weight from their perceptual distance (3), by the paper's
+text; `blend = "paper-equation"` takes equation 4 literally, which does the reverse. The weight's odds are multiplied
 by the ratio of inverse variances, where known.
 """
 
@@ -91,7 +92,7 @@ class _Propagated(NamedTuple):
 
 
 class Mapis:
-    """Refines the raw depth of frames in order; `reset` starts a new chain after a lost frame."""
+    """Refines the raw depth of frames in order (equations 2 to 4); `reset` starts a new chain after a lost frame."""
 
     _propagated: Kept[_Propagated | None] = None
     _scale: Kept[float] = 1.0
@@ -184,7 +185,7 @@ class Mapis:
         return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.sigma_fading))
 
     def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
-        """Weight of the warped depth, (H, W) float32 in 0..1, from the perceptual distance S."""
+        """Weight of the warped depth in equation 4, (H, W) float32 in 0..1, from the perceptual distance S."""
         match blend:
             case "exponential":
                 return np.exp(-distance / np.float32(self.settings.tau))

@@ -51,7 +51,10 @@ class StructureDistance:
 
 
 class LpipsAlex:
-    """LPIPS(AlexNet), version 0.1, per pixel; `checkpoint` is a file with torchvision's names, or `WeightsError`."""
+    """LPIPS(AlexNet), version 0.1, per pixel (equation 3 of arXiv 2508.11282).
+
+    checkpoint : a file with torchvision's names, or `WeightsError`.
+    """
 
     name = "lpips"
 

@@ -1,4 +1,7 @@
-"""From relative disparity to metric depth: pseudo-stereo baseline and robust affine fit (arXiv 2508.11282)."""
+"""From relative disparity to metric depth: pseudo-stereo baseline and robust affine fit.
+
+The baseline is equation 1 of arXiv 2508.11282; the fit with a shift is not in the paper.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ class AffineDisparity:
 def fit_baseline_lbfgsb(
     depth_mm: np.ndarray, disparity: np.ndarray, focal_px: float, floor_share: float = 0.0
 ) -> float:
-    """Return the baseline B (mm) that minimises the mean of (D - f B / d)^2, found as in the paper, by L-BFGS-B.
+    """Return the baseline B (mm) that minimises the mean of (D - f B / d)^2 (equation 1), by L-BFGS-B.
 
     depth_mm, disparity : arrays of one shape; pixels that are not finite and positive are left out.
     floor_share : pixels below this share of the largest disparity are left out, too: f / d of d near 0 would dominate

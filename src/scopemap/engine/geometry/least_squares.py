@@ -1,9 +1,10 @@
 """Robust nonlinear least squares: one trust-region minimiser, robust kernels and robust scale estimates.
 
-Powell's dog-leg, METHOD section WEMA-RTDL: the Gauss-Newton step if within radius rho; else the steepest descent step
-cut to rho if h |p_sd| > rho, h = |p_sd|^2 / |J p_sd|^2; else where the line from the Cauchy point to the Gauss-Newton
-step leaves the ball. Radius: Nocedal and Wright, "Numerical Optimization", algorithm 4.1. `SchurModel` eliminates
-points (Lourakis and Argyros, ICCV 2005; Triggs et al., "Bundle Adjustment", 2000, 6.1).
+Powell's dog-leg, equations 7 to 9 of arXiv 2508.11282: the Gauss-Newton step (7) if within radius rho; else the
+steepest descent step (8) cut to rho if h |p_sd| > rho, h = |p_sd|^2 / |J p_sd|^2 (the paper compares |p_sd|); else
+where the line from the Cauchy point to the Gauss-Newton step leaves the ball (9). Radius: Nocedal and Wright,
+"Numerical Optimization", algorithm 4.1. `SchurModel` eliminates points (Lourakis and Argyros, ICCV 2005; Triggs et al.,
+"Bundle Adjustment", 2000, 6.1).
 """
 
 from __future__ import annotations

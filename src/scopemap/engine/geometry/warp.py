@@ -108,7 +108,10 @@ def resampled(values: np.ndarray, camera: PinholeCamera) -> np.ndarray:
 
 
 def bilateral_filtered(depth_mm: np.ndarray, sigma_px: float, sigma_mm: float) -> np.ndarray:
-    """Smooth depth (H, W) float32 within surfaces, not across edges; NaN pixels stay NaN and do not count."""
+    """Smooth depth (H, W) float32 within surfaces, not across edges (equation 2 of arXiv 2508.11282).
+
+    NaN pixels stay NaN and do not count.
+    """
     known = np.isfinite(depth_mm)
     if sigma_px <= 0 or not known.any():
         return depth_mm

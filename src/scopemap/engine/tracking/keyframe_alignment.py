@@ -90,7 +90,7 @@ class MotionModel:
 
 
 class KeyframeAligner:
-    """Aligns frames with keyframes: by the keyframe's corners, else photometrically (METHOD section WEMA-RTDL).
+    """Aligns frames with keyframes: by the keyframe's corners, else photometrically (`rtdl.py`).
 
     flow : matches the corners; None: they are not used. motion : where alignments start, and from where a pose may not
     jump.
@@ -122,12 +122,13 @@ class KeyframeAligner:
         by_corners = self.by_corners(keyframe, frame, inverse(self._motion.T_world_last) @ keyframe.T_world_camera)
         if by_corners is not None and self.rejection(keyframe, by_corners) is None:
             return by_corners, None
-        pyramid, starts = self.pyramid(keyframe, frame), self._motion.predictions()
+        pyramid, predicted = self.pyramid(keyframe, frame), self._motion.predictions()
+        starts = [inverse(T) @ keyframe.T_world_camera for T in predicted]
         if self._settings.start == "identity" and len(starts) == 1:
-            starts = [keyframe.T_world_camera]
+            starts = [np.eye(4)]
         searched = self.has_corners(keyframe) and self._settings.relocalisation_keyframes > 0
         found = []
-        for T_start in (inverse(T) @ keyframe.T_world_camera for T in starts):
+        for T_start in starts:
             judged = judge(keyframe.pyramid, pyramid, Motion(T_start, np.array([1.0, 0.0])))
             if not searched or self.rejection(keyframe, judged) is None:
                 judged = align(keyframe.pyramid, pyramid, T_start, self._settings)

@@ -4,13 +4,14 @@ For a reference pixel p with depth, X = depth * ray(p) and X' = T_current_refere
 
     r_c(p) = C_c(project(X')) - (gain * L(p) * R_c(p) + bias),      L(p) = ((cos' / cos) (|X| / |X'|)^2)^gamma
 
-R, C are the reference and the current image; C is sampled bilinearly, and its gradient is the exact derivative of that
-interpolation, so that Jacobians agree with finite differences. L is the change of brightness by the lamp, which
-moves with the camera (cos: of incidence; gamma: of the image's tone curve). With the tangent plane m . X = 1 it is
-cos' / cos = (1 + m . R^T t) |X| / |X'|; m follows from the gradient of inverse depth. A locally normalised channel
-is independent of illumination: it has neither gain nor bias nor L. Parameters of the normal equations, in
-this order: rotation (3, rad) and translation (3, in units of `unit_mm`) of a perturbation exp(xi) T_current_reference,
-gain, bias.
+(equation 5 of arXiv 2508.11282, whose p' is project(X'); gain, bias and L are ours, and so is the depth of the
+reference in X). R, C are the reference and the current image; C is sampled bilinearly, and its gradient is the exact
+derivative of that interpolation, so that Jacobians agree with finite differences. L is the change of brightness by the
+lamp, which moves with the camera (cos: of incidence; gamma: of the image's tone curve). With the tangent plane m . X =
+1 it is cos' / cos = (1 + m . R^T t) |X| / |X'|; m follows from the gradient of inverse depth. A locally normalised
+channel is independent of illumination: it has neither gain nor bias nor L. Parameters of the normal equations, in this
+order: rotation (3, rad) and translation (3, in units of `unit_mm`) of a perturbation exp(xi) T_current_reference, gain,
+bias.
 
 Where the current depth D is measured, a geometric residual is added: the distance from X' to the tangent plane of D
 at project(X'), over `unit_mm` (point to plane: Chen and Medioni, 1992, with projective data association):

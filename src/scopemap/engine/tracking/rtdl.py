@@ -1,4 +1,8 @@
-"""RTDL: rotation first, then the whole motion, by dog-leg on a keyframe's photometric residuals, coarse to fine."""
+"""RTDL: rotation first, then the whole motion, by dog-leg on a keyframe's photometric residuals, coarse to fine.
+
+Equations 5 to 12 of arXiv 2508.11282, section "WEMA-RTDL module". `residuals.py` has the photometric error (5) and its
+Jacobian, `least_squares.py` the dog-leg step (7 to 9). Steps are composed on the group, where the paper adds (10, 12).
+"""
 
 from __future__ import annotations
 
@@ -69,7 +73,10 @@ class Alignment:
 
 
 def align(reference: list[View], current: list[View], T_start: np.ndarray, settings: TrackingSettings) -> Alignment:
-    """Return the alignment of two pyramids (finest level first), from the first guess `T_start` (4, 4)."""
+    """Return the alignment of two pyramids (finest level first), from the first guess `T_start` (4, 4).
+
+    The coarsest level turns the camera (equation 10); the finer ones start from that rotation (6) and move it (12).
+    """
     motion, iterations, coarse = Motion(T_start, np.array([1.0, 0.0])), 0, math.inf
     depth = reference[-1].depth_mm
     unit_mm = float(np.nanmean(depth)) if np.isfinite(depth).any() else 1.0

@@ -1,8 +1,8 @@
 """WEMA: the weighted mean of the last poses, on the group.
 
-METHOD section WEMA: x_reg = s (alpha x_i + beta x_{i-1} + gamma x_{i-2}) + (1 - s) x_i, s = 1 - exp(-i omega). Poses
-do not add: the mean is taken in the tangent space at the newest pose. The earlier poses are the estimated ones, and
-the tracker does not use the smoothed poses. The mean lags behind a moving camera (see BENCHMARK.md).
+Equation 13 of arXiv 2508.11282: x_reg = s (alpha x_i + beta x_{i-1} + gamma x_{i-2}) + (1 - s) x_i, s = 1 -
+exp(-i omega). Poses do not add: the mean is taken in the tangent space at the newest pose. The earlier poses are the
+estimated ones, and the tracker does not use the smoothed ones. The mean lags behind a moving camera (BENCHMARK.md).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scopemap.engine.kept import Kept
 
 
 class Wema:
-    """Weighted exponential moving average of the last three poses; without effect where `settings.method` is "none"."""
+    """Weighted exponential moving average of three poses (equation 13); no effect where `settings.method` is "none"."""
 
     _past: Kept[list[np.ndarray]]
     _count: Kept[int] = 0

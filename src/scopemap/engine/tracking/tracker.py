@@ -105,7 +105,7 @@ class Tracker(FrameTracker):
     The first usable frame fixes the world. A frame's pose has the least reprojection error of the keyframe's corners,
     matched by `flow`, and is judged photometrically. Where it is rejected and where too few corners are matched,
     features find the frame in the keyframes most like it. Where the keyframe's depth is measured, the pose comes from
-    photometric alignment (METHOD section WEMA-RTDL). A lost frame is recorded with the reason; the next one is aligned
+    photometric alignment (`rtdl.py`). A lost frame is recorded with the reason; the next one is aligned
     from the last pose, from the extrapolated one, and relocalised in recent keyframes. After several sharp frames lost
     in a row a new map begins, with its own world; later relocalisation may lead back to an older map.
     """
