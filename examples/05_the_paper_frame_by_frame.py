@@ -21,11 +21,11 @@ import numpy as np
 from scopemap import Config, Frame, open_sequence
 from scopemap.engine.config import SmoothingSettings
 from scopemap.engine.depth.pseudo_stereo import AffineDisparity, fit_baseline_lbfgsb
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
 from scopemap.engine.geometry.least_squares import DenseModel, Options, Problem, minimise, robust_sigma
 from scopemap.engine.geometry.se3 import inverse, mean_near, orthonormalised, se3_exp
 from scopemap.engine.geometry.warp import bilateral_filtered, pull
-from scopemap.engine.preprocessing import Estimators
 from scopemap.engine.tracking.pyramid import build_pyramid
 from scopemap.engine.tracking.residuals import Loss, View, normal_equations, residual_images
 from scopemap.runner.estimators import create_estimators
