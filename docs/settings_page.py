@@ -20,7 +20,7 @@ _ADVANCED = """
 ## Advanced settings
 
 The constants of the stages. They are set as the others are: `--set tracking.huber=2`. The last column says where the
-default comes from. METHOD is [arXiv 2508.11282](https://arxiv.org/abs/2508.11282), which publishes none of its
+default comes from. The paper is [arXiv 2508.11282](https://arxiv.org/abs/2508.11282), which publishes none of its
 constants; "by hand" is a value that was chosen without a search that is on record.
 
 | setting | default | meaning | default from |

@@ -50,7 +50,7 @@ class DepthSettings(StageSettings):
     )
 
     reanchor_every: NonNegativeInt = advanced(
-        0, "fit the metric anchor every n-th frame, best a multiple of keyframe_every; 0: once", "METHOD: once"
+        0, "fit the metric anchor every n-th frame, best a multiple of keyframe_every; 0: once", "the paper: once"
     )
     shading_exponent: Annotated[float, Field(gt=0, le=1)] = advanced(
         0.6,
@@ -72,7 +72,7 @@ class DepthSettings(StageSettings):
         "Depth Pro's formula, depth = f / (W c)",
     )
     network_every: PositiveInt = advanced(
-        1, "the network looks at every n-th frame; flow carries its depth to those between", "METHOD: every frame"
+        1, "the network looks at every n-th frame; flow carries its depth to those between", "the paper: every frame"
     )
     factor: PositiveFloat = advanced(
         30.0, "anchor = factor: the nearest tissue of frame 1 is at 1000 mm / factor", "table 3 of the paper"
@@ -117,10 +117,10 @@ class MapisSettings(StageSettings):
         0.3, "growth of the warped depth's variance per frame, share of its gap to the frame's", "by hand"
     )
     filter_sigma_px: NonNegativeFloat = advanced(
-        2.0, "sigma_d of the bilateral filter; 0: off", "plausible, not searched; METHOD gives none"
+        2.0, "sigma_d of the bilateral filter; 0: off", "plausible, not searched; the paper gives none"
     )
     filter_sigma_mm: PositiveFloat = advanced(
-        2.0, "sigma_r of the bilateral filter", "plausible, not searched; METHOD gives none"
+        2.0, "sigma_r of the bilateral filter", "plausible, not searched; the paper gives none"
     )
     consistency_px: NonNegativeFloat = advanced(
         1.0, "largest forward-backward error of flow; 0: not checked (the paper)", "by hand"
@@ -135,10 +135,10 @@ class MapisSettings(StageSettings):
         "auto",
         "weight of the warped depth, with the perceptual distance S; linear: 1 - S; exponential: exp(-S / tau); "
         "paper-equation: S; auto: linear for predicted depth, none for measured",
-        "linear: METHOD section MAPIS-Depth, by its text; better than exponential wherever it was tried",
+        "linear: the paper's section MAPIS-Depth, by its text; better than exponential wherever it was tried",
     )
     tau: PositiveFloat = advanced(
-        0.15, "exponential blend: distance at which the weight is 1/e", "plausible, not searched; METHOD gives none"
+        0.15, "exponential blend: distance at which the weight is 1/e", "plausible, not searched; the paper gives none"
     )
     constant_weight: Share = advanced(
         0.5, "constant blend: weight of the warped depth", "by hand, for the ablation without LPIPS"

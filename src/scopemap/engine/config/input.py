@@ -113,13 +113,13 @@ class MaskSettings(StageSettings):
     )
 
     field_of_view: bool = advanced(
-        True, "find the circular or octagonal field of view and black borders", "by hand; METHOD has none"
+        True, "find the circular or octagonal field of view and black borders", "by hand; the paper has none"
     )
-    highlights: bool = advanced(True, "find specular highlights and mask them", "by hand; METHOD has none")
+    highlights: bool = advanced(True, "find specular highlights and mask them", "by hand; the paper has none")
     overlays: bool = advanced(
-        True, "find burned-in text and logos, which stay while the rest moves", "by hand; METHOD has none"
+        True, "find burned-in text and logos, which stay while the rest moves", "by hand; the paper has none"
     )
-    exposure: bool = advanced(True, "mask under-exposed and over-exposed pixels", "by hand; METHOD has none")
+    exposure: bool = advanced(True, "mask under-exposed and over-exposed pixels", "by hand; the paper has none")
     dark_level: Annotated[int, Field(ge=0, le=255)] = advanced(
         12, "grey level up to which a pixel counts as under-exposed", "by hand"
     )

@@ -47,7 +47,7 @@ class MappingSettings(StageSettings):
         "by hand",
     )
     local_gaps: Gaps = advanced((1, 2), "there a keyframe's corners are matched in those so many before", "by hand")
-    global_adjustment: bool = advanced(True, "adjust all keyframes after the last frame", "by hand; METHOD has none")
+    global_adjustment: bool = advanced(True, "adjust all keyframes after the last frame", "by hand; the paper has none")
     correlated_observations: Annotated[float, Field(ge=1)] = advanced(
         4.0, "so many observations count as one: errors of flow are alike at neighbouring corners", "by hand"
     )

@@ -85,7 +85,7 @@ class TrackingSettings(StageSettings):
     keyframe_patience: NonNegativeInt = advanced(
         3, "frames that a keyframe waits longer where the picture is not clear", "by hand"
     )
-    levels: PositiveInt = advanced(5, "levels of the image pyramid, factor 0.5", "METHOD section WEMA-RTDL")
+    levels: PositiveInt = advanced(5, "levels of the image pyramid, factor 0.5", "the paper's section WEMA-RTDL")
     finest_level: Annotated[int, Field(ge=0, le=3)] = advanced(1, "0: full working size, 1: half", _CHOSEN)
     max_iterations: PositiveInt = advanced(30, "steps per pyramid level", "by hand")
     huber: PositiveFloat = advanced(
@@ -104,10 +104,12 @@ class TrackingSettings(StageSettings):
     )
     max_step: PositiveFloat = advanced(0.5, "largest motion between frames: rad, and mm over mean depth", "by hand")
     solver: Literal["dogleg", "gauss-newton"] = advanced(
-        "dogleg", "minimiser of the photometric error", "METHOD section WEMA-RTDL, subsection Optimisation"
+        "dogleg", "minimiser of the photometric error", "the paper's section WEMA-RTDL, subsection Optimisation"
     )
     rotation_first: bool = advanced(
-        True, "SO(3) only at the coarsest level", "METHOD section WEMA-RTDL, subsection Rotation-Translation Decoupling"
+        True,
+        "SO(3) only at the coarsest level",
+        "the paper, Rotation-Translation Decoupling",
     )
     start: Literal["identity", "previous"] = advanced(
         "previous", "first guess: the keyframe's pose, or the previous frame's", "by hand"
@@ -129,13 +131,13 @@ class SmoothingSettings(StageSettings):
     METHODS: ClassVar[Methods] = {"none": {}, "wema": {}}
     method: str = Field("none", description="wema: smooth poses")
 
-    alpha: Share = advanced(0.6, "weight of pose i", "plausible, not searched; METHOD gives none")
-    beta: Share = advanced(0.3, "weight of pose i-1", "plausible, not searched; METHOD gives none")
-    gamma: Share = advanced(0.1, "weight of pose i-2", "plausible, not searched; METHOD gives none")
+    alpha: Share = advanced(0.6, "weight of pose i", "plausible, not searched; the paper gives none")
+    beta: Share = advanced(0.3, "weight of pose i-1", "plausible, not searched; the paper gives none")
+    gamma: Share = advanced(0.1, "weight of pose i-2", "plausible, not searched; the paper gives none")
     omega: PositiveFloat = advanced(
-        0.1, "s = 1 - exp(-i omega); frames count from 0", "plausible, not searched; METHOD gives none"
+        0.1, "s = 1 - exp(-i omega); frames count from 0", "plausible, not searched; the paper gives none"
     )
-    dynamic: bool = advanced(True, "false: s = 1 (the paper's ablation without DyEMA)", "METHOD section WEMA")
+    dynamic: bool = advanced(True, "false: s = 1 (the paper's ablation without DyEMA)", "the paper's section WEMA")
 
     @model_validator(mode="after")
     def _weights_sum_to_one(self) -> SmoothingSettings:

@@ -21,7 +21,7 @@ from scopemap.engine.kept import Kept
 _MIN_SHARE = 0.02  # by hand
 _MIN_SHARE_NOTED = 0.005  # by hand: a smaller share beyond the largest depth is not mentioned
 _MAX_SHARE_BEYOND = 0.5  # by hand: of the depth that may be beyond the limit without a note
-_FACTOR_MM = 1000.0  # `depth.factor` divides it, as in table 3 of METHOD's paper
+_FACTOR_MM = 1000.0  # `depth.factor` divides it, as in table 3 of the paper
 # Longest side of most images that scopenet was trained on: at twice the size it needs four times as long, and surfaces
 # are less consistent.
 _SCOPENET_PX = 160

@@ -18,7 +18,7 @@ from scopemap.engine.tracking.residuals import View
 _GREY_UNIT = 32.0
 _SLOPE_SIGMA_PX = 1.5  # by hand: of the smoothing of depth before its slope is measured
 _NORMALISE_SIGMA_PX = 2.0  # chosen on cecum_t1_a (C3VD) and four phantoms: of the local mean and deviation
-_MIN_SIDE_PX = 16  # METHOD section WEMA-RTDL: no level is smaller
+_MIN_SIDE_PX = 16  # the paper's section WEMA-RTDL: no level is smaller
 _NOISE_LEVEL = 2.0  # by hand: grey levels of local deviation below which an area counts as flat
 
 

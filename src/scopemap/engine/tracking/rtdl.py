@@ -30,7 +30,7 @@ _INLIER = 0.5  # by hand: residual of an inlier, in units of the normalised chan
 _MIN_SIGMA = 1e-3  # guard: division by zero in flat images
 _MIN_DEPTH_SIGMA = 1e-3  # guard: of the distance to measured depth, share of the keyframe's mean depth
 _GREY_SHARE = 0.3  # by hand: weight of the grey channel against the normalised one
-_RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth; METHOD gives none, not searched
+_RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth; the paper gives none, not searched
 
 
 class Motion(NamedTuple):
