@@ -7,6 +7,7 @@ import shutil
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 from drawn_benchmarks import as_hamlyn, as_scared, as_scared_c, seen
 from front_door import call
@@ -18,6 +19,7 @@ from scopemap.engine.models.weights import REGISTRY
 from scopemap.input.opening import open_sequence
 from scopemap_bench import runner
 from scopemap_bench.comparison import FinishedRun, frame_pair, write_results
+from scopemap_bench.datasets.scared import ScaredKeyframe
 from scopemap_bench.entry import Entry
 from scopemap_bench.plan import Plan, found_sequences, read_plan
 from scopemap_bench.result import RunResult
@@ -112,6 +114,28 @@ def test_scared_runs_to_the_last_row_and_figure(data: Path, tmp_path: Path, monk
     table = list(csv.DictReader((tmp_path / "tables" / "table2.csv").open()))
     assert [row["framework"] for row in table if row["source"] == "measured"] == list(rows)
     assert {row["depth"] for row in table if row["framework"] == "paper's preset"} == {PAPERS_DEPTH}
+
+
+def test_the_truth_of_a_frame_is_read_once_for_all_methods_and_measures(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A keyframe's scene points are gigabytes in an archive; two rows measure depth, surface and consistency of it."""
+    use_weights(data / "weights", monkeypatch)
+    read: list[int] = []
+    depth_of = ScaredKeyframe._depth_mm
+
+    def counted(source: ScaredKeyframe, index: int) -> np.ndarray | None:
+        read.append(index)
+        return depth_of(source, index)
+
+    monkeypatch.setattr(ScaredKeyframe, "_depth_mm", counted)
+    plan = only("scared", "dataset_2/keyframe_[1-4]")
+    protocol = plan.protocol.model_copy(update={"consistency": True, "contradiction": True, "flow": "dis"})
+    few = tuple(m for m in plan.method if m.name in ("scopemap", "standing still"))
+    rows, _ = run(plan.model_copy(update={"method": few, "protocol": protocol}), data / "scared", tmp_path, monkeypatch)
+    assert [row.status for row in rows] == ["done", "done"]
+    assert all(row.figure("depth", "abs_rel") > 0 for row in rows)
+    assert sorted(read) == [0, 1, 2]
 
 
 def test_ablations_and_scared_c_run_to_the_last_row(

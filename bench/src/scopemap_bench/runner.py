@@ -1,6 +1,6 @@
 """Runs a plan, each entry in a process of its own, with a time limit; a second call continues an interrupted one.
 
-OUT/runs/SEQUENCE/METHOD/{entry.json, run/, result.json, log.txt}    OUT/phantoms/    OUT/flows/
+OUT/runs/SEQUENCE/METHOD/{entry.json, run/, result.json, log.txt}    OUT/phantoms/    OUT/flows/    OUT/truths/
 
 A method may use all memory, crash in foreign code or call exit: its row says so and the benchmark continues. The
 process of an entry is `python -m scopemap_bench.runner ENTRY.json`, so peak memory is its own. `describe` tells what a
@@ -183,7 +183,7 @@ def run_entry(entry: Entry) -> RunResult:
         sequence = entry.open()
         timing = method_of(entry).run(sequence, entry.shared_settings(), entry.run_folder)
         memory_mb = _peak_memory_mb()
-        figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows)
+        figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows, entry.truths)
     except ScopemapError as error:
         return _without_figures(entry, "failed", str(error))
     return RunResult(
@@ -299,9 +299,10 @@ def _depth_of(entry: Entry) -> str:
 
 def _quality_of_truth(sequence: Sequence) -> str:
     """Return the source of the true poses ("exact", "kinematic", ...), "" where there are none."""
-    stamps = sequence.source.stamps(sequence.selection)
-    truth = sequence.source.truth(stamps[0][0]) if stamps else None
-    return truth.quality if truth else ""
+    source, stamps = sequence.source, sequence.source.stamps(sequence.selection)
+    # Depth of a frame may take an archive's decompression to read.
+    known = stamps and (source.pose(stamps[0][0]) is not None or source.truth(stamps[0][0]) is not None)
+    return source.quality if known else ""
 
 
 def _peak_memory_mb() -> float:
