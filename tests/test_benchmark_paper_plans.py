@@ -14,6 +14,7 @@ from front_door import call
 from small_networks import use_weights, write_weights
 from tiny_phantom import write_tiny
 
+from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError
 from scopemap.engine.models.weights import REGISTRY
 from scopemap.input.opening import open_sequence
@@ -21,6 +22,7 @@ from scopemap_bench import runner
 from scopemap_bench.comparison import FinishedRun, frame_pair, write_results
 from scopemap_bench.datasets.scared import ScaredKeyframe
 from scopemap_bench.entry import Entry
+from scopemap_bench.forecast import Pace, measured_pace
 from scopemap_bench.plan import Plan, found_sequences, read_plan
 from scopemap_bench.result import RunResult
 from scopemap_bench.runner import run_entry, run_plan
@@ -204,6 +206,7 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
+    monkeypatch.setattr(runner, "measured_pace", lambda: Pace(once_s=30.0, ratio=2.0))
     refused = tmp_path / REGISTRY["raft-large"].place
     refused.write_bytes(b"half a download")
     assert call("bench", "scared", "--data", data / "scared", "--dry-run") == 0
@@ -215,14 +218,31 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     ]
     rows = dict(line.strip().split(": ", 1) for line in lines[3:] if line.startswith("  "))
     assert set(rows) == {method.name for method in read_plan("scared").method}
-    assert rows["scopemap"] == "1 min"
-    assert rows["MDE (per-frame Depth Pro)"] == "needs weights: depth-pro (scopemap models pull NAME)"
+    assert rows["scopemap"] == "2 min"
+    assert (
+        rows["MDE (per-frame Depth Pro)"]
+        == "needs weights: depth-pro (scopemap models pull NAME); 22 min when they are there"
+    )
     assert rows["paper's preset"].startswith("needs weights: depth-anything, depth-pro, raft-large (damaged), alexnet")
     assert rows["OneSLAM"].count(" min; not supplied: ") == 1
     assert "weights that are missing or damaged: alexnet, depth-anything, depth-pro, raft-large (damaged)" in lines
     assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about ")
+    assert "on this machine's processors, with what is missing " in lines[-1]
     assert list(tmp_path.iterdir()) == [refused]
     copy = Path(shutil.copytree(data / "scared", tmp_path / "scared"))
     (copy / "dataset_1/keyframe_1/data/rgb.mp4").write_bytes(b"half a download")
     assert call("bench", "scared", "--data", copy, "--dry-run") == 0
     assert "  dataset_1/keyframe_1: reading the video " in capfd.readouterr().out
+
+
+def test_a_machine_is_measured_by_a_run_of_its_own() -> None:
+    pace = measured_pace()
+    assert pace.once_s > 0.5
+    assert 0.05 < pace.ratio < 50
+    config = Config()
+    short, long = (pace.seconds(config, frames, 320 * 256, surface=False) for frames in (0, 100))
+    assert short == pytest.approx(pace.once_s)
+    # A frame of default takes 0.19 s on the machine of the ratios, and its measures 0.06 s.
+    assert long - short == pytest.approx(100 * pace.ratio * (0.24 * 0.64 + 0.05 + 0.064), rel=0.05)
+    strict = Config.load("paper")
+    assert pace.seconds(strict, 100, 320 * 256, surface=True) > 3 * long
