@@ -7,18 +7,22 @@ import shutil
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 from drawn_benchmarks import as_hamlyn, as_scared, as_scared_c, seen
 from front_door import call
 from small_networks import use_weights, write_weights
 from tiny_phantom import write_tiny
 
+from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError
 from scopemap.engine.models.weights import REGISTRY
 from scopemap.input.opening import open_sequence
 from scopemap_bench import runner
 from scopemap_bench.comparison import FinishedRun, frame_pair, write_results
+from scopemap_bench.datasets.scared import ScaredKeyframe
 from scopemap_bench.entry import Entry
+from scopemap_bench.forecast import Pace, measured_pace
 from scopemap_bench.plan import Plan, found_sequences, read_plan
 from scopemap_bench.result import RunResult
 from scopemap_bench.runner import run_entry, run_plan
@@ -114,6 +118,28 @@ def test_scared_runs_to_the_last_row_and_figure(data: Path, tmp_path: Path, monk
     assert {row["depth"] for row in table if row["framework"] == "paper's preset"} == {PAPERS_DEPTH}
 
 
+def test_the_truth_of_a_frame_is_read_once_for_all_methods_and_measures(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A keyframe's scene points are gigabytes in an archive; two rows measure depth, surface and consistency of it."""
+    use_weights(data / "weights", monkeypatch)
+    read: list[int] = []
+    depth_of = ScaredKeyframe._depth_mm
+
+    def counted(source: ScaredKeyframe, index: int) -> np.ndarray | None:
+        read.append(index)
+        return depth_of(source, index)
+
+    monkeypatch.setattr(ScaredKeyframe, "_depth_mm", counted)
+    plan = only("scared", "dataset_2/keyframe_[1-4]")
+    protocol = plan.protocol.model_copy(update={"consistency": True, "contradiction": True, "flow": "dis"})
+    few = tuple(m for m in plan.method if m.name in ("scopemap", "standing still"))
+    rows, _ = run(plan.model_copy(update={"method": few, "protocol": protocol}), data / "scared", tmp_path, monkeypatch)
+    assert [row.status for row in rows] == ["done", "done"]
+    assert all(row.figure("depth", "abs_rel") > 0 for row in rows)
+    assert sorted(read) == [0, 1, 2]
+
+
 def test_ablations_and_scared_c_run_to_the_last_row(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,6 +206,7 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
+    monkeypatch.setattr(runner, "measured_pace", lambda: Pace(once_s=30.0, ratio=2.0))
     refused = tmp_path / REGISTRY["raft-large"].place
     refused.write_bytes(b"half a download")
     assert call("bench", "scared", "--data", data / "scared", "--dry-run") == 0
@@ -191,14 +218,31 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     ]
     rows = dict(line.strip().split(": ", 1) for line in lines[3:] if line.startswith("  "))
     assert set(rows) == {method.name for method in read_plan("scared").method}
-    assert rows["scopemap"] == "1 min"
-    assert rows["MDE (per-frame Depth Pro)"] == "needs weights: depth-pro (scopemap models pull NAME)"
+    assert rows["scopemap"] == "2 min"
+    assert (
+        rows["MDE (per-frame Depth Pro)"]
+        == "needs weights: depth-pro (scopemap models pull NAME); 22 min when they are there"
+    )
     assert rows["paper's preset"].startswith("needs weights: depth-anything, depth-pro, raft-large (damaged), alexnet")
     assert rows["OneSLAM"].count(" min; not supplied: ") == 1
     assert "weights that are missing or damaged: alexnet, depth-anything, depth-pro, raft-large (damaged)" in lines
     assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about ")
+    assert "on this machine's processors, with what is missing " in lines[-1]
     assert list(tmp_path.iterdir()) == [refused]
     copy = Path(shutil.copytree(data / "scared", tmp_path / "scared"))
     (copy / "dataset_1/keyframe_1/data/rgb.mp4").write_bytes(b"half a download")
     assert call("bench", "scared", "--data", copy, "--dry-run") == 0
     assert "  dataset_1/keyframe_1: reading the video " in capfd.readouterr().out
+
+
+def test_a_machine_is_measured_by_a_run_of_its_own() -> None:
+    pace = measured_pace()
+    assert pace.once_s > 0.5
+    assert 0.05 < pace.ratio < 50
+    config = Config()
+    short, long = (pace.seconds(config, frames, 320 * 256, surface=False) for frames in (0, 100))
+    assert short == pytest.approx(pace.once_s)
+    # A frame of default takes 0.19 s on the machine of the ratios, and its measures 0.06 s.
+    assert long - short == pytest.approx(100 * pace.ratio * (0.24 * 0.64 + 0.05 + 0.064), rel=0.05)
+    strict = Config.load("paper")
+    assert pace.seconds(strict, 100, 320 * 256, surface=True) > 3 * long

@@ -62,6 +62,35 @@ def test_an_archive_in_any_order_is_read_by_number(tmp_path: Path) -> None:
     assert find(tmp_path).stored() == order
 
 
+@pytest.mark.parametrize("first", ["nothing", "numbers"])
+@pytest.mark.parametrize("order", ["ascending", "descending", "shuffled"])
+def test_an_archive_is_decompressed_once_whatever_its_order(
+    order: str, first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = members(30, 5000)
+    names = {"ascending": list(files), "descending": list(files)[::-1]}.get(order)
+    names = names or [list(files)[n] for n in np.random.default_rng(0).permutation(30)]
+    write_tar(tmp_path / "points.tar.gz", {name: files[name] for name in names})
+    rewinds = []
+    rewind = gzip._GzipReader._rewind  # type: ignore[attr-defined]
+    monkeypatch.setattr(gzip._GzipReader, "_rewind", lambda self: (rewinds.append(1), rewind(self)))  # type: ignore[attr-defined]
+    found = find(tmp_path)
+    if first == "numbers":
+        assert found.numbers() == list(range(30))
+    for passes in (1, 2):
+        assert [found.read(n) for n in range(30)] == list(files.values())
+        # Once more for each time that it is read, and for the headers.
+        assert len(rewinds) <= passes - 1 + (first == "numbers") + 1
+    assert [file.name for file in tmp_path.iterdir()] == ["points.tar.gz"]
+
+
+def test_frames_that_are_left_out_do_not_wait_anywhere(tmp_path: Path) -> None:
+    write_tar(tmp_path / "points.tar.gz", members(40))
+    found = find(tmp_path)
+    assert all(found.read(n) for n in range(0, 40, 10))
+    assert found._spool is None  # type: ignore[union-attr]
+
+
 def test_reading_keeps_nothing_in_memory_and_writes_nothing(tmp_path: Path) -> None:
     write_tar(tmp_path / "points.tar.gz", members(32, MB // 4))
     found = find(tmp_path)

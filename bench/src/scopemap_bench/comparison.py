@@ -18,7 +18,7 @@ import pandas as pd
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import MaskSettings
 from scopemap.engine.errors import AlignmentError, InputError
-from scopemap.engine.frame import Frame, Truth
+from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.se3 import inverse, se3, transform
 from scopemap.engine.masking.masker import Masker
@@ -137,7 +137,7 @@ def _pair_medians(result: RunResult, poses: str) -> np.ndarray:
 
 def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, folder: Path) -> Iterator[Path]:
     """Draw two frames: their depth, their clouds by each method's poses, ORB's matches in space and as bars."""
-    (previous, true_previous), (current, true_current) = frame_pair(frames, runs[0].figure.frame)
+    (previous, T_previous), (current, T_current) = frame_pair(frames, runs[0].figure.frame)
     depths, own_poses = {}, {}
     for run in runs[:_MAX_DEPTHS]:
         reader, scale = DepthReader(run.folder), run.result.figure("consistency", "scale")
@@ -162,7 +162,6 @@ def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, fold
     correspondence = matcher.match(current.rgb, current.valid)
     if correspondence is None:
         return
-    T_previous, T_current = (None if truth is None else truth.T_world_camera for truth in (true_previous, true_current))
     where = "estimated" if T_previous is None or T_current is None else "reference"
     if T_previous is not None and T_current is not None:
         posed = dict.fromkeys(depths, (T_previous, T_current))
@@ -202,13 +201,16 @@ def _clouds(
     return points, np.concatenate([image[k] for image, k in zip(images, known, strict=True)])
 
 
-def frame_pair(frames: Frames, wanted: int | None) -> list[tuple[Frame, Truth | None]]:
-    """Return the frame of number `wanted` (None: in the middle) after the one before it, masked as for the measures."""
+def frame_pair(frames: Frames, wanted: int | None) -> list[tuple[Frame, np.ndarray | None]]:
+    """Return the frame of number `wanted` (None: in the middle) after the one before it, each with its true pose.
+
+    They are masked as for the measures.
+    """
     stamps = frames.source.stamps(frames.selection) or []
     masker = Masker(MaskSettings())
-    last: list[tuple[Frame, Truth | None]] = []
-    for place, (frame, truth) in enumerate(frames):
-        last = [*last[-1:], (masker(frame), truth)]
+    last: list[tuple[Frame, np.ndarray | None]] = []
+    for place, frame in enumerate(frames.frames()):
+        last = [*last[-1:], (masker(frame), frames.source.pose(frame.index))]
         if place and (place > len(stamps) // 2 if wanted is None else frame.index >= wanted):
             break
     if len(last) < 2 or wanted not in (None, last[-1][0].index):

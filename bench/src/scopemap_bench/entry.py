@@ -66,6 +66,12 @@ class Entry(BaseModel):
         return self.out / "flows" / f"{folder_name(self.label)}-{_digest([described])[:8]}"
 
     @property
+    def truths(self) -> Path:
+        """Folder of the true depth at the working size that all methods of this sequence are measured with."""
+        described = self.sequence.model_dump(mode="json", exclude={"figure"})
+        return self.out / "truths" / f"{folder_name(self.label)}-{_digest([described, self.settings, self.inputs])[:8]}"
+
+    @property
     def key(self) -> str:
         """Fingerprint of all that decides the figures but the code: the plan, and size and time of the files in it."""
         described = self.model_dump(mode="json", exclude={"out": True, "data": True, "sequence": {"figure"}})

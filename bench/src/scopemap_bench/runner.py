@@ -1,6 +1,6 @@
 """Runs a plan, each entry in a process of its own, with a time limit; a second call continues an interrupted one.
 
-OUT/runs/SEQUENCE/METHOD/{entry.json, run/, result.json, log.txt}    OUT/phantoms/    OUT/flows/
+OUT/runs/SEQUENCE/METHOD/{entry.json, run/, result.json, log.txt}    OUT/phantoms/    OUT/flows/    OUT/truths/
 
 A method may use all memory, crash in foreign code or call exit: its row says so and the benchmark continues. The
 process of an entry is `python -m scopemap_bench.runner ENTRY.json`, so peak memory is its own. `describe` tells what a
@@ -31,17 +31,12 @@ from scopemap.engine.errors import InputError, ScopemapError, SettingsError
 from scopemap.input.sequence import Sequence
 from scopemap.runner.estimators import missing_weights
 from scopemap_bench.entry import Entry, entries_of
+from scopemap_bench.forecast import measured_pace
 from scopemap_bench.methods.method import Method, PipelineMethod, create_method
 from scopemap_bench.plan import Plan, found_sequences, spec_of
 from scopemap_bench.result import FILE_NAME, RunResult
 from scopemap_bench.scoring import score
 
-# Seconds per frame at 400x320 px on two CPU cores: half the CPU time of random networks of full size, flow both ways.
-_FLOW_S = {"dis": 0.02, "raft-small": 0.7, "raft-large": 2.6}
-_DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 100.0}
-_PERCEPTUAL_S = {"lpips": 0.05, "structure": 0.01}
-_TRACKING_S, _SCORING_S = 0.2, 0.1  # with reading, masks, fusion and the back end
-_START_S, _SURFACE_S = 20.0, 20.0  # of a run: imports and kernels; its surface against the true one
 Listener = Callable[[Entry, RunResult, bool], None]
 
 
@@ -49,33 +44,47 @@ def describe(plan: Plan, out: Path, data: Path | None = None) -> Iterator[str]:
     """Yield the lines that `scopemap bench PLAN --dry-run` prints; raises as `run_plan`, but writes nothing."""
     entries, notes = planned(plan, out, data)
     lengths = {label: _length(entry) for label, entry in {entry.label: entry for entry in entries}.items()}
+    pace = measured_pace()
     rows: defaultdict[str, list[str]] = defaultdict(list)
     hours: defaultdict[str, float] = defaultdict(float)
-    lacking: set[str] = set()
+    waiting_hours: defaultdict[str, float] = defaultdict(float)
+    lacking, rendered = set[str](), set[Path]()
     done = 0
     for entry in entries:
+        frames, pixels, _ = lengths[entry.label]
+        config, name = _config(entry), entry.method.name
         if kept_result(entry) is not None:
             done += 1
-        elif reason := what_is_missing(entry):
-            rows[entry.method.name].append(reason)
+            continue
+        taken = pace.seconds(config, frames, pixels, surface=entry.protocol.surface) / 3600
+        if entry.sequence.phantom is not None and entry.source not in rendered and not entry.source.is_dir():
+            rendered.add(entry.source)
+            taken += pace.rendering_s(frames, pixels) / 3600
+        if reason := what_is_missing(entry):
+            rows[name].append(reason)
+            waiting_hours[name] += taken
             flows = [entry.protocol.flow] * entry.protocol.consistency
-            lacking |= set(missing_weights(_config(entry) or Config(), *flows, verified=True))
+            lacking |= set(missing_weights(config or Config(), *flows, verified=True))
         else:
-            hours[entry.method.name] += _seconds(entry, lengths[entry.label][0]) / 3600
-    frames = sum(count for count, _ in lengths.values())
-    yield f"{plan.title}: {len(lengths)} sequences, {frames} frames, {len(plan.method)} methods"
-    yield from (f"  {label}: {fault or f'{count} frames'}" for label, (count, fault) in lengths.items())
+            hours[name] += taken
+    yield (
+        f"{plan.title}: {len(lengths)} sequences, {sum(count for count, *_ in lengths.values())} frames, "
+        f"{len(plan.method)} methods"
+    )
+    yield from (f"  {label}: {fault or f'{count} frames'}" for label, (count, _, fault) in lengths.items())
     yield from (f"note: {note}" for note in notes)
     yield "rows:"
     for method in dict.fromkeys(entry.method.name for entry in entries):
-        reasons = dict.fromkeys(rows[method])
         expected = [_duration(hours[method])] if method in hours else []
+        reasons = [*dict.fromkeys(rows[method])]
+        reasons += [f"{_duration(waiting_hours[method])} when they are there"] if reasons else []
         yield f"  {method}: {'; '.join([*expected, *reasons]) or 'done'}"
     yield f"weights that are missing or damaged: {', '.join(sorted(lacking)) or 'none'}"
     waiting = sum(map(len, rows.values()))
     yield (
         f"{len(entries)} runs: {done} done, {waiting} missing, {len(entries) - done - waiting} to run in about "
-        f"{_duration(sum(hours.values()))} on two CPU cores; networks take less on a GPU"
+        f"{_duration(sum(hours.values()))} on this machine's processors, with what is missing "
+        f"{_duration(sum(hours.values()) + sum(waiting_hours.values()))}; networks take less on a GPU"
     )
 
 
@@ -83,14 +92,19 @@ def _duration(hours: float) -> str:
     return f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.0f} min"
 
 
-def _length(entry: Entry) -> tuple[int, str]:
-    """Return the frames of an entry's sequence, 0 where its file does not state them, and why it cannot be opened."""
+def _length(entry: Entry) -> tuple[int, int, str]:
+    """Return the frames of an entry's sequence, 0 where its file does not state them, the pixels of each, and a fault.
+
+    Pixels are those of the working size; the fault is why the sequence cannot be opened, or "".
+    """
     if entry.sequence.phantom is not None:
-        return spec_of(entry.sequence.phantom, entry.seed, entry.data).frames or 0, ""
+        spec = spec_of(entry.sequence.phantom, entry.seed, entry.data)
+        return spec.frames or 0, spec.width * spec.height, ""
     try:
-        return entry.open().count or 0, ""
+        sequence = entry.open()
+        return sequence.count or 0, sequence.camera.width * sequence.camera.height, ""
     except ScopemapError as error:
-        return 0, str(error)
+        return 0, 0, str(error)
 
 
 def _config(entry: Entry) -> Config | None:
@@ -99,20 +113,6 @@ def _config(entry: Entry) -> Config | None:
     with suppress(ScopemapError):
         return method.config(entry.shared_settings()) if isinstance(method, PipelineMethod) else None
     return None
-
-
-def _seconds(entry: Entry, frames: int) -> float:
-    """Return the time that an entry takes, from its networks."""
-    config = _config(entry)
-    if config is None:
-        return 0.0
-    flow, networks, mapis = config.networks.flow, config.networks, config.mapis
-    per_frame = _TRACKING_S + _SCORING_S + _DEPTH_S.get(config.depth.backend, 0.0)
-    per_frame += _FLOW_S.get(networks.keyframe_flow, 0.0)
-    if (mapis.blend, mapis.frame_scale) != ("none", "none"):
-        per_frame += _FLOW_S.get(flow, 0.0) + _PERCEPTUAL_S[networks.perceptual]
-    once = _START_S + (_DEPTH_S["depth-pro"] if config.depth.anchor == "depth-pro" else 0.0)
-    return once + frames * per_frame + _SURFACE_S * entry.protocol.surface
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def run_entry(entry: Entry) -> RunResult:
         sequence = entry.open()
         timing = method_of(entry).run(sequence, entry.shared_settings(), entry.run_folder)
         memory_mb = _peak_memory_mb()
-        figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows)
+        figures = score(entry.run_folder, sequence, entry.protocol, entry.sequence.align, entry.flows, entry.truths)
     except ScopemapError as error:
         return _without_figures(entry, "failed", str(error))
     return RunResult(
@@ -299,9 +299,10 @@ def _depth_of(entry: Entry) -> str:
 
 def _quality_of_truth(sequence: Sequence) -> str:
     """Return the source of the true poses ("exact", "kinematic", ...), "" where there are none."""
-    stamps = sequence.source.stamps(sequence.selection)
-    truth = sequence.source.truth(stamps[0][0]) if stamps else None
-    return truth.quality if truth else ""
+    source, stamps = sequence.source, sequence.source.stamps(sequence.selection)
+    # Depth of a frame may take an archive's decompression to read.
+    known = stamps and (source.pose(stamps[0][0]) is not None or source.truth(stamps[0][0]) is not None)
+    return source.quality if known else ""
 
 
 def _peak_memory_mb() -> float:

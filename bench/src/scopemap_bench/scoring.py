@@ -37,14 +37,23 @@ from scopemap_bench.evaluation.protocols import PROTOCOLS
 from scopemap_bench.evaluation.true_surface import TrueSurface, measure_surface, read_true_surface
 from scopemap_bench.plan import ProtocolPlan
 from scopemap_bench.result import Figures
+from scopemap_bench.true_depth import TrueDepths
 
 _CONSISTENCY_PX, _MAX_VIEWS = 1.0, 40
 
 
 def score(
-    folder: Path, sequence: Sequence, protocol: ProtocolPlan, align: AlignMode | None = None, flows: Path | None = None
+    folder: Path,
+    sequence: Sequence,
+    protocol: ProtocolPlan,
+    align: AlignMode | None = None,
+    flows: Path | None = None,
+    truths: Path | None = None,
 ) -> Figures:
-    """Return all figures of a run's folder that its sequence's truth allows, by group; `flows` keeps flow."""
+    """Return all figures of a run's folder that its sequence's truth allows, by group.
+
+    flows, truths : folders that keep flow and true depth for other runs of the sequence.
+    """
     estimate, reference = read_trajectory(folder), reference_trajectory(sequence)
     figures, matched = pose_groups(estimate, reference, protocol, align or protocol.align)
     if "climb" in figures and reference is not None:
@@ -52,11 +61,11 @@ def score(
     if matched is not None and protocol.surface:
         surface = surface_figures_of(folder, sequence, matched, icp=protocol.icp)
         figures |= {"surface": surface} if surface else {}
-    depth = DepthReader(folder)
+    depth, true_depths = DepthReader(folder), TrueDepths(sequence, truths)
     if depth.present and protocol.depth:
-        figures |= _depth(depth, sequence, protocol, matched)
+        figures |= _depth(depth, true_depths, protocol, matched)
     if depth.present and protocol.consistency:
-        figures |= _consistency(depth, sequence, estimate, protocol, flows)
+        figures |= _consistency(depth, sequence, true_depths, estimate, protocol, flows)
     if protocol.contradiction:
         figures["poses"] |= _contradiction(sequence, estimate)
     return figures
@@ -122,13 +131,12 @@ def _seen_surface(sequence: Sequence) -> TrueSurface | None:
     if surface is None or (surface.seen is not None and whole_clip) or surface.T_view is not None:
         return surface
     stamps = sequence.source.stamps(sequence.selection) or []
-    chosen = {index for index, _ in stamps[:: max(1, -(-len(stamps) // _MAX_VIEWS))]}
-    truths = [truth for frame, truth in sequence if frame.index in chosen and truth is not None]
-    views = {
-        truth.index: (truth.T_world_camera, truth.depth_mm)
-        for truth in truths
-        if truth.T_world_camera is not None and truth.depth_mm is not None
-    }
+    true_depths, views = TrueDepths(sequence), {}
+    for index, _ in stamps[:: max(1, -(-len(stamps) // _MAX_VIEWS))]:
+        pose = sequence.source.pose(index)
+        depth_mm = None if pose is None else true_depths(index)
+        if pose is not None and depth_mm is not None:
+            views[index] = (pose, depth_mm)
     return surface.seen_by(sequence.camera, views) if views else surface
 
 
@@ -151,14 +159,14 @@ def depth_groups(
     sequence = open_truth(run, truth)
     if not is_camera_of(run, sequence):
         raise InputError(f"the run {run} was made with another camera than {truth} gives: their depths do not compare")
-    protocol = default_protocol(sequence)
+    protocol, true_depths = default_protocol(sequence), TrueDepths(sequence)
     figures: Figures = {}
     if scaling is not None:
-        figures |= _depth(depth, sequence, protocol.model_copy(update={"depth_scaling": scaling}), matched)
+        figures |= _depth(depth, true_depths, protocol.model_copy(update={"depth_scaling": scaling}), matched)
         if not figures:
             raise InputError(f"{truth} has no true depth of the frames with depth in {run}")
     if consistency:
-        figures |= _consistency(depth, sequence, read_trajectory(run), protocol)
+        figures |= _consistency(depth, sequence, true_depths, read_trajectory(run), protocol)
     return figures
 
 
@@ -168,23 +176,24 @@ def default_protocol(sequence: Sequence) -> ProtocolPlan:
     return ProtocolPlan(depth_range_mm=DEPTH_RANGES_MM.get(name, ProtocolPlan().depth_range_mm))
 
 
-def true_pairs(depth: DepthReader, sequence: Sequence) -> DepthPairs:
-    """Return a factory of (estimated, true) depth of the frames that have both."""
+def true_pairs(depth: DepthReader, true_depths: TrueDepths) -> DepthPairs:
+    """Return a factory of (estimated, true) depth of the frames that have both, in order."""
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for frame, truth in sequence:
-            estimated_mm = depth.read(frame.index)
-            if truth is not None and truth.depth_mm is not None and estimated_mm is not None:
-                yield estimated_mm, truth.depth_mm
+        for index in true_depths.numbers():
+            estimated_mm = depth.read(index)
+            true_mm = None if estimated_mm is None else true_depths(index)
+            if estimated_mm is not None and true_mm is not None:
+                yield estimated_mm, true_mm
 
     return pairs
 
 
 def _depth(
-    depth: DepthReader, sequence: Sequence, protocol: ProtocolPlan, matched: MatchedTrajectories | None
+    depth: DepthReader, true_depths: TrueDepths, protocol: ProtocolPlan, matched: MatchedTrajectories | None
 ) -> Figures:
     report = depth_errors.evaluate_depth_sequence(
-        true_pairs(depth, sequence),
+        true_pairs(depth, true_depths),
         scaling=protocol.depth_scaling,
         truth_range_mm=protocol.depth_range_mm,
         clip_prediction=protocol.clip_depth,
@@ -198,17 +207,22 @@ def _depth(
 
 
 def _consistency(
-    depth: DepthReader, sequence: Sequence, estimate: Trajectory, protocol: ProtocolPlan, flows: Path | None = None
+    depth: DepthReader,
+    sequence: Sequence,
+    true_depths: TrueDepths,
+    estimate: Trajectory,
+    protocol: ProtocolPlan,
+    flows: Path | None = None,
 ) -> Figures:
     """Measure depth over time, after one scale factor for all frames where true depth is known."""
-    scale = depth_errors.fit_sequence(true_pairs(depth, sequence), "sequence-median", protocol.depth_range_mm).scale
+    scale = depth_errors.fit_sequence(true_pairs(depth, true_depths), "sequence-median", protocol.depth_range_mm).scale
     camera = sequence.camera
     matcher, meter = FrameMatcher(camera), ConsistencyMeter(camera, scale)
     estimator, masker = create_flow(protocol.flow), Masker(MaskSettings())
     folder = None if flows is None else flows / estimator.name
     poses = _tracked_poses(estimate)
     before: np.ndarray | None = None
-    for frame, truth in sequence:
+    for frame in sequence.frames():
         # Highlights move with the lamp, and pixels outside the field of view show no tissue: one mask for all methods.
         valid = masker(frame).valid
         found = (None, None) if before is None else flow_to_previous(estimator, frame.index, before, frame.rgb, folder)
@@ -220,15 +234,15 @@ def _consistency(
             valid,
             correspondence,
             T_world_camera=poses.get(frame.index),
-            T_reference_camera=None if truth is None else truth.T_world_camera,
-            true_depth_mm=None if truth is None else truth.depth_mm,
+            T_reference_camera=sequence.source.pose(frame.index),
+            true_depth_mm=true_depths(frame.index),
         )
     return {"consistency": meter.report() | {"flow": estimator.name}}
 
 
 def _contradiction(sequence: Sequence, estimate: Trajectory) -> dict[str, int]:
     meter, masker, poses = FailureMeter(sequence.camera), Masker(MaskSettings()), _tracked_poses(estimate)
-    for frame, _ in sequence:
+    for frame in sequence.frames():
         meter.add(frame.rgb, masker(frame).valid, poses.get(frame.index))
     return meter.figures()
 

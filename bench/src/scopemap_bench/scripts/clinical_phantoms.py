@@ -18,6 +18,7 @@ from scopemap.result.depth_maps import DepthReader
 from scopemap_bench.evaluation.depth import DepthFit, evaluate_depth
 from scopemap_bench.scoring import true_pairs
 from scopemap_bench.scripts import measuring
+from scopemap_bench.true_depth import TrueDepths
 
 FRAMES, SEED = 120, 21
 EXPOSURE = ("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4")
@@ -80,7 +81,7 @@ def scale_cells(run: Path, source: Path, figures: dict[str, Any]) -> list[str]:
     if not figures:
         return [""] * 3
     logs, fit = np.log(figures["depth"]["metric_consistency"]["frames"]), DepthFit(scale=figures["scale"])
-    pairs = true_pairs(DepthReader(run), open_sequence(source))()
+    pairs = true_pairs(DepthReader(run), TrueDepths(open_sequence(source)))()
     errors = [evaluate_depth(*pair, scaling=fit)["abs_rel"] for pair in pairs]
     first, *_, last = (part.mean() for part in np.array_split(logs, 10))
     worst = max(np.nanmean(part) for part in np.array_split(errors, 10))

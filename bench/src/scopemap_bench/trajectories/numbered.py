@@ -1,17 +1,20 @@
 """Numbered files of a data set, in a folder or in a tar archive, read one at a time.
 
-An archive is never unpacked to disk: only regular files with a number in their own name are read, into memory. Going
-back in a compressed archive decompresses it from its start again.
+Of an archive only regular files with a number in their own name are read. Going back in a compressed archive would
+decompress it from its start again: in ascending order its files are decompressed once, however they lie in it. Those
+that lie before a smaller number wait in a temporary file without a name.
 """
 
 from __future__ import annotations
 
 import re
 import tarfile
+import tempfile
 import threading
+import zlib
 from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
-from typing import TypeAlias
+from typing import IO, TypeAlias
 
 from scopemap.engine.errors import check_bytes, reporting
 
@@ -56,6 +59,9 @@ class ArchiveFiles:
         self._tar: tarfile.TarFile | None = None
         self._last_offset, self._passed = -1, 0
         self._complete = False
+        self._waiting: dict[int, tuple[int, int]] = {}  # offset and size in the temporary file
+        self._spool: IO[bytes] | None = None
+        self._read_to = 0
         # Frames are read ahead in a thread of their own, truth in another; the stream is one.
         self._lock = threading.Lock()
 
@@ -63,16 +69,23 @@ class ArchiveFiles:
         """Return the content of the file with this number, None where there is none; `InputError` as of a folder."""
         with self._lock, self._reporting():
             while number not in self._found and not self._complete:
-                self._advance()
+                found = self._advance()
+                if found is not None and found > number:
+                    self._let_wait(found)
             member = self._found.get(number)
-            if member is None or self._tar is None:
+            if member is None:
                 return None
             check_bytes(f"{self.path}, {member.name}", member.size, most_bytes or LARGEST_FILE_BYTES)
-            stream = self._tar.extractfile(member)
-            content = b"" if stream is None else stream.read()
-            if len(content) < member.size:
-                raise EOFError(f"{member.name} breaks off")
-            return content
+            if number in self._waiting and self._spool is not None:
+                offset, size = self._waiting[number]
+                self._spool.seek(offset)
+                return zlib.decompress(self._spool.read(size))
+            if member.offset < self._read_to:  # from the start again, but for no other file
+                self._read_to = 0
+            for other, passed in sorted(self._found.items(), key=lambda item: item[1].offset):
+                if self._read_to <= passed.offset < member.offset and other > number:
+                    self._let_wait(other)
+            return self._content(member)
 
     def numbers(self) -> list[int]:
         """Return all numbers, ascending; the archive is read to its end for it."""
@@ -85,12 +98,31 @@ class ArchiveFiles:
                 self._advance()
             return list(self._found)
 
-    def _advance(self) -> None:
+    def _content(self, member: tarfile.TarInfo) -> bytes:
+        stream = None if self._tar is None else self._tar.extractfile(member)
+        content = b"" if stream is None else stream.read()
+        if len(content) < member.size:
+            raise EOFError(f"{member.name} breaks off")
+        self._read_to = member.offset + 1
+        return content
+
+    def _let_wait(self, number: int) -> None:
+        """Put the content of a file that is passed on the way to a smaller number into the temporary file."""
+        member = self._found[number]
+        if self.path.suffix == ".tar" or number in self._waiting or member.size > LARGEST_FILE_BYTES:
+            return
+        packed = zlib.compress(self._content(member), level=1)
+        self._spool = self._spool or tempfile.TemporaryFile()  # noqa: SIM115
+        self._waiting[number] = (self._spool.seek(0, 2), len(packed))
+        self._spool.write(packed)
+
+    def _advance(self) -> int | None:
+        """Read the next header; return its number where it is that of a file that was not there yet."""
         self._tar = self._tar or tarfile.open(self.path, tarinfo=_BoundedMember)  # noqa: SIM115
         member = self._tar.next()
         if member is None:
             self._complete = True
-            return
+            return None
         # Sizes below zero lead `tarfile` back to headers that it has read (CVE-2025-8194).
         if member.size < 0 or member.offset <= self._last_offset:
             raise EOFError(f"{member.name} has no valid size")
@@ -100,8 +132,10 @@ class ArchiveFiles:
         if self._passed > _MOST_MEMBERS:
             raise EOFError(f"it holds more than {_MOST_MEMBERS} members")
         number = _number_of(member.name, self._prefix, self._suffixes)
-        if number is not None and member.isreg():
-            self._found.setdefault(number, member)
+        if number is None or not member.isreg() or number in self._found:
+            return None
+        self._found[number] = member
+        return number
 
     def _reporting(self) -> AbstractContextManager[None]:
         return reporting(f"reading {self.path}: the archive is damaged or incomplete; download it again")
