@@ -260,7 +260,7 @@ def test_a_run_that_is_stopped_writes_the_frames_until_then(
     last = LOST - 2
     told = json.loads((out / "provenance.json").read_text())
     assert told["interrupted_at_frame"] == result.frames["index"][-1] == last
-    assert f"interrupted at frame {last}: the result is of the frames until then" in warned(told)
+    assert f"The run was stopped at frame {last}: later frames are missing." in warned(told)
     assert [int(row["index"]) for row in frame_rows(out)] == list(range(last + 1))
     assert len(read_trajectory(out)) == last + 1
     assert len(trimesh.load_mesh(out / "mesh.ply").faces) > 100

@@ -172,7 +172,7 @@ def test_limits_bound_what_is_kept(folder: Path) -> None:
     kept = result.trajectory.indices.tolist()
     assert 0 < len(kept) <= 4
     assert (kept[0], kept[-1]) == (0, FRAMES - 1)
-    assert "older frames are not in the result: it keeps 4" in " ".join(warned(result.provenance))
+    assert "The result keeps the last 4 frames; " in " ".join(warned(result.provenance))
     alone = Reconstructor(config, open_sequence(folder))
     alone.step(next(iter(alone.frames())))
     assert len(alone.surface().faces) == faces  # the first frame alone was fused

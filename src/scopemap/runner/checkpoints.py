@@ -84,7 +84,7 @@ class Checkpoints:
 
     def restore(self) -> tuple[int, bool]:
         """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
-        with reporting("cannot resume from the checkpoint; --no-resume begins anew"):
+        with reporting("cannot resume from the checkpoint; --no-resume starts again"):
             return self._restored()
 
     def _restored(self) -> tuple[int, bool]:
@@ -154,7 +154,7 @@ def input_changes(identity: dict[str, Any], content: dict[str, Any], path: Path)
 def can_resume(folder: Path, identity: dict[str, Any], damage: list[str]) -> bool:
     """Return whether a folder holds a whole checkpoint of a run that would have the same result.
 
-    `damage` takes why one is not whole: the run then begins anew.
+    `damage` takes why one is not whole: the run then starts again.
     """
     if not (folder / CHECKPOINT).is_file():
         return False

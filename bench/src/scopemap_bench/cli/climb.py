@@ -15,16 +15,20 @@ from scopemap.terminal.options import AsJson, Quiet
 def climb(
     out: Annotated[Path, typer.Option(help="Folder of the submission; clips are added to it.")],
     runs: Annotated[
-        list[Path] | None, typer.Argument(metavar="[RUN]...", help="Folders of runs; without one --out is checked.")
+        list[Path] | None,
+        typer.Argument(metavar="[RUN]...", help="Folders of runs; without any, only --out is checked."),
     ] = None,
     clip: Annotated[str, typer.Option(help="Name of the clip; default: that of the run's input.")] = "",
     videos: Annotated[
-        Path | None, typer.Option(help="Folder of the challenge's videos: each must have its clip.")
+        Path | None, typer.Option(help="Folder of the challenge's videos; every video must have a clip.")
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write each run as the five runs of a clip, and check the submission by the challenge's rules (exit code 1)."""
+    """Convert runs into a CLiMB submission and check it.
+
+    Each run becomes the five runs of a clip. The exit code is 1 if the submission breaks a rule of the challenge.
+    """
     from scopemap_bench.climb.submission import submission_problems, write_submission
 
     written = [write_submission(run, out, clip) for run in runs or []]

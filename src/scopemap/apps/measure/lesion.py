@@ -140,7 +140,7 @@ def _masks_of_folder(run: Result, folder: Path) -> dict[int, np.ndarray]:
 def _mask_of_frame(run: Result, mask: Path | np.ndarray, frame: int | None) -> tuple[int, np.ndarray]:
     """Return a frame's number and its mask (H, W) bool, by a picture, a mask, or corners (N, 2)."""
     if frame is None:
-        raise SettingsError("one mask of a lesion, or corners, without the frame that they are of: give both")
+        raise SettingsError("a mask or an outline of a lesion needs its frame: give both")
     if frame not in run.tracked.trajectory.indices:
         raise InputError(f"frame {frame}, of which the lesion's mask is, has no pose in {run.path}")
     if isinstance(mask, Path):
