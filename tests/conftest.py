@@ -51,6 +51,7 @@ SLOW = {
     "test_colmap_method",
     "test_depth_preview",
     "test_documented_commands",
+    "test_documented_runs",
     "test_faulty_frames",
     "test_file_names",
     "test_films",

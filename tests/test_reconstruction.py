@@ -198,7 +198,7 @@ def test_without_a_folder_nothing_is_written(run: _Run, tmp_path: Path, monkeypa
     config = with_true_depth(run.phantom, fusion__enabled=False)
     result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config)
     assert list(tmp_path.iterdir()) == []
-    assert any(text.startswith("frames in the result: 3, too few") for text in said(result.provenance))
+    assert any(text.startswith("Only 3 frames are in the result: too few") for text in said(result.provenance))
     assert warned(run.result.provenance) == []
     result.save(tmp_path / "empty")
     assert not (tmp_path / "empty" / "mesh.glb").exists()

@@ -262,8 +262,8 @@ WARNED: list[tuple[str, Edit, str]] = [
     ("endoslam:real", drop(SHEET), "no pose is known"),
     ("endomapper-sim", text("trajectory.csv", unity_table((0, 1, 2), SIM_HEADER)), "1 of 4 images have no pose"),
     ("endomapper-sim", text("trajectory.csv", SIM_HEADER + "\n" + unity_row(1, ";") * 4), "the times do not increase"),
-    ("stereomis", lambda f: write_kinematics(f / KINEMATICS, frames=FRAMES + 2), "2 of 8 poses are of frames beyond"),
-    ("endomapper", model(images_bin([1, 7, 8])), "2 of 3 poses are of frames beyond the 6"),
+    ("stereomis", lambda f: write_kinematics(f / KINEMATICS, frames=FRAMES + 2), "2 of 8 poses belong to frames"),
+    ("endomapper", model(images_bin([1, 7, 8])), "2 of 3 poses belong to frames beyond the 6"),
     ("endomapper", text("Seq_001_info.json", '{"endoscope_number": 12}'),
      "Endoscope_12_geometrical.xml (Seq_001_info.json) is not in"),
     ("simcol3d", lambda f: (f / "..").joinpath("SavedPosition_S1.txt").rename(f.parent / "SavedPosition_S2.txt")

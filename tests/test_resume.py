@@ -246,7 +246,7 @@ def test_stored_frames_that_are_damaged_while_a_run_works_end_it(folder: Path, t
 
     with pytest.raises(InputError, match="the stored frames are damaged") as caught:
         _run(folder, out, "default", observers=(damage,))
-    assert "--no-resume begins anew" in caught.value.__notes__[0]
+    assert "--no-resume starts again" in caught.value.__notes__[0]
     assert _run(folder, out, "default").provenance["resumed_after_frame"] is None
 
 

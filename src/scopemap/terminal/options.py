@@ -33,8 +33,8 @@ InputNow = Annotated[
 PresetName = Annotated[
     Literal["default", "paper", "paper-strict", "realtime"] | None,
     typer.Option(
-        help="default: best without downloads; paper: as published, made robust; paper-strict: as published; "
-        "realtime: fast."
+        help="Preset: default (no downloads), paper (as published, made robust), paper-strict (as published), "
+        "realtime (fast)."
     ),
 ]
 ConfigFile = Annotated[

@@ -46,12 +46,14 @@ def bench(
     paper_units: Annotated[
         bool, typer.Option("--paper-units", help="Print rotations of tables 1 to 3 in radians; default: degrees.")
     ] = False,
-    frames: Annotated[int | None, typer.Option(min=2, help="speed: use the first N frames; default: all.")] = None,
+    frames: Annotated[int | None, typer.Option(min=2, help="For speed: use the first N frames; default: all.")] = None,
     compare: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="speed: name the stages that are slower than in FILE, which --json wrote."),
+        typer.Option(
+            metavar="FILE", help="For speed: name the stages that are slower than in FILE, which --json wrote."
+        ),
     ] = None,
-    preset: Annotated[_Preset | None, typer.Option(help="speed: preset of the run; default: default.")] = None,
+    preset: Annotated[_Preset | None, typer.Option(help="For speed: preset of the run; default: default.")] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:

@@ -41,8 +41,7 @@ class StereoMisFolder(PosedVideo):
             self.notes.append(f"no pose is known: {_POSES} is not there")
         if (path / "masks").is_dir():
             self.notes.append(
-                "masks/ is not used: 0 is where instruments are, the other way round than mask.files has it, and the "
-                "numbers count from 1"
+                "masks/ is not used: it marks instruments by 0, unlike mask.files, and counts frames from 1"
             )
 
     @staticmethod
@@ -63,8 +62,8 @@ class StereoMisFolder(PosedVideo):
         offset = int(numbers[0] == 1)
         poses = poses_by_row(table.values[:, -7:], _MM_PER_METRE, table.where)
         self.poses = {int(numbers[row]) - offset: pose for row, pose in poses.items()}
-        self.notes.append(
-            f"truth: robot kinematics, {_POSES} taken as camera-to-world in metres; row {offset} is the video's first "
-            "frame; no depth is known"
-        )
+        self.notes += [
+            f"the truth is robot kinematics: {_POSES} is read as camera-to-world in metres",
+            f"row {offset} of the truth is the video's first frame; no depth is known",
+        ]
         self._warn_of_poses_beyond(file)
