@@ -59,7 +59,7 @@ def test_too_little_is_refused_with_the_least_that_works_before_anything_is_writ
 
 
 def test_networks_whose_memory_is_not_known_are_refused(folder: Path) -> None:
-    with pytest.raises(SettingsError, match=r"cannot be held with depth-anything, raft-small"):
+    with pytest.raises(SettingsError, match=r"cannot be guaranteed with depth-anything, raft-small"):
         _plan(folder, 4000, depth__backend="depth-anything", networks__flow="raft-small")
 
 

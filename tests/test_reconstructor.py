@@ -131,7 +131,7 @@ def test_what_own_depth_returns_is_checked(function: Callable[[np.ndarray], np.n
     with pytest.raises(InputError, match=fault):
         one.step(tissue)
     two = Reconstructor(None, CAMERA, flow=lambda a, b: np.zeros((2, 2, 2)))
-    with pytest.raises(InputError, match="own flow: expected floats of shape"):
+    with pytest.raises(InputError, match="custom flow: expected floats of shape"):
         [two.step(tissue + step) for step in range(3)]
 
 

@@ -152,7 +152,7 @@ FAULTS: list[tuple[str, Edit, str]] = [
     ("oneslam", intrinsics(cx=400), "principal point 400, 30.25 is outside"),
     *(("oneslam", stated(FPS=rate), "FPS must be a positive number") for rate in (0, -25, "fast", [25], float("nan"))),
     ("oneslam", line("poses_gt.txt", 1, "3 0 0 0 0 0 1"), "found 8 numbers where earlier lines have 7"),
-    ("oneslam", line("poses_gt.txt", 1, "10 0 0 0 0 0 0 1"), "line 3: the time stamp of an earlier line comes again"),
+    ("oneslam", line("poses_gt.txt", 1, "10 0 0 0 0 0 0 1"), "line 3: the time stamp of an earlier line is repeated"),
     ("oneslam", line("poses_gt.txt", 1, "3.5 0 0 0 0 0 0 1"), "stamped by frame number here, but not all stamps"),
     ("oneslam", lambda f: write_picture(f / "images/00000009.png", 9), r"00000009\.\w+ and 00000009\.\w+ have"),
     ("oneslam", lambda f: write_picture(f / "images/last.png", 9), r"last\.png: its name holds no number"),
@@ -197,7 +197,7 @@ FAULTS: list[tuple[str, Edit, str]] = [
     *(("stereomis", text(KINEMATICS, content), rf"groundtruth\.txt.*{message}") for content, message in (
         ("# only this\n", "holds no pose"), ("0 1 2 3\n", "line 1: found 4 numbers where frame tx ty tz"),
         ("0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 0\n", "line 2: the quaternion has length 0"),
-        ("0 0 0 0 0 0 0 1\n\n0 0 0 0 0 0 0 1\n", "line 3: the time stamp of an earlier line comes again"),
+        ("0 0 0 0 0 0 0 1\n\n0 0 0 0 0 0 0 1\n", "line 3: the time stamp of an earlier line is repeated"),
         ("0.5 0 0 0 0 0 0 1\n", "must be frame numbers"), ("nan 0 0 0 0 0 0 1\n", "must be frame numbers"),
         ("-1 0 0 0 0 0 0 1\n", "must be frame numbers"))),
     ("stereomis", lambda f: (f / "b.mp4").write_bytes((f / "endoscope_part0001.mp4").read_bytes()),
@@ -207,8 +207,8 @@ FAULTS: list[tuple[str, Edit, str]] = [
     *(("endomapper", model(content), rf"Seq_001\.zip.*{message}") for content, message in (
         (b"", "cut off"), (images_bin([1, 2, 3])[:-30], "cut off"), (images_bin([]), "no image with its pose"),
         (images_bin([1])[:-32] + struct.pack("<Q", 2**60), "the archive is damaged or incomplete .it is cut off"),
-        (images_bin([1, 1]), "comes again"), (images_bin([1], name="frame{}.png"), "'frame1.png' is none of a frame"),
-        (images_bin([0, 1]), "'out0.png' is none of a frame"),
+        (images_bin([1, 1]), "is repeated"), (images_bin([1], name="frame{}.png"), "'frame1.png' is not outN.png"),
+        (images_bin([0, 1]), "'out0.png' is not outN.png"),
         (images_bin([1, 2], quaternion=(2.0, 0.0, 0.0, 0.0)), "quaternion has length 2"))),
     ("endomapper", edited("meta-data/colmap/Seq_001.zip", lambda b: b[: len(b) // 2]), "archive is damaged or incompl"),
     ("endomapper", edited("meta-data/colmap/Seq_001.zip", lambda b: b[:60] + b"\xff" * 10 + b[70:]), "archive is da"),

@@ -53,7 +53,7 @@ class StereoMisFolder(PosedVideo):
         """Read rows of 8 numbers, the first the frame, in any order; numbers from 1 count frames from 1.
 
         A row that holds NaN or infinity is a frame without a pose. Raises `InputError`, with the line, for what is no
-        such row, and for a frame that comes again.
+        such row, and for a frame that is repeated.
         """
         table = read_numbers(file, missing=True).with_columns(8, "frame tx ty tz qx qy qz qw").sorted_by_stamp()
         numbers = table.values[:, 0]

@@ -244,7 +244,9 @@ def _marked(run: Result, frame: int, mask: np.ndarray, pose: np.ndarray) -> trim
     there = ndimage.map_coordinates(seen, [v, u], order=0, cval=np.nan)
     level[~(points[:, 2] < (1 + _IN_FRONT / 2) * there) | (points[:, 2] <= 0)] = 0
     if not (level > 0.5).any():
-        raise InputError(f"no surface where frame {frame} shows the lesion: a mask there can be carried nowhere")
+        raise InputError(
+            f"no surface where frame {frame} shows the lesion: its mask cannot be transferred to other frames"
+        )
     colours = np.repeat(np.rint(255 * level).astype(np.uint8)[:, None], 3, axis=1)
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
