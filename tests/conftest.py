@@ -54,6 +54,7 @@ SLOW = {
     "test_compare_exams",
     "test_depth_preview",
     "test_documented_commands",
+    "test_documented_runs",
     "test_evaluation_deformation",
     "test_faulty_frames",
     "test_file_names",

@@ -72,7 +72,7 @@ def drawn_result(name: str = "video.mp4", **facts: Any) -> Result:
         "camera": {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         | {"source": "calibration file camera.yaml"},
         "estimators": {"depth": "scopenet", "flow": "dis"},
-        "scale": {"known": False, "source": "millimetres as scopenet gives them"},
+        "scale": {"known": False, "source": "scopenet's own scale"},
         "notices": [notice.as_json() for notice in of_input(["a note"], ["a warning"])],
         "seconds": {"total": 3.0},
         "versions": {"scopemap": "0.1.0"},

@@ -76,9 +76,11 @@ def test_run_writes_its_folder_and_says_what_it_found(tmp_path: Path, capfd: Cap
     assert {"trajectory.tum", "mesh.ply", "mesh.glb", "frames.csv", "config.toml", "provenance.json", "depth"} <= {
         path.name for path in out.iterdir()
     }
-    assert re.search(rf"{FRAMES - 1} of {FRAMES} frames tracked, 1 lost, path \d+\.\d mm", said.out)
-    assert re.search(r"^lost: 0\.10 s \(1 frame\), too dark: go nearer", said.out, re.MULTILINE)
-    for words in ("scale: measured depth", "camera: calibration file camera.yaml", str(out / "report.html")):
+    assert re.search(rf"^  frames   {FRAMES - 1} of {FRAMES} tracked, 1 lost; path \d+\.\d mm$", said.out, re.MULTILINE)
+    assert re.search(
+        r"^Note: The camera was lost in 1 frames?, .* too dark\. Next time, go nearer", said.out, re.MULTILINE
+    )
+    for words in ("scale    measured depth", "camera   calibration file camera.yaml", str(out / "report.html")):
         assert words in said.out
     assert f"frame {FRAMES} of {FRAMES}" in said.err
     assert "writing the report" in said.err
@@ -90,7 +92,7 @@ def test_json_has_its_keys_and_nothing_else_is_printed(images: Path, tmp_path: P
     said = capfd.readouterr()
     facts = json.loads(said.out)
     assert list(facts) == JSON_KEYS
-    assert re.fullmatch(r"warning: the camera is unknown, .*\n", said.err)
+    assert re.fullmatch(r"warning: The focal length is assumed: .*\n", said.err)
     assert (facts["frames"], facts["preset"], facts["dataset"]) == (FRAMES, "realtime", "images")
     assert facts["out"] == str(tmp_path)
     assert facts["estimators"]["anchor"] == "near-far 5:80 mm"
@@ -122,7 +124,7 @@ def test_a_video_that_breaks_off_is_used_as_far_as_it_goes(images: Path, tmp_pat
     for quiet in ((), ("--quiet",)):
         assert call("run", file, "--out", tmp_path / "out", "--overwrite", *quiet) == 0
         said = capfd.readouterr()
-        assert (said.out + said.err == "") if quiet else re.search(f"^warning: .*{pattern}", said.err, re.MULTILINE)
+        assert (said.out + said.err == "") if quiet else re.search(f"^Note: .*{pattern}", said.out, re.MULTILINE)
         assert re.search(pattern, " ".join(warned(json.loads((tmp_path / "out" / "provenance.json").read_text()))))
     assert 4 <= len(_indices(tmp_path / "out")) < 2 * FRAMES
 

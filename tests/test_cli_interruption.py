@@ -66,8 +66,8 @@ def test_an_interrupted_run_writes_what_was_tracked(
     assert call("run", phantom, "--out", out) == 143
     said = capfd.readouterr()
     assert "stopping after this frame" in said.err
-    assert f"interrupted at frame {STOPPED}" in said.err
-    assert f"{STOPPED + 1} of {STOPPED + 1} frames tracked" in said.out
+    assert f"The run was stopped at frame {STOPPED}" in said.out
+    assert f"{STOPPED + 1} of {STOPPED + 1} tracked" in said.out
     assert json.loads((out / "provenance.json").read_text())["interrupted_at_frame"] == STOPPED
     assert len(read_trajectory(out)) == STOPPED + 1
     assert (out / "mesh.ply").is_file()

@@ -85,7 +85,7 @@ def test_lost_frames_and_those_of_other_maps_are_counted_apart(capfd: pytest.Cap
             observers[0](step)  # type: ignore[arg-type]
     out, err = capfd.readouterr()
     assert out == ""
-    line = r"frame 6 of 6: about \d+ s left, ok, 1 lost, 2 in other maps so far"
+    line = r"frame 6 of 6: about \d+ s left, tracked \(so far 1 lost, 2 in other submaps\)"
     assert re.fullmatch(line, err.splitlines()[-1])
     with run_progress(10, silent=True) as shown:
         assert shown.observers == ()

@@ -216,7 +216,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         ("0,000002.png,a,0,0,1,0,0,0", "line 2: expected numbers"),
         ("0,000002.png,0,0,0,nan,0,0,0", "line 2: the quaternion has length nan"),
         ("0,000002.png,0,0,0,1,1,0,0", "line 2: the quaternion has length 1.41"),
-        ("0,000002.png,0,0,0,1,0,0,0\n1,2.png,0,0,0,1,0,0,0", "line 3: frame 2 comes again"),
+        ("0,000002.png,0,0,0,1,0,0,0\n1,2.png,0,0,0,1,0,0,0", "line 3: frame 2 is repeated"),
         ("0,000002.png,nan,0,0,1,0,0,0", "it holds no pose"),
     ],
 )

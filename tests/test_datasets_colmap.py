@@ -41,7 +41,7 @@ def test_a_model_and_its_images(form: str, model: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(truth.T_world_camera, true_pose(number), atol=1e-12)
         assert (truth.index, truth.depth_mm, truth.quality) == (number, None, "sfm")
     assert sequence.warnings == []
-    assert any("scale unknown: units are taken as mm" in note for note in sequence.notes)
+    assert any("unknown scale is read as mm" in note for note in sequence.notes)
     assert "1 of 4 images have no pose" in sequence.notes
 
 

@@ -104,8 +104,8 @@ def test_topics_sizes_and_stamps_that_do_not_fit(tmp_path: Path) -> None:
     assert source.stamps(slice(None))[2][1] == pytest.approx((START_NS + 3 * STEP_NS + 5) / 1e9)
     assert len(numbers(source)) == 4
     assert source.left_out[4].reason == "64x50 px, others are 64x48 px"
-    assert any("hold no stamp" in warning for warning in source.warnings)
-    assert f"the stamps of {IMAGE} do not increase: images stay as they were recorded" in source.warnings
+    assert any("hold no time stamp" in warning for warning in source.warnings)
+    assert f"the stamps of {IMAGE} do not increase: images keep the order of recording" in source.warnings
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from scopemap.report.depth_figures import MASKED_GREY, DepthPreviews
 from scopemap.result.depth_maps import DepthReader, DepthWriter
 from scopemap.result.result import Result
 
-UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
+UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
 
 
 @pytest.fixture(scope="module")
@@ -100,12 +100,12 @@ def test_a_scale_that_is_a_guess_is_said_everywhere(result: Result, out: Path) -
         "known": False,
         "measured": False,
         "stated": False,
-        "source": "millimetres as scopenet gives them",
+        "source": "scopenet's own scale",
     }
     assert scale_words(result.provenance["scale"]) == UNKNOWN
     lines = summary_lines(result)
-    assert lines[0].endswith("(scale unknown)")
-    assert lines[1].startswith(UNKNOWN)
+    assert lines[1].endswith("(scale unknown)")
+    assert "Sizes are unknown" in lines[0]
     assert f"# {UNKNOWN}" in (out / "trajectory.tum").read_text().splitlines()
     assert f"comment {UNKNOWN}\n".encode() in (out / "mesh.ply").read_bytes()[:600]
     assert json.loads((out / "depth" / "depth.json").read_text())["scale_known"] is False

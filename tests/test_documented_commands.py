@@ -11,39 +11,16 @@ from typing import Any
 import pytest
 import typer
 import typer.main
+from documented import DOCUMENTS, blocks, commands
 from front_door import call
 
 from scopemap.apps.demo import demo as demonstration
 from scopemap.cli.app import app
 from scopemap_bench.scripts.demo_clip import SPEC, write_clip
 
-ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-DOCUMENTS = sorted({*DOCUMENTS, *(ROOT / "bench").glob("*.md")} - {ROOT / "CHANGELOG.md"})
 # ClickException, wherever typer has it.
 REFUSED = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
-# Not the name of an image, nor of an import.
-CALLED = re.compile(r"(?!podman )(?:.*[\s!(])?scopemap ((?!import)[a-z-].*)")
 ABOUT_THE_DEMO = re.compile(r"scopemap-demo/")
-
-
-def _blocks(text: str, language: str = r"\w*") -> list[str]:
-    """Return the content of code blocks: fenced ones of the language, and indented ones where any will do."""
-    fenced = re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
-    plain = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
-    indented = re.findall(r"(?:^ {4}.*\n)+", plain, flags=re.MULTILINE) if language == r"\w*" else []
-    return fenced + indented
-
-
-def _commands(document: Path) -> list[list[str]]:
-    """Return the arguments of each `scopemap` in the document's blocks of code."""
-    found = []
-    for block in _blocks(document.read_text(encoding="utf-8")):
-        for line in block.replace("\\\n", " ").splitlines():
-            parts = re.split(r"\s(?:&&|\||>|&)\s|;\s", re.sub(r"\s#.*", "", line))
-            called = [CALLED.match(part.strip()) for part in parts]
-            found += [shlex.split(match[1]) for match in called if match]
-    return found
 
 
 def _parse(command: Any, arguments: list[str], parent: Any = None, name: str = "scopemap") -> None:
@@ -60,10 +37,10 @@ def test_what_is_not_understood_is_found() -> None:
             _parse(typer.main.get_command(app), wrong)
 
 
-@pytest.mark.parametrize("document", [one for one in DOCUMENTS if _commands(one)], ids=lambda path: path.name)
+@pytest.mark.parametrize("document", [one for one in DOCUMENTS if commands(one)], ids=lambda path: path.name)
 def test_commands_in_blocks_are_understood(document: Path) -> None:
     faults = []
-    for arguments in _commands(document):
+    for arguments in commands(document):
         try:
             _parse(typer.main.get_command(app), arguments)
         except typer.Exit:  # --help
@@ -75,12 +52,12 @@ def test_commands_in_blocks_are_understood(document: Path) -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_options_of_commands_in_the_text_exist(document: Path) -> None:
-    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    known_commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     text = re.sub(r"^```.*?^```", "", document.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     for name, rest in re.findall(r"`scopemap ([a-z]+)([^`]*)`", text):
-        assert name in commands, f"scopemap {name}"
-        inner = getattr(commands[name], "commands", {}).values()
-        known = {option for one in (commands[name], *inner) for param in one.params for option in param.opts}
+        assert name in known_commands, f"scopemap {name}"
+        inner = getattr(known_commands[name], "commands", {}).values()
+        known = {option for one in (known_commands[name], *inner) for param in one.params for option in param.opts}
         assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", rest)) <= known | {"--help"}, f"scopemap {name}{rest}"
 
 
@@ -98,7 +75,7 @@ def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_commands_about_the_demonstration_run(small_demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(small_demo)
-    called = [one for document in DOCUMENTS for one in _commands(document) if ABOUT_THE_DEMO.search(" ".join(one))]
+    called = [one for document in DOCUMENTS for one in commands(document) if ABOUT_THE_DEMO.search(" ".join(one))]
     assert {"inspect", "run", "evaluate", "export"} <= {arguments[0] for arguments in called}
     for arguments in called:
         assert call(*arguments) == 0, arguments
@@ -107,10 +84,10 @@ def test_commands_about_the_demonstration_run(small_demo: Path, monkeypatch: pyt
 def test_python_about_the_demonstration_runs(small_demo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(small_demo)
     written = [one for one in DOCUMENTS if one.name != "api.md"]  # that is generated, and has signatures
-    blocks = [block for one in written for block in _blocks(one.read_text(encoding="utf-8"), "python")]
-    for block in blocks:
+    shown = [block for one in written for block in blocks(one.read_text(encoding="utf-8"), "python")]
+    for block in shown:
         compile(block, "document", "exec")
-    about = [block for block in blocks if ABOUT_THE_DEMO.search(block)]
+    about = [block for block in shown if ABOUT_THE_DEMO.search(block)]
     assert about
     for block in about:
         exec(compile(block, "document", "exec"), {})

@@ -21,7 +21,7 @@ from PIL import Image
 from scopemap.engine.geometry.rendering import render_mesh
 
 POSES = np.stack([pose_of(index) for index in range(IN_RESULT)])
-UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
+UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
 BOX_MM = tube().bounds
 
 

@@ -26,7 +26,7 @@ from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.result.result import Result
 
-UNKNOWN = "scale unknown (millimetres as scopenet gives them): sizes are a guess, compare shapes"
+UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
 
 
 @pytest.fixture(scope="module")

@@ -64,7 +64,7 @@ def test_a_frame_with_which_a_stage_fails_is_lost_with_the_reason(
     _break(monkeypatch, kind, name, {4}, np.linalg.LinAlgError("it\nbroke"))
     result = reconstruct(open_sequence(folder), with_true_depth(folder), out=tmp_path / "out")
     assert _lost(tmp_path / "out") == {4: reason}
-    assert warned(result.provenance)[0] == (f"1 frame(s) could not be processed whole (first: frame 4, {reason})")
+    assert warned(result.provenance)[0] == f"Processing failed in 1 frame, first in frame 4: {reason}."
     assert len(result.mesh.faces) > 100
 
 
@@ -81,7 +81,7 @@ def test_a_frame_without_flow_to_the_one_before_is_still_tracked(folder: Path, m
     _break(monkeypatch, DenseMatcher, "match", {4}, RuntimeError("it broke"))
     result = reconstruct(open_sequence(folder), Config())
     assert result.provenance["tracked"] == FRAMES
-    assert "frame 4, flow failed: it broke" in warned(result.provenance)[0]
+    assert "frame 4: flow failed: it broke" in warned(result.provenance)[0]
 
 
 def test_where_many_frames_fail_the_run_ends_with_the_reason(
@@ -108,7 +108,7 @@ def test_depth_that_is_no_number_is_unknown_and_told(
     result = reconstruct(open_sequence(folder), Config())
     assert result.provenance["tracked"] == FRAMES
     assert np.isfinite(result.mesh.vertices).all()
-    told = "1 frame(s) got no depth from the network (first: frame 4)"
+    told = "The network returned no depth for 1 frame, first for frame 4."
     assert (told in warned(result.provenance)) == (value != 0)
 
 
@@ -139,5 +139,5 @@ def test_a_reader_that_hangs_ends_the_frames_and_what_was_tracked_is_kept(
     assert result.trajectory.indices[result.trajectory.tracked].tolist() == [*range(6)]
     (warning,) = [warning for warning in warned(result.provenance) if "hangs" in warning]
     late = "its picture after frame 5 did not come within 3 s: a decoder or a disk hangs; the frames until then"
-    assert warning == f"{folder}: {late} were used"
+    assert warning == f"{folder}: {late} were used."
     assert len(result.mesh.faces) > 100

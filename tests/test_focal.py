@@ -188,7 +188,7 @@ def test_a_camera_at_rest_stays_as_assumed(still: Sequence, focal: str) -> None:
     assert result.provenance["camera"]["focal_sigma_px"] is None
     camera, notes = result.provenance["camera"]["source"], said(result.provenance)
     assert camera.startswith("assumed: horizontal field of view 70 deg")
-    assert ("the motion does not determine it" in camera) == (focal == "auto")
+    assert ("the motion does not constrain it" in camera) == (focal == "auto")
     assert "--fov" not in camera  # it was not given
     assert not any("focal length:" in note for note in notes)
     assert ("focal length" in result.provenance["seconds"]) == (focal == "auto")
@@ -207,7 +207,7 @@ ESTIMATES = {
     ("name", "focal", "taken", "message"),
     [
         ("clear", "auto", True, "fx 84 +- 3 px, horizontal field of view 100 deg"),
-        ("bent", "auto", True, "radial distortion, about 30%"),
+        ("bent", "auto", True, "radial distortion, about 30 %"),
         ("wide", "auto", False, "uncertain: fx 84 +- 17 px"),
         ("agrees", "auto", False, "consistent with the estimate from the motion: fx 140 +- 7 px"),
         ("none", "auto", False, "0 windows"),

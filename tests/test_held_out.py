@@ -112,8 +112,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # Every run says how its surface agrees with some of its frames.
     assert result.provenance["surface"]["frames"] == 12
     assert result.provenance["surface"]["coverage_mean"] > 0.75
-    assert "flow: dis; perceptual distance: structure" in summary_lines(result)
-    assert "covers" in next(line for line in summary_lines(result) if line.startswith("mesh: "))
+    assert "covers" in next(line for line in summary_lines(result) if line.startswith("  surface "))
     return folder / "run"
 
 

@@ -75,7 +75,7 @@ def test_nothing_is_found_in_a_clean_video(tmp_path: Path) -> None:
     assert (found.overlays, found.insets, found.packed, found.field.shape) == ((), (), None, "full")
     assert (found.facts["codec"], found.facts["bits"], found.facts["pictures"]) == ("mpeg4", 8, COUNT)
     assert found.facts["usual_rate_hz"] == pytest.approx(25)
-    assert found.forecast == "good: nothing in its motion, sharpness and texture endangers a reconstruction"
+    assert found.forecast == "good: motion, sharpness and texture suit a reconstruction"
     assert not write_mask(found, tmp_path / "none")
     assert not (tmp_path / "none").exists()
     every_tenth = inspect(found.path, frames=slice(None, None, 10))
@@ -297,7 +297,7 @@ def test_fast_motion_makes_a_poor_forecast(tmp_path: Path) -> None:
     found = inspect(images(tmp_path / "in", moved(mottled(2), 97)))
     assert {"motion-fast", "unlike"} & set(by_code(found))
     assert found.forecast.startswith("poor: ")
-    assert "separate maps" in found.forecast
+    assert "several submaps" in found.forecast
 
 
 def test_a_cut_is_found_where_it_is(tmp_path: Path) -> None:

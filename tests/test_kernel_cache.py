@@ -58,6 +58,6 @@ def test_the_summary_names_what_compiling_took(monkeypatch: pytest.MonkeyPatch) 
     assert 0 < compiling_s() - before_s < time.perf_counter() - before
     assert compiling_words(0.0) == ""
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/cache")
-    assert compiling_words(11.04) == "; 11.0 s of it, which the frames/s leave out, to compile kernels, once"
+    assert compiling_words(11.04) == " (without 11.0 s of compiling kernels, once)"
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
-    assert "every time: set NUMBA_CACHE_DIR" in compiling_words(11.0)
+    assert "in every run: set NUMBA_CACHE_DIR" in compiling_words(11.0)

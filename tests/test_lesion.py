@@ -219,7 +219,7 @@ def test_what_cannot_be_measured_is_refused(known: Path, tmp_path: Path, capfd: 
     outline = "20,20 40,20 40,40"
     assert "has no pose" in said("--lesion", outline, "--frame", FRAMES - 1)
     assert "2 corners" in said("--lesion", "20,20 40,20", "--frame", 0)
-    assert "without the frame" in said("--lesion", outline)
+    assert "needs its frame" in said("--lesion", outline)
     assert "no surface where frame 0" in said("--lesion", "300,300 310,300 310,310", "--frame", 0)
     short = ("--reference", "20,20 24,20", "--reference-mm", 3)
     assert "the reference is 4.0 px long: 10 px are needed" in said("--lesion", outline, "--frame", 0, *short)

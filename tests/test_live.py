@@ -166,7 +166,7 @@ def test_the_command_writes_a_result(clip: Path, tmp_path: Path, capfd: pytest.C
     out = tmp_path / "out"
     assert call("live", clip, "--out", out, "--set", "fusion.every=1") == 0
     said = capfd.readouterr()
-    assert "look at" in said.out
+    assert f"Open {out / 'report.html'}" in said.out
     assert ("ended: " in said.err, said.out.count("ended: ")) == (False, 1)
     assert {"trajectory.tum", "mesh.ply", "report.html", "frames.csv", "SHA256SUMS"} <= {
         file.name for file in out.iterdir()

@@ -15,7 +15,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.tracking.causes import ADVICE, LossCause, causes_of_loss
 from scopemap.engine.tracking.usable import too_few_pixels
 from scopemap.result.frame_table import ELSEWHERE, LOST, NOT_USED
-from scopemap.result.losses import in_words, losses
+from scopemap.result.losses import losses, main_cause
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 
@@ -74,7 +74,8 @@ def test_segments_have_the_cause_that_began_them() -> None:
         (8, 8, 1, again),
     ]
     assert [loss.when for loss in found] == ["0.10 to 0.40 s", "0.60 s", "0.80 s"]
-    assert in_words(found).startswith("Mostly by this: fast motion. Next time: turn and withdraw more slowly")
+    assert main_cause(found) == ("fast motion", ADVICE[LossCause.FAST_MOTION])
+    assert main_cause([]) == ("", "")
 
 
 @pytest.mark.slow

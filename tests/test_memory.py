@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +59,7 @@ def test_too_little_is_refused_with_the_least_that_works_before_anything_is_writ
 
 
 def test_networks_whose_memory_is_not_known_are_refused(folder: Path) -> None:
-    with pytest.raises(SettingsError, match=r"cannot be held with depth-anything, raft-small"):
+    with pytest.raises(SettingsError, match=r"cannot be guaranteed with depth-anything, raft-small"):
         _plan(folder, 4000, depth__backend="depth-anything", networks__flow="raft-small")
 
 
@@ -94,19 +95,20 @@ def test_voxels_grow_until_the_surface_is_within_the_limit(at_end: bool, tmp_pat
         assert np.median(np.abs(radius_mm - 30.0)) < tolerance_mm
 
 
+def _codes(run: Path) -> set[str]:
+    return {notice["code"] for notice in json.loads((run / "provenance.json").read_text())["notices"]}
+
+
 def test_a_limited_run_says_what_was_chosen_and_its_settings_repeat_it(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("scopemap.runner.memory._BLOCK_BYTES", 500_000)
     monkeypatch.setattr("scopemap.runner.memory._LEAST_BLOCKS", 100)
     ask = ("run", folder, "--depth", f"files:{folder}")
     assert call(*ask, "--out", tmp_path / "free") == 0
-    free = capfd.readouterr().out
-    assert "note: memory" not in free
+    assert "memory-limited" not in _codes(tmp_path / "free")
     assert call(*ask, "--out", tmp_path / "limited", "--memory", "800MB") == 0
-    said = capfd.readouterr().out
-    assert re.search(r"note: memory: at most \d+ observations adjusted, \d+ blocks of 8\^3 voxels", said)
-    assert re.search(r"note: fusion: voxels of [\d.]+ mm in place of [\d.]+ mm, so that the surface is within", said)
+    assert {"memory-limited", "fusion-coarsened"} <= _codes(tmp_path / "limited")
     assert "memory_mb = 800" in (tmp_path / "limited" / "config.toml").read_text()
     faces = [len(trimesh.load_mesh(tmp_path / name / "mesh.ply").faces) for name in ("free", "limited")]
     assert faces[0] > 2 * faces[1] > 200

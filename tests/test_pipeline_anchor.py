@@ -46,7 +46,7 @@ def test_an_unknown_camera_stays_assumed_without_a_focal_length(
     assert result.camera == sequence.camera
     assert "assumed" in result.provenance["camera"]["source"]
     if name != "depth-pro":  # which would have been asked instead of the motion
-        assert "; the motion does not determine it: " in result.provenance["camera"]["source"]
+        assert "; the motion does not constrain it: " in result.provenance["camera"]["source"]
 
 
 @pytest.mark.parametrize("anchor_too", [False, True])

@@ -198,7 +198,7 @@ def test_without_a_folder_nothing_is_written(run: _Run, tmp_path: Path, monkeypa
     config = with_true_depth(run.phantom, fusion__enabled=False)
     result = reconstruct(open_sequence(run.phantom, frames=slice(0, 3)), config)
     assert list(tmp_path.iterdir()) == []
-    assert any(text.startswith("frames in the result: 3, too few") for text in said(result.provenance))
+    assert any(text.startswith("Only 3 frames are in the result: too few") for text in said(result.provenance))
     assert warned(run.result.provenance) == []
     result.save(tmp_path / "empty")
     assert not (tmp_path / "empty" / "mesh.glb").exists()
@@ -260,7 +260,7 @@ def test_a_run_that_is_stopped_writes_the_frames_until_then(
     last = LOST - 2
     told = json.loads((out / "provenance.json").read_text())
     assert told["interrupted_at_frame"] == result.frames["index"][-1] == last
-    assert f"interrupted at frame {last}: the result is of the frames until then" in warned(told)
+    assert f"The run was stopped at frame {last}: later frames are missing." in warned(told)
     assert [int(row["index"]) for row in frame_rows(out)] == list(range(last + 1))
     assert len(read_trajectory(out)) == last + 1
     assert len(trimesh.load_mesh(out / "mesh.ply").faces) > 100

@@ -131,7 +131,7 @@ def test_what_own_depth_returns_is_checked(function: Callable[[np.ndarray], np.n
     with pytest.raises(InputError, match=fault):
         one.step(tissue)
     two = Reconstructor(None, CAMERA, flow=lambda a, b: np.zeros((2, 2, 2)))
-    with pytest.raises(InputError, match="own flow: expected floats of shape"):
+    with pytest.raises(InputError, match="custom flow: expected floats of shape"):
         [two.step(tissue + step) for step in range(3)]
 
 
@@ -172,7 +172,7 @@ def test_limits_bound_what_is_kept(folder: Path) -> None:
     kept = result.trajectory.indices.tolist()
     assert 0 < len(kept) <= 4
     assert (kept[0], kept[-1]) == (0, FRAMES - 1)
-    assert "older frames are not in the result: it keeps 4" in " ".join(warned(result.provenance))
+    assert "The result keeps the last 4 frames; " in " ".join(warned(result.provenance))
     alone = Reconstructor(config, open_sequence(folder))
     alone.step(next(iter(alone.frames())))
     assert len(alone.surface().faces) == faces  # the first frame alone was fused

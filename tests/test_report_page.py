@@ -236,7 +236,7 @@ def test_prompt_and_report_tell_one_speed(folder: Path) -> None:
     result.provenance["seconds"] = {"total": 20.0, "compile kernels": 8.0}
     result.provenance["resumed_after_frame"] = None
     assert frames_per_s(result) == 24 / 12
-    assert time_words(result) == "time: 20.0 s, 2.0 frames/s"
+    assert time_words(result) == "20.0 s, 2.0 frames/s"
     run = Result(folder)
     assert page_data(run, shown_meshes(run, 1000))["frames_per_s"] == frames_per_s(run)
     result.provenance["resumed_after_frame"] = int(result.frames["index"][11])
@@ -248,10 +248,10 @@ def test_a_result_shows_itself_in_a_notebook_and_in_one_line(folder: Path) -> No
     result = drawn_result(name="<b>video</b>.mp4")
     assert repr(result) == in_one_line(result)
     assert repr(result) == (
-        "<Result, doubtful: 14 of 24 frames in one map; beside it 1 submap (1 not usable); scale unknown; "
-        "surface covers 94 % of its own pictures, not of the organ>"
+        "<Result, doubtful: 14 of 24 frames are in the result, others in 1 submap (1 not usable). "
+        "The scale is unknown. The surface covers 94 % of what these frames show, not of the organ.>"
     )
-    assert "7 of 7 frames in one map" in repr(result.others[0])
+    assert "7 of 7 frames are in the result" in repr(result.others[0])
     html = result._repr_html_()
     assert "&lt;Result" in html
     assert "<Result" not in html

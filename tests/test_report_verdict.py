@@ -55,8 +55,8 @@ def test_a_whole_run_is_good_and_its_sizes_are_unknown() -> None:
     found = verdict(run_of([0] * 100))
     assert found.word == "good"
     assert (
-        found.sentence
-        == "100 of 100 frames in one map; scale unknown; surface covers 94 % of its own pictures, not of the organ"
+        found.sentence == "100 of 100 frames are in the result. The scale is unknown. "
+        "The surface covers 94 % of what these frames show, not of the organ."
     )
     assert [reason.level for reason in found.reasons] == ["good", "good", "good"]
     assert found.advice == "The shape can be used. Sizes are unknown: compare shapes, do not measure."
@@ -65,10 +65,10 @@ def test_a_whole_run_is_good_and_its_sizes_are_unknown() -> None:
 def test_sizes_by_a_range_that_was_typed_are_not_called_known() -> None:
     scale = {"known": True, "measured": False, "stated": True, "source": "near-far 10:80 mm"}
     found = verdict(run_of([0] * 100, scale=scale))
-    assert "; scale as you stated it; " in found.sentence
+    assert " The scale is as you stated it. " in found.sentence
     assert "Sizes rest on your near-far 10:80 mm: check a length that you know." in found.advice
     found = verdict(run_of([0] * 100, scale=scale | {"stated": False, "measured": True, "source": "measured depth"}))
-    assert "Sizes are known (by measured depth)." in found.advice
+    assert "Sizes are known (from measured depth)." in found.advice
 
 
 def notices(*found: Notice) -> dict[str, Any]:
@@ -79,7 +79,7 @@ ANOTHER_LENS = {"change": -0.08, "x": 0.0, "y": 0.0, "surface": 0.06, "path": 0.
 MASKS = Notice("masks-missing", {"missing": 40, "frames": 50, "folder": "masks"})
 
 
-def test_notices_come_first_in_plain_words_and_once() -> None:
+def test_notices_come_first_and_once() -> None:
     counts = {"submaps": 10, "frames": 77, "tracked": 181, "saved": 2, "least": 5}
     said_elsewhere = [Notice("submaps-apart", counts), Notice("input-interrupted", {"frame": 30})]
     other = Notice("input-warning", {"text": "the video a.mp4 holds 3 damaged picture(s), which were left out"})
@@ -87,11 +87,13 @@ def test_notices_come_first_in_plain_words_and_once() -> None:
     facts = notices(*said_elsewhere, assumed, other, other, MASKS)
     found = verdict(run_of([0] * 40 + [LOST] * 10, **facts, interrupted_at_frame=30))
     assert [(reason.code, reason.level, reason.text) for reason in found.reasons[:3]] == [
-        ("interrupted", "doubtful", "The run was stopped at frame 30: the rest is missing."),
-        ("masks-missing", "doubtful", "Most frames have no mask: instruments may be part of the surface."),
+        ("interrupted", "doubtful", "The run was stopped at frame 30: later frames are missing."),
+        ("masks-missing", "doubtful", "40 of 50 frames have no mask in masks: instruments may be part of the surface."),
         ("input-warning", "note", "The video a.mp4 holds 3 damaged picture(s), which were left out."),
     ]
-    assert any(reason.text.startswith("80 % of the frames until then are in the result") for reason in found.reasons)
+    assert any(
+        reason.text.startswith("80 % of the frames until frame 30 are in the result") for reason in found.reasons
+    )
     assert not {"submaps-apart", "input-interrupted", "input-note"} & {reason.code for reason in found.reasons}
 
 
@@ -111,7 +113,7 @@ def test_submaps_of_three_seconds_that_are_usable_stand_for_their_part(apart: in
     other = changed(run.others[0], provenance={"verdict": {"level": level}})
     found = verdict(changed(run, others=[other]))
     assert found.word == word
-    assert f"40 of 80 frames in one map; beside it 1 submap (1 {rules.WORDS[level]}); " in found.sentence
+    assert f"40 of 80 frames are in the result, others in 1 submap (1 {rules.WORDS[level]}). " in found.sentence
 
 
 @pytest.mark.parametrize(
@@ -139,27 +141,30 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
     assert verdict(run_of([0] * 10)).word == "good"
     found = verdict(run_of([0] * 50, mesh=trimesh.Trimesh()))
     assert found.word == "not usable"
-    assert found.sentence == "50 of 50 frames in one map; scale unknown; no surface"
+    assert found.sentence == "50 of 50 frames are in the result. The scale is unknown. There is no surface."
 
 
 @pytest.mark.parametrize(
     ("facts", "words"),
     [
-        ({"camera": {"origin": "assumed"}}, "lens is a guess"),
-        (notices(Notice("mapping-not-rigid", {"merged": "", "sigma_px": 0.98})), "one rigid shape"),
+        ({"camera": {"origin": "assumed"}}, "lens is assumed"),
+        (notices(Notice("mapping-not-rigid", {"merged": "", "sigma_px": 0.98})), "scene is not rigid"),
         (notices(Notice("mapping-none")), "not adjusted: no other view confirms"),
-        (notices(Notice("camera-at-rest")), "hardly moves"),
-        (notices(Notice("camera-distorted", {"share": 0.12})), "bends straight lines"),
+        (notices(Notice("camera-at-rest")), "is at rest while the tissue moves"),
+        (notices(Notice("camera-distorted", {"share": 0.12})), "has radial distortion"),
         (notices(Notice("input-interlaced")), "is interlaced"),
-        (notices(Notice("camera-contradicted", ANOTHER_LENS)), "another lens (focal length -8%), which would change"),
-        (notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})), "as tracked"),
+        (notices(Notice("camera-contradicted", ANOTHER_LENS)), "another lens (focal length -8 %), which changes"),
+        (
+            notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})),
+            "would differ by 20 % (10 % before)",
+        ),
         (notices(moving(30)), "moves on its own in 30 of 60"),
         (notices(Notice("shape-not-determined", {"error_px": 0.3, "other_px": 0.31})), "does not determine the shape"),
         (
             notices(Notice("mapping-not-determined", {"error_px": 0.3, "other_px": 0.31, "merged": ""})),
             "rests on the depth network alone",
         ),
-        (notices(Notice("depth-triangulated", {"triangulated": 3, "keyframes": 6})), "in 3 of 6 keyframes only"),
+        (notices(Notice("depth-triangulated", {"triangulated": 3, "keyframes": 6})), "in only 3 of 6 keyframes"),
         (notices(Notice("mapping-without-observations", {"keyframes": 1})), "no other view confirms"),
         ({"interrupted_at_frame": 30}, "was stopped at frame 30"),
     ],
@@ -203,15 +208,15 @@ def test_submaps_are_in_order_of_time_and_the_worst_is_named() -> None:
         ("maps/1", 70, 99),
     ]
     texts = [reason.text for reason in verdict(run).reasons]
-    assert "Most doubtful of the submaps is maps/1, frames 70 to 99, with 55% inliers against 70% to 90%." in texts
+    assert "The most doubtful submap is maps/1 (frames 70 to 99), with 55 % inliers against 70 % to 90 %." in texts
     assert most_doubtful(submaps) is submaps[2]
 
 
 def test_frames_that_were_not_used_are_no_gap() -> None:
     places = [0, NOT_USED, NOT_USED] * 40
-    assert "Longest gap" not in " ".join(reason.text for reason in verdict(run_of(places)).reasons)
+    assert "longest gap" not in " ".join(reason.text for reason in verdict(run_of(places)).reasons)
     places[30:45] = [LOST, NOT_USED, NOT_USED] * 5
-    assert "Longest gap: 5 frames" in " ".join(reason.text for reason in verdict(run_of(places)).reasons)
+    assert "the longest gap is 5 frames" in " ".join(reason.text for reason in verdict(run_of(places)).reasons)
 
 
 def test_the_document_states_the_thresholds() -> None:
@@ -233,12 +238,14 @@ def test_a_camera_stated_to_be_at_rest_is_no_doubt() -> None:
 
 @pytest.mark.parametrize("code", KINDS)
 def test_every_notice_has_words_and_survives_json(code: str) -> None:
-    formatted = f"{KINDS[code].text}{KINDS[code].plain or ''}"
-    values = {name: 0.5 if re.search(rf"{{{name}:", formatted) else f"<{name}>" for name in fields_of_kind(code)}
+    kind = KINDS[code]
+    values = {name: 0.5 if re.search(rf"{{{name}:", kind.text) else f"<{name}>" for name in fields_of_kind(code)}
     notice = Notice(code, values)
-    assert all(str(value) in notice.text for value in values.values() if isinstance(value, str))
-    assert "{" not in f"{notice.text}{notice.plain}"
-    assert notice.plain.endswith(".") == (KINDS[code].plain != "")
+    shown = [value for name, value in values.items() if isinstance(value, str) and name not in kind.unsaid]
+    assert all(value.casefold() in notice.text.casefold() for value in shown)
+    assert not any(f"{{{name}" in kind.text for name in kind.unsaid)
+    assert "{" not in str(notice)
+    assert notice.text.endswith(".")
     (found,) = notices_of(json.loads(json.dumps(notices(notice, notice))))
     assert found == notice
     with pytest.raises(ValueError, match=code):
@@ -253,7 +260,7 @@ def test_the_documents_list_every_code_with_its_values() -> None:
 
 
 def test_no_doubtful_notice_is_left_out_of_the_verdict() -> None:
-    assert [code for code, kind in KINDS.items() if kind.level == "doubtful" and kind.plain == ""] == []
+    assert [code for code, kind in KINDS.items() if kind.level == "doubtful" and not kind.in_verdict] == []
 
 
 def test_the_summary_names_every_caution() -> None:

@@ -173,7 +173,7 @@ def test_what_is_missing_or_too_much_is_reported(tmp_path: Path) -> None:
     (folder / "Seq_001_info.json").unlink()
     sequence = open_sequence(folder)
     (warning,) = sequence.warnings
-    assert "Seq_001_a.mp4: 2 of 8 poses are of frames beyond the 6 of the video" in warning
+    assert "Seq_001_a.mp4: 2 of 8 poses belong to frames beyond the 6 of the video" in warning
     assert any("scale unknown" in note for note in sequence.notes)
     assert any("no calibration: Seq_001_info.json is missing" in note for note in sequence.notes)
 

@@ -248,7 +248,7 @@ def test_a_run_with_a_damaged_checkpoint_begins_anew_and_says_so(
     assert _bytes(out) == _bytes(wanted)
     (notice,) = [one for one in result.provenance["notices"] if one["code"] == "checkpoint-damaged"]
     assert name.split("/")[-1] in notice["text"]
-    assert told[0].startswith("beginning anew: ")
+    assert told[0].startswith("starting again: ")
 
 
 def test_stored_frames_that_are_damaged_while_a_run_works_end_it(folder: Path, tmp_path: Path) -> None:
@@ -260,7 +260,7 @@ def test_stored_frames_that_are_damaged_while_a_run_works_end_it(folder: Path, t
 
     with pytest.raises(InputError, match="the stored frames are damaged") as caught:
         _run(folder, out, "default", observers=(damage,))
-    assert "--no-resume begins anew" in caught.value.__notes__[0]
+    assert "--no-resume starts again" in caught.value.__notes__[0]
     assert _run(folder, out, "default").provenance["resumed_after_frame"] is None
 
 

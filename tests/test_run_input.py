@@ -59,13 +59,13 @@ def test_another_file_in_its_place_is_not_taken_for_it(video: tuple[Path, Path],
     place, run = video
     kept = shutil.copyfile(place, tmp_path / "kept.mp4")
     place.write_bytes(bytes(200))
-    with pytest.raises(InputError, match=r"a\.mp4 of the run .* is another file now; --input PATH"):
+    with pytest.raises(InputError, match=r"a\.mp4 of the run .* is another file now; name the input with --input PATH"):
         find_input(run)
     assert find_input(run, kept) == kept
-    with pytest.raises(InputError, match=r"is not what the run .* read .*: its content is another"):
+    with pytest.raises(InputError, match=r"is not the file that the run .* read .*: its content differs"):
         find_input(run, place)
     place.unlink()
-    with pytest.raises(InputError, match=r"is not there any more; --input PATH says where it is now"):
+    with pytest.raises(InputError, match=r"was not found; name it with --input PATH"):
         find_input(run)
     with pytest.raises(InputError, match=r"there is no .*gone\.mp4, which --input names"):
         find_input(run, tmp_path / "gone.mp4")
@@ -95,7 +95,7 @@ def test_exports_are_told_where_the_input_is(
     monkeypatch.chdir("/")
     out = tmp_path / ("out.mcap" if to == "mcap" else "out")
     said = refused(capfd, "export", run, "--to", to, "--out", out)
-    assert "--input PATH says where it is now; frames/ has no picture of 14 of the 14 frames" in said
+    assert "name it with --input PATH; frames/ has no picture of 14 of the 14 frames" in said
     assert call("export", run, "--to", to, "--out", out, "--input", tmp_path / "moved") == 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -120,7 +121,8 @@ def test_what_is_redacted_is_black_wherever_pictures_are_kept(
     size, boxes = ("--size", "160x128"), ("--redact", ",".join(map(str, _BOX)), "--redact", "0,0,4,4")
     code, said = call("run", source, "--out", tmp_path / "out", *size, *boxes), capfd.readouterr()
     assert code == 0, said.err
-    assert "note: redacted: 2 box(es) of each picture are black" in said.out
+    notices = json.loads((tmp_path / "out" / "provenance.json").read_text())["notices"]
+    assert any(notice["text"].startswith("Redacted: 2 box(es) of each picture are black") for notice in notices)
     kept = [cv2.imread(str(file)) for file in (tmp_path / "out" / "frames").glob("*[0-9].jpg")]
     assert len(kept) == FRAMES
     assert len(seen) >= FRAMES

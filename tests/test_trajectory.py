@@ -163,7 +163,7 @@ def test_c3vd_with_the_time_first(
 def test_c3vds_times_may_not_repeat(tmp_path: Path, trajectory: Trajectory) -> None:
     rows = [[0.5, *T.T.ravel()] for T in trajectory.T_world_camera[trajectory.tracked]]
     np.savetxt(tmp_path / "pose.txt", rows, delimiter=",")
-    with pytest.raises(InputError, match=r"pose\.txt, line 2: the time stamp of an earlier line comes again"):
+    with pytest.raises(InputError, match=r"pose\.txt, line 2: the time stamp of an earlier line is repeated"):
         read_trajectory(tmp_path)
 
 

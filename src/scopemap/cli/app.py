@@ -40,6 +40,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+_GROUPS = {
+    "Reconstruct": ("run", "demo", "live"),
+    "Look": ("view", "report", "export", "verify"),
+    "Measure": ("measure", "coverage", "locate", "compare-exams"),
+    "Compare and evaluate": ("evaluate", "compare", "bench", "climb"),
+    "Prepare": ("inspect", "calibrate", "datasets", "phantom", "models"),
+    "Many videos": ("batch",),
+}
+"""Commands in the groups of --help, those of scopemap-bench among them; others stand in a group of their own."""
 _MEASURES = [one for _, added in plugins("scopemap.measures") for one in added]
 _OWN = (
     run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage,
@@ -57,11 +66,13 @@ def commands() -> tuple[dict[str, Any], list[str]]:
 
 
 _COMMANDS, _LEFT_OUT = commands()
-for name, command in _COMMANDS.items():
+_GROUP_OF = {name: group for group, names in _GROUPS.items() for name in names}
+for name in sorted(_COMMANDS, key=lambda name: [*_GROUP_OF, name].index(name)):
+    command, group = _COMMANDS[name], _GROUP_OF.get(name)
     if isinstance(command, typer.Typer):
-        app.add_typer(command, name=name)
+        app.add_typer(command, name=name, rich_help_panel=group)
     else:
-        app.command(name)(command)
+        app.command(name, rich_help_panel=group)(command)
 
 
 def _version(requested: bool) -> None:

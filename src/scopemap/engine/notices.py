@@ -1,10 +1,11 @@
-"""What a run has to say about itself: typed notices, and the one place where each is put into words.
+"""What a run reports about itself: typed notices, and the one place that words each of them.
 
-Programs read `code` and `values` (docs/formats.md lists them); people read `text`.
+Programs read `code` and `values` (docs/formats.md lists them); people read `text` and `next_step`.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from string import Formatter
@@ -16,24 +17,35 @@ Level = Literal["info", "note", "doubtful"]
 
 @dataclass(frozen=True)
 class _Kind:
-    """Level and words of a code. plain : what the report says; None: `text`; "": another reason says the same."""
+    """Level and words of a code.
+
+    text : one sentence of at most 120 characters. next_step : an imperative of at most 80, or "". unsaid : values that
+    programs read and the sentence leaves out. in_verdict : False where another reason of the verdict says the same.
+    """
 
     level: Level
     text: str
-    plain: str | None = None
+    next_step: str = ""
+    unsaid: tuple[str, ...] = ()
+    in_verdict: bool = True
 
+
+_CHECK_THE_LENS = "Check the calibration (--camera, --fov or --scope)."
+_MORE_MOTION = "Do not trust the relief; record sideways motion and revisit places."
+_OTHER_STATES = "See mesh_over_time.glb for the other states."
 
 KINDS: dict[str, _Kind] = {
     # What readers of files found: free text, by which nothing is decided.
-    "input-note": _Kind("info", "{text}"),
-    "input-warning": _Kind("note", "{text}"),
-    "input-changed": _Kind("note", "the input {path} changed while it was read: this may be a part of it"),
-    "checkpoint-damaged": _Kind("info", "a killed run here could not be resumed, and this one began anew: {reason}"),
+    "input-note": _Kind("info", "{text}."),
+    "input-warning": _Kind("note", "{text}."),
+    "input-changed": _Kind(
+        "note",
+        "The input {path} changed while it was read, so frames may be missing.",
+        "Wait until the file is complete, then run again.",
+    ),
+    "checkpoint-damaged": _Kind("info", "The run began again at its first frame instead of resuming: {reason}."),
     "input-interlaced": _Kind(
-        "doubtful",
-        "the pictures are interlaced: their even and odd rows were taken at two times, and edges that move look like "
-        "combs; --deinterlace (input.deinterlace=true) uses one field of each",
-        "The video is interlaced: what moves has combed edges (see --deinterlace)",
+        "doubtful", "The video is interlaced: moving edges look like combs.", "Run again with --deinterlace."
     ),
     "input-interlaced-averaged": _Kind(
         "info",
@@ -52,194 +64,188 @@ KINDS: dict[str, _Kind] = {
     ),
     "input-text-burned-in": _Kind(
         "note",
-        "by its header notes, perhaps a patient's name, are burned into the images",
-        "Text is burned into the images, perhaps a patient's name: hand none on",
+        "The file states that text, perhaps a patient's name, is burned into its images.",
+        "Do not share images of this result; --redact blackens parts of them.",
     ),
-    "input-interrupted": _Kind("note", "interrupted at frame {frame}: the result is of the frames until then", ""),
-    "camera-assumed": _Kind("info", "camera {source}"),
+    "input-interrupted": _Kind(
+        "note", "The run was stopped at frame {frame}: later frames are missing.", in_verdict=False
+    ),
+    "camera-assumed": _Kind("info", "The camera is {source}."),
     "camera-unknown": _Kind(
         "note",
-        "{reason}; a calibration (--camera) or the field of view (--fov) makes the camera known, "
-        "the kind of endoscope (--scope) the guess better",
-        "",
+        "The focal length is assumed: {reason}.",
+        "Calibrate (--camera), or run again with --fov or --scope.",
+        in_verdict=False,
     ),
     "camera-distorted": _Kind(
         "doubtful",
-        "focal length: the lens has radial distortion, about {share:.0%} at half the image's width from the centre; "
-        "only a calibration corrects it (--camera)",
-        "The lens bends straight lines: shapes are bent, too. A calibration mends it",
+        "The lens has radial distortion, about {share:.0%} at half the image width from the centre, which bends "
+        "shapes.",
+        "Calibrate, and run again with --camera.",
     ),
     "camera-contradicted": _Kind(
         "doubtful",
-        "mapping: the views ask for another lens: focal length {change:+.0%}, principal point {x:+.0%} and {y:+.0%} of "
-        "it, which would change the surface by {surface:.0%} and the path by {path:.0%} of its length; check the "
-        "calibration and whether the pictures were cut after it, or the tissue moves",
-        "The motion asks for another lens (focal length {change:+.0%}), which would change the surface by "
-        "{surface:.0%}. Check the calibration, and whether the pictures were cut after it; or the tissue moves",
+        "The motion fits another lens (focal length {change:+.0%}), which changes surface by {surface:.0%} and path by "
+        "{path:.0%}.",
+        "Check calibration and cropping; tissue motion can look the same.",
+        unsaid=("x", "y"),
     ),
     "camera-unconfirmed": _Kind(
         "doubtful",
-        "mapping: the views do not tell the focal length (standard deviation {sigma:.0%}): nothing but the calibration "
-        "supports it",
-        "The motion does not tell the focal length: were the calibration wrong, this result would not show it",
+        "The motion does not constrain the focal length (standard deviation {sigma:.0%}): a wrong one would not show.",
+        "Check the calibration; record more rotation and sideways motion.",
     ),
     "camera-at-rest": _Kind(
         "doubtful",
-        "the camera is at rest while the tissue moves: errors of the path say little here",
-        "The camera hardly moves while the tissue does: the path means little",
+        "The camera is at rest while the tissue moves, so the estimated path means little.",
+        "Run again with --camera-at-rest.",
     ),
     "camera-at-rest-stated": _Kind(
-        "note",
-        "tracking: the camera is at rest, as stated: all motion is the tissue's",
-        "The camera was stated to be at rest: each frame has a surface of its own. Had it moved, all were wrong",
+        "note", "You stated that the camera is at rest: each frame has its own surface, wrong if the camera moved."
     ),
     "masks-missing": _Kind(
         "doubtful",
-        "masks: {missing} of {frames} frames have none in {folder}; the last number in a mask's name must be "
-        "the frame's",
-        "Most frames have no mask: instruments may be part of the surface",
+        "{missing} of {frames} frames have no mask in {folder}: instruments may be part of the surface.",
+        "Name each mask so that its last number is the frame's number.",
     ),
-    "frames-failed": _Kind("note", "{frames} frame(s) could not be processed whole (first: frame {first}, {reason})"),
-    "frames-without-depth": _Kind("note", "{frames} frame(s) got no depth from the network (first: frame {first})"),
+    "frames-failed": _Kind("note", "Processing failed in {frames:frame}, first in frame {first}: {reason}."),
+    "frames-without-depth": _Kind("note", "The network returned no depth for {frames:frame}, first for frame {first}."),
     "depth-propagated": _Kind(
-        "info", "depth: the network saw one frame in {every}; flow propagated it to {frames} others"
+        "info", "The network estimated depth in one frame in {every}; optical flow propagated it to {frames:frame}."
     ),
-    "frames-skipped": _Kind(
-        "info",
-        "{frames} frame(s) were skipped, without depth, because nothing in them can be followed: {causes}",
-    ),
-    "frames-few": _Kind(
-        "note", "frames in the result: {frames}, too few to judge it by; the surface is a glimpse from one place", ""
-    ),
-    "frames-forgotten": _Kind("note", "{frames} of the older frames are not in the result: it keeps {kept}"),
-    "frames-dropped": _Kind("info", "live: {dropped} of {read} frames were dropped, because newer ones were there"),
+    "frames-skipped": _Kind("info", "{frames:frame} without usable texture were skipped: {causes}."),
+    "frames-few": _Kind("note", "Only {frames:frame} are in the result: too few to judge it.", in_verdict=False),
+    "frames-forgotten": _Kind("note", "The result keeps the last {kept} frames; {frames} older ones are not in it."),
+    "frames-dropped": _Kind("info", "{dropped} of {read} live frames were dropped to keep the latency low."),
     "submaps-apart": _Kind(
         "note",
-        "{submaps} submaps: the camera was lost, and nothing connects what it saw before and after; {frames} of "
-        "{tracked} tracked frames are in the result; the relative pose of the others is unknown; {saved} with at least "
-        "{least} frames are saved in maps/",
-        "",
+        "The camera was lost and {submaps} submaps stay apart: {frames} of {tracked} tracked frames are in the result.",
+        "Look at the others in maps/; their relative poses are unknown.",
+        unsaid=("saved", "least"),
+        in_verdict=False,
     ),
     "tissue-moves": _Kind(
         "note",
-        "tissue: in {frames} of {measured} frames more than {threshold:.0%} of the picture moves on its own; most in "
-        "frame {most}: {share:.0%}, around {x:.2f} of the width and {y:.2f} of the height",
-        "Tissue moves on its own in {frames} of {measured} frames",
+        "Tissue moves on its own in {frames} of {measured} frames, most in frame {most} ({share:.0%} of the picture).",
+        "Run again with --surface-at SECONDS for the surface at one moment.",
+        unsaid=("threshold", "x", "y"),
     ),
     "mapping-none": _Kind(
         "doubtful",
-        "mapping: poses are as tracked; keyframes were not adjusted (--set mapping.method=local adjusts them, by flow)",
-        "Keyframes were not adjusted: no other view confirms depth and path",
+        "Keyframes were not adjusted: no other view confirms depth and path.",
+        "Run again with --set mapping.method=local.",
     ),
     "mapping-local": _Kind(
-        "info", "mapping: {adjusted} keyframes adjusted as they came, each with those before it; {refused} as tracked"
+        "info", "{adjusted:keyframe} were adjusted, each with those before it; {refused} kept their tracked poses."
     ),
     "mapping-local-not-rigid": _Kind(
         "doubtful",
-        "mapping: {adjusted} keyframes adjusted as they came, {refused} as tracked: there the scene is not rigid or "
-        "the focal length is wrong",
-        "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed",
+        "{refused:keyframe} could not be adjusted ({adjusted} were): the tissue moved, or the focal length is wrong.",
+        _CHECK_THE_LENS,
     ),
     "mapping-adjusted": _Kind(
         "info",
-        "mapping: {keyframes} keyframes adjusted, rotations by up to {rotation_deg:.1f} deg, {loops} loops closed in "
-        "{maps} map(s); reprojection errors {sigma_px:.2f} px (robust standard deviation); depth corrected by "
-        "{depth_change:.0%} on average",
+        "Bundle adjustment of {keyframes:keyframe} left {sigma_px:.2f} px reprojection error and closed {loops:loop} "
+        "in {maps:map}.",
+        unsaid=("rotation_deg", "depth_change"),
     ),
     "mapping-without-observations": _Kind(
-        "info", "mapping: poses are as tracked; the {keyframes} keyframes have no common observations"
+        "info", "Bundle adjustment was not possible: the {keyframes:keyframe} have no common observations."
     ),
     "mapping-not-rigid": _Kind(
         "doubtful",
-        "mapping: poses are as tracked{merged}; the scene is not rigid or the focal length is wrong: reprojection "
-        "errors stay at {sigma_px:.2f} px (robust standard deviation)",
-        "The views do not fit one rigid shape: the tissue moved, or the lens is other than assumed",
+        "Bundle adjustment was rejected ({sigma_px:.2f} px error): the scene is not rigid, or the focal length "
+        "is wrong.",
+        _CHECK_THE_LENS,
+        unsaid=("merged",),
     ),
     "shape-determined": _Kind(
-        "info",
-        "mapping: the motion determines the shape; the adjustment finds it from another start, too (correlation of the "
-        "relief {correlation:.2f})",
+        "info", "The motion determines the shape: another start finds it, too (correlation {correlation:.2f})."
     ),
     "shape-decided": _Kind(
         "note",
-        "mapping: starts of the adjustment end in different shapes; two of them in the one taken, with clearly smaller "
-        "errors of tracks left out: {error_px:.2f} px, {other_px:.2f} px for the other",
-        "Two shapes fit the views; the one that was taken fits them clearly better",
+        "Two shapes fit the views; the result has the better one ({error_px:.2f} against {other_px:.2f} px error).",
     ),
     "shape-not-determined": _Kind(
         "doubtful",
-        "mapping: starts of the adjustment end in different shapes; the one from the network's depth was taken (errors "
-        "of tracks left out {error_px:.2f} px, of the other {other_px:.2f} px)",
-        "The motion does not determine the shape: another one fits the views about as well",
+        "The motion does not determine the shape: no other start confirms it ({error_px:.2f} and {other_px:.2f} "
+        "px error).",
+        _MORE_MOTION,
     ),
     "mapping-not-determined": _Kind(
         "doubtful",
-        "mapping: poses are as tracked{merged}, and the depth network decides the shape; starts of the adjustment end "
-        "in different shapes (errors of tracks left out {error_px:.2f} and {other_px:.2f} px)",
-        "The motion does not determine the shape: it rests on the depth network alone",
+        "The motion does not determine the shape, which rests on the depth network alone.",
+        _MORE_MOTION,
+        unsaid=("error_px", "other_px", "merged"),
     ),
     "mapping-tissue-moves": _Kind(
         "doubtful",
-        "mapping: {keyframes} keyframes adjusted with tissue that moves, at {nodes} nodes by up to {moved:.0%} of the "
-        "median depth{periodic}; errors of tracks left out {px:.2f} px, {rigid_px:.2f} px if it were rigid",
-        "The tissue moved while it was filmed{periodic}: the surface is one state of it",
+        "Tissue moved by up to {moved:.0%} of the median depth{periodic}; the surface shows one state of it.",
+        _OTHER_STATES,
+        unsaid=("keyframes", "nodes", "px", "rigid_px"),
     ),
     "mapping-depth-disagrees": _Kind(
         "doubtful",
-        "mapping: poses are as tracked{merged}; depths of keyframes would disagree by {adjusted:.0%}, as tracked by "
-        "{tracked:.0%}",
-        "The path is as tracked: an adjustment of all views would have made distances disagree",
+        "Bundle adjustment was rejected: keyframe depths would differ by {adjusted:.0%} ({tracked:.0%} before).",
+        unsaid=("merged",),
     ),
     "depth-triangulated": _Kind(
-        "info",
-        "depth: {triangulated} of {keyframes} keyframes triangulated against frames around them; where views disagree "
-        "(moving tissue, uncertain poses) or are too few the predicted depth stays",
+        "info", "Several views measured depth in {triangulated} of {keyframes:keyframe}; the others keep the network's."
     ),
     "fusion-scaled": _Kind(
         "info",
-        "fusion: voxels of {voxel_mm:g} mm, 1/{divisor} of the clip's median depth, and depth up to {max_depth_mm:g} "
-        "mm; set fusion.voxel_mm for others",
+        "Voxels measure {voxel_mm:g} mm, 1/{divisor} of the median depth; pixels beyond {max_depth_mm:g} mm are not "
+        "fused.",
+        "Set fusion.voxel_mm for another size.",
     ),
     "fusion-coarsened": _Kind(
         "info",
-        "fusion: voxels of {voxel_mm:g} mm in place of {finest_mm:g} mm, so that the surface is within run.memory_mb",
+        "Voxels measure {voxel_mm:g} mm instead of {finest_mm:g} mm, so that the surface fits into memory.",
+        "Allow more with --memory.",
     ),
     "fusion-at-one-moment": _Kind(
-        "note",
-        "fusion: as seen at second {second:g} where tissue moves on its own, {where}",
-        "",
+        "note", "The surface shows moving tissue as seen at second {second:g}: {where}.", in_verdict=False
     ),
     "fusion-free-space": _Kind(
         "note",
-        "fusion: {share:.1%} of the pixels, in {frames} frames, are left out: other frames look through there, or "
-        "instruments touch them",
-        "",
+        "{share:.1%} of the pixels in {frames:frame} were not fused: others look through there, or an instrument "
+        "is near.",
+        in_verdict=False,
     ),
     "fusion-in-one-state": _Kind(
-        "info",
-        "fusion: what was seen of moving tissue was moved into its state at second {second:.2f}; mesh_over_time.glb "
-        "has its other states",
+        "info", "The surface shows moving tissue in its state at second {second:.2f}.", _OTHER_STATES
     ),
     "fusion-too-far": _Kind(
         "doubtful",
-        "most of the scene is not fused: its median depth is {median_mm:.0f} mm, fusion.max_depth_mm {max_depth_mm:g}; "
-        "raise fusion.max_depth_mm and fusion.voxel_mm",
-        "Most of what was seen is too far away to be in the surface",
+        "Most of the scene is not fused: its median depth is {median_mm:.0f} mm, and fusion ends at "
+        "{max_depth_mm:g} mm.",
+        "Run again with larger fusion.max_depth_mm and fusion.voxel_mm.",
     ),
     "memory-limited": _Kind(
         "info",
-        "memory: at most {observations} observations adjusted, {blocks} blocks of 8^3 voxels, stages {ahead} frame(s) "
-        "ahead (run.memory_mb)",
+        "To limit memory, {observations} observations, {blocks} blocks of 8^3 voxels and {ahead:frame} ahead are "
+        "kept at "
+        "most.",
     ),
 }
 """Every code with its level and its words."""
 
 
+class _Words(Formatter):
+    """Formats shares as "6 %", and counts by their noun: `{frames:frame}` is "1 frame" or "12 frames"."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if len(format_spec) > 1 and format_spec.isalpha():
+            return f"{value} {format_spec}" + "s" * (value != 1)
+        text = format(value, format_spec)
+        return f"{text[:-1]} %" if format_spec.endswith("%") else text
+
+
 @dataclass(frozen=True)
 class Notice:
-    """One thing that a run says about itself.
+    """One thing that a run reports about itself.
 
-    code : a key of `KINDS`, stable between versions. values : numbers and texts, those that the code's words name.
+    code : a key of `KINDS`, stable between versions. values : numbers and texts, as `fields_of_kind` names them.
     """
 
     code: str
@@ -257,22 +263,27 @@ class Notice:
 
     @property
     def text(self) -> str:
-        """One phrase, as in the summary of a run."""
-        return KINDS[self.code].text.format(**self.values)
+        """One sentence: what was found, and what it means for the result."""
+        words = _Words().vformat(KINDS[self.code].text, (), self.values)
+        return re.sub(r"^[a-z](?=[a-z-]*[\s:,])", lambda first: first[0].upper(), words.rstrip(".")) + "."
 
     @property
-    def plain(self) -> str:
-        """One sentence for the reader of a report; "" where another reason of the verdict says the same."""
-        kind = KINDS[self.code]
-        said = self.text if kind.plain is None else kind.plain.format(**self.values)
-        return f"{said[0].upper()}{said[1:].rstrip('.')}." if said else ""
+    def next_step(self) -> str:
+        """What to do about it, one sentence; "" where there is nothing to do."""
+        return KINDS[self.code].next_step
+
+    @property
+    def in_verdict(self) -> bool:
+        """Whether it is a reason of the verdict; False: an assumption, or another reason says the same."""
+        return self.level != "info" and KINDS[self.code].in_verdict
 
     def __str__(self) -> str:
-        return self.text
+        return f"{self.text} {self.next_step}".rstrip()
 
     def as_json(self) -> dict[str, Any]:
-        """Return code, level, values and text, as `provenance.json` holds them."""
-        return {"code": self.code, "level": self.level, "values": dict(self.values), "text": self.text}
+        """Return code, level, values, text and next step, as `provenance.json` holds them."""
+        facts = {"code": self.code, "level": self.level, "values": dict(self.values)}
+        return facts | {"text": self.text, "next_step": self.next_step}
 
     @classmethod
     def from_json(cls, found: Mapping[str, Any]) -> Notice:
@@ -283,8 +294,7 @@ class Notice:
 def fields_of_kind(code: str) -> set[str]:
     """Return the names of the values of a code."""
     kind = KINDS[code]
-    words = f"{kind.text} {kind.plain or ''}"
-    return {name for _, name, _, _ in Formatter().parse(words) if name}
+    return {name for _, name, _, _ in Formatter().parse(kind.text) if name} | set(kind.unsaid)
 
 
 def of_input(notes: Iterable[str | Notice], warnings: Iterable[str | Notice]) -> list[Notice]:
@@ -307,4 +317,4 @@ def scale_words(scale: Mapping[str, Any]) -> str:
         return f"scale: sizes rest on the stated {scale['source']}"
     if scale["known"]:
         return f"scale: {scale['source']}"
-    return f"scale unknown ({scale['source']}): sizes are a guess, compare shapes"
+    return f"scale unknown ({scale['source']}): compare shapes, not sizes"

@@ -89,7 +89,7 @@ def open_sequence(
     if frames.step is not None and frames.step <= 0:
         raise InputError(f"selecting frames: the step must be positive, got {frames.step}")
     if size is not None and not (isinstance(size, tuple | list) and len(size) == 2):
-        raise InputError(f"the working size {str(size)[:80]!r} is none: give (width, height), such as (320, 256)")
+        raise InputError(f"the working size {str(size)[:80]!r} is invalid: give (width, height), such as (320, 256)")
     with _errors_of_the_system(path):
         reader = _reader(Path(path), dataset)
     sequence = sequence_of(reader, camera=camera, fov_deg=fov_deg, size=size, frames=frames, settings=settings)

@@ -101,7 +101,8 @@ class Sequence:
     @property
     def notes(self) -> list[str | Notice]:
         """What had to be assumed about the input."""
-        return [*self.source.notes, *([] if self.calibrated else [f"camera {self.camera_source}"])]
+        assumed = [] if self.calibrated else [Notice("camera-assumed", {"source": self.camera_source})]
+        return [*self.source.notes, *assumed]
 
     @property
     def warnings(self) -> list[str | Notice]:

@@ -86,7 +86,7 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
         "words": [WORDS[level_of_submap(submap)] for submap in run.submaps],
         "scale_known": scale_is_known(run.provenance),
         "scale_source": scale_source(run.provenance),
-        "notes": [notice.text for notice in notices_of(run.provenance) if notice.level == "info"],
+        "notes": [str(notice) for notice in notices_of(run.provenance) if not notice.in_verdict],
         "frames_per_s": frames_per_s(run),
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "frames": _frames(run),

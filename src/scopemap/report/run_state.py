@@ -1,4 +1,4 @@
-"""How far a run is, in words: of the progress at the prompt and in a notebook."""
+"""The progress of a run in words, for the terminal and a notebook."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def of_all(total: int | None) -> str:
 
 
 class RunState:
-    """Counts the frames of a run as they pass; total : how many there are, None: nobody knows.
+    """Counts the frames of a run; total : their number, None: unknown.
 
     adjusts : whether keyframes are adjusted after the last frame, and frames fused then.
     """
@@ -34,9 +34,9 @@ class RunState:
 
     @property
     def time_left(self) -> str:
-        """The time until the result is written; "" before the second frame, and where no number of frames is known.
+        """The time until the result is written; "" before the second frame, and where the number of frames is unknown.
 
-        Frames per second are told once, of the whole run: those of tracking alone are more.
+        Frames per second are reported once, for the whole run: tracking alone is faster.
         """
         if self.done <= self._first or not self._total:
             return ""
@@ -67,6 +67,6 @@ class RunState:
         else:
             self._maps[step.track.map] += 1
             elsewhere = self._maps.total() - max(self._maps.values())
-            counts = ((self.lost, "lost"), (elsewhere, "in other maps"))
+            counts = ((self.lost, "lost"), (elsewhere, "in other submaps"))
             counted = ", ".join(f"{count} {words}" for count, words in counts if count)
-            self.text = "ok" + (f", {counted} so far" if counted else "")
+            self.text = "tracked" + (f" (so far {counted})" if counted else "")

@@ -74,7 +74,7 @@ def summary_picture(run: Result, meshes: Sequence[trimesh.Trimesh]) -> Image.Ima
 def _head_lines(found: Verdict) -> list[str]:
     """Return the main facts and every caution, as on the page; the first reasons where there is none."""
     cautions = [reason for reason in found.reasons if reason.level in ("bad", "doubtful")]
-    shown = [f"- {reason.text}" for reason in cautions or found.reasons[:_LEAST_REASONS]]
+    shown = [f"- {reason}" for reason in cautions or found.reasons[:_LEAST_REASONS]]
     return [part for line in (found.sentence, *shown) for part in textwrap.wrap(line, _LINE_LETTERS)]
 
 

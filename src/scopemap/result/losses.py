@@ -55,13 +55,13 @@ def losses(frames: FrameTable) -> list[LostSegment]:
     return found
 
 
-def in_words(found: list[LostSegment]) -> str:
-    """Return what most of the lost frames were lost by, with the advice; "" where nothing is known of it."""
+def main_cause(found: list[LostSegment]) -> tuple[str, str]:
+    """Return the cause of most of the lost frames and the advice on it; "" where nothing is known of it."""
     frames: Counter[LossCause] = Counter()
     for loss in found:
         if loss.cause:
             frames[loss.cause] += loss.frames
     if not frames:
-        return ""
+        return "", ""
     cause = frames.most_common(1)[0][0]
-    return f"Mostly by this: {cause}. Next time: {ADVICE[cause]}."
+    return cause.value, ADVICE[cause]

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from scopemap.apps.measure.measure import Measure
     from scopemap.input.sequence import Sequence
 
-_SCALE_NOT_STATED = "scale unknown (the run does not state it): sizes are a guess, compare shapes"
+_SCALE_NOT_STATED = "scale unknown (the run does not state it): compare shapes, not sizes"
 _MOST_PX = 1 << 15
 
 

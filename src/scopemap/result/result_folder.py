@@ -68,7 +68,7 @@ def result_folder(
         except BaseException as error:
             if has_checkpoint(unfinished):
                 error.add_note(
-                    f"a checkpoint is kept in {folder}: the same command resumes from there, --no-resume begins anew"
+                    f"a checkpoint is kept in {folder}: the same command resumes from there, --no-resume starts again"
                 )
             else:
                 shutil.rmtree(unfinished, ignore_errors=True)

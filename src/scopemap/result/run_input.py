@@ -45,15 +45,15 @@ def find_input(run: Path, given: Path | None = None) -> Path:
         if not given.exists():
             raise InputError(f"there is no {given}, which --input names as the input of the run {run}")
         if not _is_same(given, content):
-            raise InputError(f"{given} is not what the run {run} read ({name}): its content is another")
+            raise InputError(f"{given} is not the file that the run {run} read ({name}): its content differs")
         return given
     there = places_of_input(run)
     for place in (*there, *_neighbours(whole.folder, Path(name).name, content)):
         if _is_same(place, content):
             return place
     if there:
-        raise InputError(f"the input {there[0]} of the run {run} is another file now; --input PATH says where it is")
-    raise InputError(f"the input {name} of the run {run} is not there any more; --input PATH says where it is now")
+        raise InputError(f"the input {there[0]} of the run {run} is another file now; name the input with --input PATH")
+    raise InputError(f"the input {name} of the run {run} was not found; name it with --input PATH")
 
 
 def places_of_input(run: Path) -> list[Path]:

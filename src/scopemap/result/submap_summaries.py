@@ -32,7 +32,7 @@ class SubmapSummary:
     @property
     def inliers(self) -> str:
         """Its inliers in words, "" where they are unknown."""
-        return "" if np.isnan(self.inlier_share) else f"{self.inlier_share:.0%} inliers"
+        return "" if np.isnan(self.inlier_share) else f"{_percent(self.inlier_share)} inliers"
 
 
 def submaps_in_time(frames: FrameTable) -> list[SubmapSummary]:
@@ -58,6 +58,10 @@ def doubt_words(submaps: list[SubmapSummary]) -> str:
     if worst is None:
         return ""
     others = [submap.inlier_share for submap in submaps if submap is not worst and not np.isnan(submap.inlier_share)]
-    rest = f"{min(others):.0%}" + (f" to {max(others):.0%}" if len(others) > 1 else "")
-    where = f"{worst.name}, frames {worst.first} to {worst.last}"
-    return f"{where}, with {worst.inlier_share:.0%} inliers against {rest}"
+    rest = _percent(min(others)) + (f" to {_percent(max(others))}" if len(others) > 1 else "")
+    where = f"{worst.name} (frames {worst.first} to {worst.last})"
+    return f"{where}, with {worst.inliers} against {rest}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"

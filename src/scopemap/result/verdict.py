@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scopemap.engine.notices import Notice, notices_of
+from scopemap.engine.notices import KINDS, Notice, notices_of
 from scopemap.result.frame_table import ELSEWHERE, NOT_USED, FrameTable
 from scopemap.result.input_part import part_of_input
-from scopemap.result.losses import in_words, losses
+from scopemap.result.losses import losses, main_cause
 from scopemap.result.result import Result
 from scopemap.result.submap_summaries import doubt_words, submaps_in_time
 
@@ -37,15 +37,24 @@ MOST_MOVING = 0.5
 """Share of the frames in which tissue moves on its own."""
 LEAST_TRIANGULATED = 0.5
 """Share of the keyframes above which several views agree on depth."""
+_ONE_STATE = {"fusion-at-one-moment", "fusion-in-one-state"}
+"""Notices of a surface that shows moving tissue at one moment."""
 
 
 @dataclass(frozen=True)
 class Reason:
-    """One fact of a verdict: a stable code, its level ("note": it does not change the word), and a sentence."""
+    """One fact of a verdict: a stable code, its level ("note": it does not change the word), and a sentence.
+
+    next_step : what to do about it, one sentence; "" where there is nothing to do.
+    """
 
     code: str
     level: Level
     text: str
+    next_step: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text} {self.next_step}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -138,23 +147,23 @@ def _advice(run: Result, level: Level) -> str:
     if _scale_is_stated(run.provenance):
         return f"{use} Sizes rest on your {scale_source(run.provenance)}: check a length that you know."
     if scale_is_known(run.provenance):
-        return f"{use} Sizes are known (by {scale_source(run.provenance)})."
+        return f"{use} Sizes are known (from {scale_source(run.provenance)})."
     return f"{use} Sizes are unknown: compare shapes, do not measure."
 
 
 def _sentence(run: Result) -> str:
     inside, used = frames_in_result(run.frames)
     surface = run.provenance.get("surface") or {}
-    parts = [f"{inside} of {used} frames in one map"]
-    if judged := _submaps_in_words(run):
-        parts.append(f"beside it {judged}")
-    known = "scale as you stated it" if _scale_is_stated(run.provenance) else "scale known"
-    parts.append(known if scale_is_known(run.provenance) else "scale unknown")
+    judged = _submaps_in_words(run)
+    facts = [f"{inside} of {used} frames are in the result" + (f", others in {judged}" if judged else "")]
+    known = "The scale is as you stated it" if _scale_is_stated(run.provenance) else "The scale is known"
+    facts.append(known if scale_is_known(run.provenance) else "The scale is unknown")
     if not len(run.mesh.faces):
-        parts.append("no surface")
+        facts.append("There is no surface")
     elif "coverage_mean" in surface:
-        parts.append(f"surface covers {_percent(surface['coverage_mean'])} of its own pictures, not of the organ")
-    return "; ".join(parts)
+        covered = _percent(surface["coverage_mean"])
+        facts.append(f"The surface covers {covered} of what these frames show, not of the organ")
+    return "".join(f"{fact}. " for fact in facts).rstrip()
 
 
 def _of_frames(run: Result) -> Reason:
@@ -162,19 +171,20 @@ def _of_frames(run: Result) -> Reason:
     part = part_of_input(run.provenance)
     chosen, which = (" chosen", f" Chosen: {part}.") if part else ("", "")
     if inside < LEAST_FRAMES:
-        few = f"Only {inside} of {used}{chosen} frames could be joined: too few for a shape.{which}"
+        few = f"Only {inside} of {used}{chosen} frames are in the result: too few for a shape.{which}"
         return Reason("frames-too-few", "bad", few)
     place = run.frames.place[run.frames.place != NOT_USED]
     found = np.isin(place, [0, *_segments(run)])
     share, apart = found.mean(), int(found.sum()) - inside
     lost_in_a_row = longest_segment(~found)
-    longest = f" Longest gap: {lost_in_a_row} frames." if lost_in_a_row else ""
-    until = "" if run.provenance.get("interrupted_at_frame") is None else " until then"
+    longest = f"; the longest gap is {lost_in_a_row} frames" if lost_in_a_row else ""
+    last = run.provenance.get("interrupted_at_frame")
+    until = "" if last is None else f" until frame {last}"
     where, counted = "in the result", f"{inside} of {used}"
     if apart:
-        where += f", or in submaps of {LEAST_SEGMENT_S:g} s and more that can be used by themselves"
+        where += f" or in usable submaps of {LEAST_SEGMENT_S:g} s and more"
         counted = f"{inside} and {apart} of {used}"
-    text = f"{_percent(share)} of the{chosen} frames{until} are {where} ({counted}).{longest}{which}"
+    text = f"{_percent(share)} of the{chosen} frames{until} are {where} ({counted}){longest}.{which}"
     return Reason("frames-in-result", _level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
 
 
@@ -199,16 +209,24 @@ def _of_maps(run: Result) -> list[Reason]:
     lost, rotated = frames.counts["lost"], frames.counts["rotation_only"]
     if other:
         judged = _submaps_in_words(run)
-        saved = f"; saved and judged by themselves: {judged}" if judged else ""
-        text = f"After losses {other} more frames form submaps of their own: their relative poses are unknown{saved}."
-        found.append(Reason("submaps", "note", text))
+        text = f"{other} more frames form separate submaps; their relative poses are unknown."
+        step = f"Look at the {judged} in maps/." if judged else ""
+        found.append(Reason("submaps", "note", text, step))
     doubt = doubt_words(submaps_in_time(frames))
     if doubt:
-        found.append(Reason("submap-doubtful", "note", f"Most doubtful of the submaps is {doubt}."))
+        found.append(Reason("submap-doubtful", "note", f"The most doubtful submap is {doubt}."))
     if lost:
-        how = f" but for its rotation in {rotated}" if rotated else " at all"
-        words = f"In {lost} frames the camera could not be followed{how}. {in_words(losses(frames))}"
-        found.append(Reason("frames-lost", "note", words.rstrip()))
+        how = f", with known rotation in {rotated}" if rotated else ""
+        cause, step = main_cause(losses(frames))
+        why = f", mostly due to this: {cause}" if cause else ""
+        found.append(
+            Reason(
+                "frames-lost",
+                "note",
+                f"The camera was lost in {lost} {'frame' if lost == 1 else 'frames'}{how}{why}.",
+                step,
+            )
+        )
     return found
 
 
@@ -217,20 +235,20 @@ def _of_surface(run: Result) -> list[Reason]:
         return [Reason("surface-missing", "bad", "There is no surface.")]
     surface, found = run.provenance.get("surface") or {}, []
     if "coverage_mean" in surface:
-        coverage = float(surface["coverage_mean"])
-        text = f"The surface covers {_percent(coverage)} of the tissue in its own pictures (worst picture: "
-        text += f"{_percent(float(surface['coverage_least']))}). How much of the organ the camera saw is not known."
+        coverage, least = float(surface["coverage_mean"]), _percent(float(surface["coverage_least"]))
+        text = f"The surface covers {_percent(coverage)} of the tissue in its own frames (worst frame: {least})"
+        text += ", not of the organ."
         found.append(Reason("surface-coverage", _level(-coverage, -GOOD_COVERAGE, -LEAST_COVERAGE), text))
     if "depth_error" in surface:
         error = float(surface["depth_error"])
         levels, seen = [_level(error, GOOD_DISAGREEMENT, MOST_DISAGREEMENT)], ""
         if "within_10_percent_mean" in surface:
-            mean, least = (float(surface[f"within_10_percent_{name}"]) for name in ("mean", "least"))
+            mean, least_share = (float(surface[f"within_10_percent_{name}"]) for name in ("mean", "least"))
             levels.append(_level(-mean, -GOOD_WITHIN, -LEAST_WITHIN))
-            seen = f" They agree within 10 % in {_percent(mean)} of the picture (worst picture: {_percent(least)})."
+            seen = f"; {_percent(mean)} of a frame agree within 10 % (worst frame: {_percent(least_share)})"
         level = max(levels, key=("good", "doubtful", "bad").index)
-        words = {"good": "fits", "doubtful": "fits only roughly", "bad": "contradicts"}[level]
-        text = f"The surface {words} the single frames: distances differ by {_percent(error, 1)} (median).{seen}"
+        words = {"good": "fits", "doubtful": "fits poorly", "bad": "contradicts"}[level]
+        text = f"The surface {words} the frames: depth differs by {_percent(error, 1)} (median){seen}."
         found.append(Reason("surface-depth", level, text))
     return found
 
@@ -238,23 +256,22 @@ def _of_surface(run: Result) -> list[Reason]:
 def _of_camera(run: Result) -> list[Reason]:
     if run.provenance.get("camera", {}).get("origin") != "assumed":
         return []
-    text = "The lens is a guess (no calibration): depth against width may be wrong."
-    return [Reason("camera-assumed", "doubtful", text)]
+    text = "The lens is assumed, not calibrated: the ratio of depth to width may be wrong."
+    return [Reason("camera-assumed", "doubtful", text, KINDS["camera-unknown"].next_step)]
 
 
 def _of_notices(run: Result) -> list[Reason]:
-    """Return what the run says about itself, each once, unless another reason says the same."""
-    found = [notice for notice in notices_of(run.provenance) if notice.level != "info" and notice.plain]
+    """Return what the run reports about itself, each once, unless another reason says the same."""
+    found = [notice for notice in notices_of(run.provenance) if notice.in_verdict]
     codes = {notice.code for notice in notices_of(run.provenance)}
     if "camera-at-rest-stated" in codes:
-        found = [notice for notice in found if notice.code != "camera-at-rest"]
-    one = codes & {"fusion-at-one-moment", "fusion-in-one-state"}
-    shown = "as seen at one moment" if one else "a mean"
-    whole = "" if "camera-at-rest-stated" in codes else " Tissue that moves as a whole looks like a moving camera."
-    more = {"tissue-moves": f" There the surface is {shown}.{whole}"}
-    levels = [n.level if "camera-at-rest-stated" in codes else _level_of(n) for n in found]
-    texts = [n.plain + more.get(n.code, "") for n in found]
-    return [Reason(n.code, level, text) for n, level, text in zip(found, levels, texts, strict=True)]
+        return [_reason(n, n.level) for n in found if n.code != "camera-at-rest"]
+    return [_reason(n, _level_of(n), done=bool(codes & _ONE_STATE) and n.code == "tissue-moves") for n in found]
+
+
+def _reason(notice: Notice, level: Level, *, done: bool = False) -> Reason:
+    """Return a notice as a reason; done : its next step was taken."""
+    return Reason(notice.code, level, notice.text, "" if done else notice.next_step)
 
 
 def _level_of(notice: Notice) -> Level:
@@ -265,27 +282,29 @@ def _level_of(notice: Notice) -> Level:
 
 
 def _of_adjustment(run: Result) -> list[Reason]:
-    """Return whether several views agree on depth, where the starts of the adjustment do not tell it."""
-    said, found = notices_of(run.provenance), []
-    if {"shape-determined", "shape-decided"} & {notice.code for notice in said}:
+    """Return whether several views agree on depth, unless other starts of the adjustment confirm the shape."""
+    notices, found = notices_of(run.provenance), []
+    if {"shape-determined", "shape-decided"} & {notice.code for notice in notices}:
         return []
-    for notice in said:
+    more_motion = KINDS["shape-not-determined"].next_step
+    for notice in notices:
         values = notice.values
         if notice.code == "mapping-without-observations":
-            text = "The camera hardly moved, or nothing was found again: no other view confirms depth and path."
-            found.append(Reason("depth-unconfirmed", "doubtful", text))
+            text = "Keyframes have no common observations: no other view confirms depth and path."
+            found.append(Reason("depth-unconfirmed", "doubtful", text, more_motion))
         if notice.code == "depth-triangulated":
             count, keyframes = values["triangulated"], values["keyframes"]
             if count <= LEAST_TRIANGULATED * keyframes:
-                text = f"Several views agree on depth in {count} of {keyframes} keyframes only."
-                found.append(Reason("depth-unconfirmed", "doubtful", text))
+                text = f"Several views agree on depth in only {count} of {keyframes} keyframes."
+                found.append(Reason("depth-unconfirmed", "doubtful", text, more_motion))
     return found
 
 
 def _of_end(run: Result) -> list[Reason]:
     last = run.provenance.get("interrupted_at_frame")
-    text = f"The run was stopped at frame {last}: the rest is missing."
-    return [] if last is None else [Reason("interrupted", "doubtful", text)]
+    if last is None:
+        return []
+    return [Reason("interrupted", "doubtful", Notice("input-interrupted", {"frame": last}).text)]
 
 
 def _level(value: float, good: float, bad: float) -> Level:

@@ -98,7 +98,7 @@ class Checkpoints:
     def restore(self) -> tuple[int, bool]:
         """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
         facts = self._state.facts
-        with reporting("cannot resume from the checkpoint; --no-resume begins anew"):
+        with reporting("cannot resume from the checkpoint; --no-resume starts again"):
             for name, owner in (self._run.pipeline.stages | self._others).items():
                 # What reading frames finds is found again where they are read again.
                 if name != "source" or facts["complete"]:
@@ -145,7 +145,7 @@ def input_changes(identity: dict[str, Any], content: dict[str, Any], path: Path)
 def can_resume(folder: Path, identity: dict[str, Any], damage: list[str]) -> bool:
     """Return whether a folder holds a whole checkpoint of a run that would have the same result.
 
-    `damage` takes why one is not whole: the run then begins anew.
+    `damage` takes why one is not whole: the run then starts again.
     """
     state = SavedState(folder)
     try:

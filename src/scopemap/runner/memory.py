@@ -72,7 +72,7 @@ def memory_plan(config: Config, sequence: Sequence) -> MemoryPlan:
     used = (config.depth.backend, config.depth.anchor, networks.flow, networks.keyframe_flow, networks.perceptual)
     if unknown := sorted({name for name in used if name.startswith(_UNMEASURED)}):
         raise SettingsError(
-            f"--memory (run.memory_mb) cannot be held with {', '.join(unknown)}: what PyTorch takes is not known"
+            f"--memory (run.memory_mb) cannot be guaranteed with {', '.join(unknown)}: PyTorch's own use is not known"
         )
     camera, source = sequence.camera, sequence.source
     pixels, frames = camera.width * camera.height, sequence.count or 0

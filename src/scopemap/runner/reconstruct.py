@@ -47,8 +47,8 @@ def reconstruct(
     """Turn a sequence, or a video, into poses, depth and a surface.
 
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
-    result; where that is damaged it begins anew, which a notice says. So it does where a `tracker` of your own keeps
-    nothing (`Kept`). Observers of the kind `KeptObserver` are resumed and saved with it.
+    result; if that is damaged the run starts again, which a notice reports. So it does where a `tracker` of your own
+    keeps nothing (`Kept`). Observers of the kind `KeptObserver` are resumed and saved with it.
 
     The settings in the result are the resolved ones: the TSDF parameters are numbers. Of several submaps the one with
     most frames is the result, and `others` holds the others. With `out` the result is read from that folder.
@@ -97,7 +97,7 @@ def _reconstruct(
     resumes = partial(can_resume, identity=identity, damage=damage)
     with result_folder(out, overwrite=overwrite, can_resume=resumes) as folder:
         for reason in damage:
-            progress(f"beginning anew: {reason}", 0, 0)
+            progress(f"starting again: {reason}", 0, 0)
         store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
         sequence, config, estimators, notices = prepare(sequence, config, clock.timed, progress)
         notices = [Notice("checkpoint-damaged", {"reason": reason}) for reason in damage] + notices

@@ -189,7 +189,7 @@ def _short(value: Any) -> str:
 
 
 def print_warnings(provenance: Mapping[str, Any]) -> None:
-    """Print the notices of a run that are more than an assumption, one a line, to the standard error."""
+    """Print the notices of a run that are more than assumptions, with their next steps, to the standard error."""
     from scopemap.engine.notices import notices_of
 
     for notice in notices_of(provenance):

@@ -20,40 +20,41 @@ advanced = partial(typer.Option, rich_help_panel="Advanced")
 
 Align = Literal["none", "origin", "se3", "sim3", "scale"]
 Unit = Literal["mm", "m"]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and JSON.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print only errors and JSON.")]
 ResultFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run.")]
 Input = Annotated[
-    Path, typer.Argument(metavar="INPUT", help="A video file, a folder of images, the folder of a data set's sequence.")
+    Path, typer.Argument(metavar="INPUT", help="Video file, folder of images, or folder of a data set's sequence.")
 ]
 InputNow = Annotated[
     Path | None,
-    typer.Option("--input", metavar="PATH", help="Where the run's input is now, if it is not found where it was."),
+    typer.Option("--input", metavar="PATH", help="Where the run's input is now, if it has moved."),
 ]
 PresetName = Annotated[
     Literal["default", "paper", "paper-strict", "realtime"] | None,
     typer.Option(
-        help="default: best of what needs no download; paper: the method as published, made robust; paper-strict: "
-        "without what it does beyond the text; realtime: fast."
+        help="Preset: default (no downloads), paper (as published, made robust), paper-strict (as published), "
+        "realtime (fast)."
     ),
 ]
 ConfigFile = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Settings as TOML; a run's config.toml repeats it.")
+    Path | None, typer.Option(metavar="FILE", help="TOML file of settings; config.toml of a run repeats that run.")
 ]
 CameraFit = Annotated[
     str | None,
     advanced(
         metavar="FIT",
-        help="What a calibration of another size means: exact (refused), scale (images were resized), crop:X,Y.",
+        help="Fit a calibration of another image size: exact (refuse), scale (images were resized), crop:X,Y.",
     ),
 ]
 Dataset = Annotated[
-    str | None, advanced(metavar="NAME", help="Its reader (`scopemap datasets list`); recognised if left out.")
+    str | None, advanced(metavar="NAME", help="Reader of the input (`scopemap datasets list`); default: recognised.")
 ]
 CameraFile = Annotated[
     Path | None,
     typer.Option(
-        metavar="FILE|NUMBERS", help="Calibration file or 'fx fy cx cy [k1 k2 p1 p2 \\[k3]]', px of the input's images."
+        metavar="FILE|NUMBERS",
+        help="Calibration file, or 'fx fy cx cy [k1 k2 p1 p2 \\[k3]]' in px of the input's images.",
     ),
 ]
 FieldOfView = Annotated[
@@ -61,29 +62,35 @@ FieldOfView = Annotated[
     typer.Option(
         min=5.0,
         max=170.0,
-        help="Horizontal field of view, degrees, of an unknown camera; default: estimated, or 70 (live: 70).",
+        help="Horizontal field of view of an unknown camera, degrees; default: estimated, else 70 (live: 70).",
     ),
 ]
 Scope = Annotated[
     str | None,
     typer.Option(
         metavar="KIND",
-        help="Kind of endoscope of an unknown camera: colonoscope, gastroscope, bronchoscope, laparoscope, cystoscope, "
-        "ureteroscope, sinus, capsule.",
+        help="Kind of endoscope: colonoscope, gastroscope, bronchoscope, laparoscope, cystoscope, ureteroscope, "
+        "sinus, capsule.",
     ),
 ]
 NearFar = Annotated[
     str | None,
-    typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm; replaces the anchor."),
+    typer.Option(metavar="NEAR:FAR", help="Nearest and farthest tissue in the first frame, mm; sets the scale."),
 ]
 Size = Annotated[
     str | None,
-    typer.Option(metavar="WxH", help="Working size, px; default: the input's over a whole number, at most 400 px."),
+    typer.Option(
+        metavar="WxH",
+        help="Working size, px; default: the input size divided by an integer, at most 400 px wide or high.",
+    ),
 ]
 SetPairs = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Any setting, such as tracking.keyframe_every=5.")
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Set any setting, such as tracking.keyframe_every=5; may be repeated."
+    ),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier call wrote there.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace earlier output.")]
 
 
 def check_output(file: Path, endings: tuple[str, ...], overwrite: bool) -> None:
@@ -148,7 +155,11 @@ def parse_slice(text: str) -> slice:
 
 Frames = Annotated[
     slice | None,
-    typer.Option(parser=parse_slice, metavar="A:B:S", help="Which frames, as a Python slice: 0:5000, ::10."),
+    typer.Option(
+        parser=parse_slice,
+        metavar="A:B:S",
+        help="Frames to use, as a Python slice such as 0:5000 or ::10; default: all.",
+    ),
 ]
 
 

@@ -25,36 +25,39 @@ def bench(
         str | None,
         typer.Argument(
             metavar="PLAN|speed",
-            help="A TOML file, or one of the plans of the package; without it these are listed. speed: the processor "
-            "time of each stage.",
+            help="Name of a plan or a TOML file; default: list the plans. speed: time each stage.",
         ),
     ] = None,
     video: Annotated[
-        Path | None, typer.Argument(metavar="[VIDEO]", help="What speed measures; by default a phantom.")
+        Path | None, typer.Argument(metavar="[VIDEO]", help="Video that speed measures; default: a phantom.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for runs, tables and figures; continues an earlier call.")
+        Path | None, typer.Option(help="Folder for runs, tables and figures; an earlier call there is resumed.")
     ] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of the plan's paths.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder that the plan's paths refer to.")] = None,
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="Only print sequences, rows, weights that are missing, and the hours expected."),
+        typer.Option("--dry-run", help="Only print sequences, rows, missing weights and expected hours."),
     ] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Run failed rows again.")] = False,
     timeout_s: Annotated[
-        float | None, typer.Option("--timeout", min=1, help="Seconds after which a run is ended.")
+        float | None, typer.Option("--timeout", min=1, help="Stop a run after this many seconds; default: no limit.")
     ] = None,
-    paper_units: Annotated[bool, typer.Option("--paper-units", help="Rotations of tables 1 to 3 in radians.")] = False,
-    frames: Annotated[int | None, typer.Option(min=2, help="speed: frames of the video, from the first.")] = None,
+    paper_units: Annotated[
+        bool, typer.Option("--paper-units", help="Print rotations of tables 1 to 3 in radians; default: degrees.")
+    ] = False,
+    frames: Annotated[int | None, typer.Option(min=2, help="For speed: use the first N frames; default: all.")] = None,
     compare: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="speed: names the stages that are slower than in FILE, printed by --json."),
+        typer.Option(
+            metavar="FILE", help="For speed: name the stages that are slower than in FILE, which --json wrote."
+        ),
     ] = None,
-    preset: Annotated[_Preset | None, typer.Option(help="speed: preset of the run, by default default.")] = None,
+    preset: Annotated[_Preset | None, typer.Option(help="For speed: preset of the run; default: default.")] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run a benchmark's plan, or the rest of it, and write its tables and figures."""
+    """Run or resume a benchmark plan, or time the stages of a run."""
     of_plans = {"--out": out, "--data": data, "--timeout": timeout_s}
     of_plans |= {"--dry-run": dry_run or None, "--retry": retry or None, "--paper-units": paper_units or None}
     of_speed = {"VIDEO": video, "--frames": frames, "--compare": compare, "--preset": preset}

@@ -16,11 +16,12 @@ from scopemap.terminal.options import AsJson, Quiet
 def climb(
     out: Annotated[Path, typer.Option(help="Folder of the submission; clips are added to it.")],
     runs: Annotated[
-        list[Path] | None, typer.Argument(metavar="[RUN]...", help="Folders of runs; without one --out is checked.")
+        list[Path] | None,
+        typer.Argument(metavar="[RUN]...", help="Folders of runs; without any, only --out is checked."),
     ] = None,
     clip: Annotated[str, typer.Option(help="Name of the clip; default: that of the run's input.")] = "",
     videos: Annotated[
-        Path | None, typer.Option(help="Folder of the challenge's videos: each must have its clip.")
+        Path | None, typer.Option(help="Folder of the challenge's videos; every video must have a clip.")
     ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="Folder of the references, CLIP/results_txt/images.txt: scores the submission.")
@@ -28,9 +29,10 @@ def climb(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert runs into a CLiMB submission, and check it by the challenge's rules (exit code 1).
+    """Convert runs into a CLiMB submission, check it, and score it.
 
-    With --truth the submission is scored: the mean over all clips of their scores, failed ones included.
+    Each run becomes the five runs of a clip. The exit code is 1 if the submission breaks a rule of the challenge. With
+    --truth the score is the mean over all clips, failed ones included.
     """
     from scopemap_bench.climb.ranking import ranking_of
     from scopemap_bench.climb.submission import submission_problems, write_submission

@@ -16,28 +16,34 @@ from scopemap.terminal.options import Align, AsJson, Quiet, Unit
 def compare(
     paths: Annotated[
         list[Path],
-        typer.Argument(metavar="DIR...", help="Runs' folders, a benchmark's runs, or trajectory files of any system."),
+        typer.Argument(
+            metavar="DIR...", help="Folders of runs, folder of a benchmark, or trajectory files of any system."
+        ),
     ],
     truth: Annotated[
         Path | None,
-        typer.Option(help="True poses: a data set's folder or a trajectory file; a benchmark's runs need none."),
+        typer.Option(help="True poses: data set's folder or trajectory file; a benchmark has its own."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for tables and figures.")] = None,
-    names: Annotated[str | None, typer.Option(metavar="A,B,...", help="Names for the table.")] = None,
+    names: Annotated[
+        str | None, typer.Option(metavar="A,B,...", help="Names of the rows; default: those of the folders.")
+    ] = None,
     align: Annotated[
-        Align, typer.Option(help="Alignment; a benchmark's runs keep the figures that they were measured with.")
+        Align, typer.Option(help="Align before measuring; runs of a benchmark keep their figures.")
     ] = "sim3",
-    unit: Annotated[Unit, typer.Option(help="Unit of trajectory files that do not state one.")] = "mm",
+    unit: Annotated[Unit, typer.Option(help="Unit of trajectory files that state none.")] = "mm",
     consistency: Annotated[
-        bool, typer.Option("--consistency", help="Also the consistency of depth over time.")
+        bool, typer.Option("--consistency", help="Also measure the consistency of depth over time.")
     ] = False,
-    paper_units: Annotated[bool, typer.Option("--paper-units", help="Rotations of tables 1 to 3 in radians.")] = False,
+    paper_units: Annotated[
+        bool, typer.Option("--paper-units", help="Print rotations of tables 1 to 3 in radians; default: degrees.")
+    ] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure runs against one truth, and print and write their tables and figures; two runs alone: with each other.
+    """Compare runs with one truth, or two runs with each other.
 
-    Without a truth, the first of two runs is moved onto the second by the Sim(3) of the frames that both have.
+    Without a truth, the first of two runs is aligned to the second by a Sim(3) fitted to their common frames.
     """
     from scopemap.report.page import PAGE, write_comparison
     from scopemap.result.result import Result

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from scopemap.apps.inspect.clip import Finding
     from scopemap.input.source import Source
 
-app = typer.Typer(help="List the supported data sets; check one.", no_args_is_help=True)
+app = typer.Typer(help="List the supported data sets, or check one.", no_args_is_help=True)
 
 
 @app.command("list")
 def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """List the data sets that are read, in the order in which they are recognised."""
+    """List the supported data sets in the order of recognition."""
     from scopemap.input.opening import readers
 
     # A reader's docstrings and its layout's table are the only description of a data set.
@@ -41,14 +41,17 @@ def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
 
 @app.command()
 def check(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="A video, a folder of images or a data set's folder.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="Video, folder of images, or folder of a data set.")],
     dataset: Dataset = None,
     camera: CameraFile = None,
     settings: SetPairs = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Read a data set once and report errors in its frames, camera, poses and depth; exit code 1 with errors."""
+    """Check the frames, camera, poses and depth of a data set.
+
+    The exit code is 1 if there are errors.
+    """
     from scopemap.engine.config import Config
     from scopemap.input.opening import open_sequence
     from scopemap_bench.datasets.checking import check as findings_of

@@ -23,8 +23,7 @@ def surface(
         bool,
         typer.Option(
             "--icp",
-            help="Also the mesh after a refinement by ICP. A run's mesh.ply is measured wherever the truth has a "
-            "surface, moved by the alignment of the trajectory.",
+            help="Also measure the mesh after refining its alignment by ICP.",
         ),
     ] = False,
 ) -> dict[str, Any]:
@@ -57,7 +56,7 @@ def surface(
 def paper(
     compared: Compared,
     paper_units: Annotated[
-        bool, typer.Option("--paper-units", help="Also the figures of the paper's table 1, rotations in radians.")
+        bool, typer.Option("--paper-units", help="Also print the paper's table 1, rotations in radians.")
     ] = False,
 ) -> dict[str, Any]:
     """Return the figures of the paper's table 1."""
@@ -73,8 +72,8 @@ def protocols(
     protocol: Annotated[
         list[str] | None,
         typer.Option(
-            help="Also another protocol's figures, may be repeated: evo, af, endogslam, surgcut3r, free-surgs, simcol, "
-            "robust-pose-estimator, oneslam, climb."
+            help="Also measure by evo, af, endogslam, surgcut3r, free-surgs, simcol, robust-pose-estimator, "
+            "oneslam or climb."
         ),
     ] = None,
 ) -> dict[str, Any]:
@@ -97,10 +96,14 @@ def protocols(
 def depth(
     compared: Compared,
     scaling: Annotated[
-        DepthScaling | None, typer.Option("--depth", help="Also a run's depth maps against true depth, scaled so.")
+        DepthScaling | None, typer.Option("--depth", help="Also compare depth maps with true depth, scaled this way.")
     ] = None,
     consistency: Annotated[
-        bool, typer.Option("--consistency", help="Also how steady a run's depth is; --truth is a data set's folder.")
+        bool,
+        typer.Option(
+            "--consistency",
+            help="Also measure the consistency of depth over time; --truth must be a data set's folder.",
+        ),
     ] = False,
 ) -> dict[str, Any]:
     """Return the figures of a run's depth maps; a truth without poses will do."""

@@ -14,34 +14,45 @@ from scopemap.terminal.progress import count_progress
 
 
 def phantom(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="new or empty folder, or one of an earlier phantom")],
-    scene: Annotated[str, typer.Option(help="colon | laparoscopy | abdominal_wall | tube")] = "colon",
-    frames: Annotated[int | None, typer.Option(help="number of frames; default 200, or all of --path")] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="image size, px")] = "320x256",
-    seed: Annotated[int, typer.Option(help="of everything random")] = 0,
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="New or empty folder, or folder of an earlier phantom.")
+    ],
+    scene: Annotated[str, typer.Option(help="Scene: colon, laparoscopy, abdominal_wall, or tube.")] = "colon",
+    frames: Annotated[int | None, typer.Option(help="Number of frames; default: 200, or all of --path.")] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Image size, px.")] = "320x256",
+    seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
     path: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="camera path to follow, 16 numbers per line")
+        Path | None, typer.Option(metavar="FILE", help="Camera path to follow: one 4x4 pose per line, as 16 numbers.")
     ] = None,
-    deform: Annotated[bool, typer.Option("--deform", help="let the tissue breathe")] = False,
-    loop: Annotated[bool, typer.Option("--loop", help="end in exactly the first pose")] = False,
+    deform: Annotated[bool, typer.Option("--deform", help="Let the tissue breathe.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="End in exactly the first pose.")] = False,
     events: Annotated[
         str,
         typer.Option(
-            help="KIND:A-B,... (frames, inclusive): black, blur, smoke, veil, fluid, instrument, turn, contact, "
-            "push, rebound, poke, peristalsis, grasp, cut"
+            metavar="KIND:A-B,...",
+            help="Events: black, blur, smoke, veil, fluid, instrument, turn, contact, push, rebound, poke, "
+            "peristalsis, grasp, cut.",
         ),
     ] = "",
     polyps: Annotated[
-        str, typer.Option(help="KIND:MM@FRAME,... where that frame sees the wall: sessile, pedunculated, flat")
+        str,
+        typer.Option(
+            metavar="KIND:MM@FRAME,...",
+            help="Polyps on the wall that this frame sees: sessile, pedunculated, flat; size in mm.",
+        ),
     ] = "",
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="route, fov_deg, noise, texture, shutter, ..."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Set a property of the phantom, such as noise=2 or fov_deg=90; may be repeated.",
+        ),
     ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render synthetic endoscopy with true poses, depth and mesh, in the C3VD layout."""
+    """Render synthetic endoscopy with exact truth (C3VD layout)."""
     # Imported here, so that --help does not wait for the kernels.
     from scopemap_bench.phantom.spec import PhantomSpec, parse_events, parse_polyps
     from scopemap_bench.phantom.writer import write_phantom

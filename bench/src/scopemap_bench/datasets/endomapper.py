@@ -80,12 +80,13 @@ class EndoMapperSequence(PosedVideo):
             match = _FRAME.fullmatch(name)
             number = int(match[1]) - 1 if match else -1
             if number < 0 or number in self.poses:
-                raise InputError(f"reading {archive}: the image name {name!r} is none of a frame, outN.png, or repeats")
+                raise InputError(f"reading {archive}: the image name {name!r} is not outN.png, or repeats")
             self.poses[number] = pose
-        self.notes.append(
-            f"truth: COLMAP sub-model {chosen}, the largest of {count}: {len(self.poses)} frames; its "
-            "scale is arbitrary (its unit is taken as mm); image outN.png is taken as frame N - 1; no depth is known"
-        )
+        self.notes += [
+            f"the truth is COLMAP sub-model {chosen}, the largest of {count}: {len(self.poses)} frames; its scale is "
+            "arbitrary, read as mm",
+            "image outN.png is taken as frame N - 1; no depth is known",
+        ]
         self._warn_of_poses_beyond(archive)
 
 

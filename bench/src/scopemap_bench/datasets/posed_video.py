@@ -60,7 +60,7 @@ class PosedVideo(Source):
     def _warn_of_poses_beyond(self, file: Path) -> None:
         beyond = sum(self.count is not None and number >= self.count for number in self.poses)
         if beyond:
-            what = f"{beyond} of {len(self.poses)} poses are of frames beyond the {self.count} of the video"
+            what = f"{beyond} of {len(self.poses)} poses belong to frames beyond the {self.count} of the video"
             self._warn(f"{file}: {what}; poses may belong to other frames")
 
 

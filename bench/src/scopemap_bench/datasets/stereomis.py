@@ -41,8 +41,7 @@ class StereoMisFolder(PosedVideo):
             self.notes.append(f"no pose is known: {_POSES} is not there")
         if (path / "masks").is_dir():
             self.notes.append(
-                "masks/ is not used: 0 is where instruments are, the other way round than mask.files has it, and the "
-                "numbers count from 1"
+                "masks/ is not used: it marks instruments by 0, unlike mask.files, and counts frames from 1"
             )
 
     @staticmethod
@@ -54,7 +53,7 @@ class StereoMisFolder(PosedVideo):
         """Read rows of 8 numbers, the first the frame, in any order; numbers from 1 count frames from 1.
 
         A row that holds NaN or infinity is a frame without a pose. Raises `InputError`, with the line, for what is no
-        such row, and for a frame that comes again.
+        such row, and for a frame that is repeated.
         """
         table = read_numbers(file, missing=True).with_columns(8, "frame tx ty tz qx qy qz qw").sorted_by_stamp()
         numbers = table.values[:, 0]
@@ -63,8 +62,8 @@ class StereoMisFolder(PosedVideo):
         offset = int(numbers[0] == 1)
         poses = poses_by_row(table.values[:, -7:], _MM_PER_METRE, table.where)
         self.poses = {int(numbers[row]) - offset: pose for row, pose in poses.items()}
-        self.notes.append(
-            f"truth: robot kinematics, {_POSES} taken as camera-to-world in metres; row {offset} is the video's first "
-            "frame; no depth is known"
-        )
+        self.notes += [
+            f"the truth is robot kinematics: {_POSES} is read as camera-to-world in metres",
+            f"row {offset} of the truth is the video's first frame; no depth is known",
+        ]
         self._warn_of_poses_beyond(file)

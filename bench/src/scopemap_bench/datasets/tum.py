@@ -120,7 +120,7 @@ class TumRgbdFolder(ImageFolder):
 def read_stamped(file: Path) -> NumberTable:
     """Return the rows `stamp tx ty tz qx qy qz qw` of a file, by ascending stamp; NaN or a quaternion of 0 is no pose.
 
-    Raises `InputError`, with the line, for any other row, for a stamp that comes again, and where no pose is left.
+    Raises `InputError`, with the line, for any other row, for a stamp that is repeated, and where no pose is left.
     """
     table = read_numbers(file, missing=True).with_columns(8, "stamp tx ty tz qx qy qz qw")
     known = np.isfinite(table.values).all(axis=1) & table.values[:, 4:].any(axis=1)
@@ -162,7 +162,7 @@ def _read_list(file: Path) -> list[tuple[float, str]]:
     listed: dict[float, str] = {}
     for where, (stamp, name) in _fields_by_line(file, "timestamp filename"):
         if float(stamp) in listed:
-            raise InputError(f"{where}: the time stamp of an earlier line comes again; leave one out")
+            raise InputError(f"{where}: the time stamp of an earlier line is repeated; leave one out")
         listed[float(stamp)] = name
     if not listed:
         raise InputError(f"reading {file}: it names no image")

@@ -74,7 +74,7 @@ class PhantomSpec:
     route : of a generated path. wander: forward in a lumen, to and fro over a cavity; sideways: by 22 mm, a third of
     the distance to a cavity's floor; withdrawal: 52 mm straight back. These two are as long in any number of frames.
     fold_mm : how far the folds of a colon rise from its wall, at most; behind deep ones more is hidden.
-    examination : 0: the first one; another number: the same scene seen again, on another path beside the first
+    examination : 0: the first one; another number: the same scene at a later visit, on another path beside the first
     one's, with fluid on other places.
     insufflation : share by which the tissue is wider than its mesh, across the first view.
     deform : whether the tissue breathes; breath_mm, breath_frames: how far and how often. events : see `Event`.

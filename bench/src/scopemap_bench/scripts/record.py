@@ -114,7 +114,7 @@ def main() -> None:
         parser.error(f"unknown table: {', '.join(sorted(unknown))}")
     if options.check:
         lines = outdated()
-        print("\n".join(lines) or "all tables are of the present code")
+        print("\n".join(lines) or "all tables were made by the present code")
         sys.exit(1 if lines else 0)
     if not names or options.data is None:
         parser.error("give --all or names of tables, and --data; or --check")

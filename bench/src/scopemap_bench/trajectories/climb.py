@@ -76,7 +76,7 @@ def read_submap(file: Path, unit: Unit = "mm") -> Trajectory:
         place = f"{file}, line {number}"
         frame, row = _row(line, place)
         if frame in rows:
-            raise InputError(f"{place}: frame {frame} comes again")
+            raise InputError(f"{place}: frame {frame} is repeated")
         if np.isfinite(row[1:4]).all():
             rows[frame] = row
             where.append(place)

@@ -36,9 +36,7 @@ def batch(
         list[str],
         typer.Argument(
             metavar="INPUT...",
-            help="Videos, folders of videos, patterns in quotes, addresses (s3://bucket/folder and others, extra "
-            "cluster), lists (.txt, one a line), tables (.csv with a column input; further columns are settings: name, "
-            "preset, config, dataset, camera, fov, frames, size, or any of --set).",
+            help="Videos, folders, quoted patterns, addresses (s3://...), .txt lists or .csv tables (docs/batch.md).",
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the results, one folder per video.")],
@@ -48,51 +46,64 @@ def batch(
     camera: options.CameraFile = None,
     fov: options.FieldOfView = None,
     scope: options.Scope = None,
-    frames: Annotated[str | None, typer.Option(metavar="A:B:S", help="Which frames of each, a Python slice.")] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="A:B:S", help="Frames of each video, as a Python slice such as ::10; default: all."),
+    ] = None,
     size: options.Size = None,
     settings: options.SetPairs = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Videos at once; default: half as many as there are cores.")
+        int | None,
+        typer.Option(min=1, metavar="N", help="Process N videos at once; default: half the number of cores."),
     ] = None,
     time_limit: Annotated[
-        float | None, options.advanced(min=0.1, metavar="SECONDS", help="End a video that takes longer; it has failed.")
+        float | None,
+        options.advanced(
+            min=0.1, metavar="SECONDS", help="Stop a video after this time and mark it as failed; default: no limit."
+        ),
     ] = None,
     retries: Annotated[
-        int, options.advanced(min=0, metavar="N", help="Further attempts where the process of a video dies.")
+        int, options.advanced(min=0, metavar="N", help="Try a video N more times if its process dies.")
     ] = 1,
     engine: Annotated[
         Literal["processes", "ray"],
-        options.advanced(help="What runs the videos: processes here, or actors on Ray."),
+        options.advanced(help="Run videos in processes of this machine, or on a Ray cluster."),
     ] = "processes",
     address: Annotated[
-        str | None, options.advanced(help="Of a Ray cluster, such as auto; default: a Ray of this machine alone.")
+        str | None, options.advanced(help="Address of a Ray cluster, such as auto; default: Ray on this machine only.")
     ] = None,
     worker_cores: Annotated[
-        int | None, options.advanced(min=1, metavar="N", help="Ray: cores of each worker (2).")
+        int | None, options.advanced(min=1, metavar="N", help="Cores of each Ray worker; default: 2.")
     ] = None,
     worker_memory: Annotated[
-        str | None, options.advanced(metavar="SIZE", help="Ray: memory that each worker is given (4GB).")
+        str | None, options.advanced(metavar="SIZE", help="Memory of each Ray worker; default: 4GB.")
     ] = None,
     worker_gpus: Annotated[
         float | None,
-        options.advanced(min=0, help="Ray: GPUs of each worker, 0.25 too (networks.device=cuda: 1)."),
+        options.advanced(
+            min=0, help="GPUs of each Ray worker, such as 0.25; default: 1 with networks.device=cuda, else 0."
+        ),
     ] = None,
     part: Annotated[
-        str | None, options.advanced(metavar="K/N", help="Only the K-th of N parts, for job arrays.")
+        str | None, options.advanced(metavar="K/N", help="Process only the K-th of N parts, for job arrays.")
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Run a second of each video, and print what all of them will take.")
+        bool,
+        typer.Option("--dry-run", help="Run one second of each video and print the expected time and space of all."),
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace results of other settings or inputs; finished ones stay.")
+        bool,
+        typer.Option(
+            "--overwrite", help="Replace results of other settings or inputs; matching finished results are kept."
+        ),
     ] = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Reconstruct many videos: look at index.html, or batch.csv, in the folder of the results.
+    """Reconstruct many videos, each into a folder of its own.
 
-    The same command again resumes: what is finished is not run again, what failed is. Exit code 1 where
-    a video failed.
+    Look at index.html or batch.csv in the folder of the results. The same command resumes: it skips what is finished
+    and repeats what failed. The exit code is 1 if a video failed.
     """
     chosen = {"preset": preset, "config": config, "dataset": dataset, "camera": camera, "fov": fov}
     chosen |= {"frames": frames, "size": size}

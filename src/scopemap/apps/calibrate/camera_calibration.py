@@ -337,7 +337,7 @@ def warnings_about(fit: Fit, covered: float) -> list[str]:
     if views < _FEW_VIEWS:
         found.append(f"only {views} views that differ: 15 to 40 are usual")
     if tilted < _TILTED_VIEWS:
-        inseparable = "focal length and distance can hardly be separated; tilt it by 20 to 40 deg in several directions"
+        inseparable = "so focal length and distance cannot be separated; tilt it by 20 to 40 deg in several directions"
         found.append(f"the board is tilted by more than {_TILTED_DEG:g} deg in {tilted} view(s): {inseparable}")
     if covered < _LITTLE_COVERED:
         beyond = "beyond them the distortion is extrapolated; hold the board into the corners, too"

@@ -24,27 +24,33 @@ _SETTINGS = ("input.stereo", "input.deinterlace")
 
 
 def calibrate(
-    source: Annotated[Path, typer.Argument(metavar="INPUT", help="A video or a folder of images of the board.")],
+    source: Annotated[Path, typer.Argument(metavar="INPUT", help="Video or folder of images of the board.")],
     board: Annotated[
-        str, typer.Option(metavar="CxR", help="The board: inner corners, 9x6; of a ChArUco board squares.")
+        str,
+        typer.Option(metavar="CxR", help="Size of the board: inner corners, such as 9x6; for a ChArUco board squares."),
     ],
     square_mm: Annotated[float, typer.Option(help="Side of a square, mm.")],
-    charuco: Annotated[bool, typer.Option("--charuco", help="A ChArUco board: markers in its white squares.")] = False,
+    charuco: Annotated[
+        bool, typer.Option("--charuco", help="Use a ChArUco board, with markers in its white squares.")
+    ] = False,
     marker_mm: Annotated[float | None, typer.Option(help="Side of a ChArUco board's marker, mm.")] = None,
     dictionary: Annotated[
-        str | None, options.advanced(metavar="NAME", help="Its set of markers, by OpenCV's name; else DICT_4X4_50.")
+        str | None, options.advanced(metavar="NAME", help="OpenCV's name of the ChArUco markers; default: DICT_4X4_50.")
     ] = None,
-    legacy: Annotated[bool, options.advanced("--legacy", help="It was laid out by OpenCV before 4.6.")] = False,
+    legacy: Annotated[bool, options.advanced("--legacy", help="Use the ChArUco layout of OpenCV before 4.6.")] = False,
     model: Annotated[
         Literal["auto", "pinhole", "fisheye"],
-        typer.Option(help="Camera model; auto: the one that predicts views better that it has not seen."),
+        typer.Option(help="Camera model; auto: the one that predicts held-out views best."),
     ] = "auto",
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Calibration to write; its picture is written to the same folder.")
+        Path,
+        typer.Option(
+            metavar="FILE", help="Calibration file to write; a picture of its residuals is written beside it."
+        ),
     ] = Path("calibration.yaml"),
     frames: options.Frames = None,
     every: Annotated[
-        int | None, options.advanced(min=1, metavar="N", help="Look at every N-th of them; else at about 300 in all.")
+        int | None, options.advanced(min=1, metavar="N", help="Use every N-th frame; default: about 300 in all.")
     ] = None,
     dataset: options.Dataset = None,
     settings: Annotated[
@@ -57,7 +63,10 @@ def calibrate(
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Calibrate the camera from images of a board; the file is for --camera of every command."""
+    """Calibrate the camera from images of a board.
+
+    Every command takes the file that this writes as --camera.
+    """
     picture = out.with_suffix(".png")
     options.check_output(out, (".yaml", ".yml"), overwrite)
     options.check_output(picture, (".png",), overwrite)

@@ -13,24 +13,26 @@ from scopemap.terminal.figures import print_json
 
 
 def coverage(
-    run: Annotated[Path, typer.Argument(metavar="RESULT", help="Folder of a run, or of a submap, result/maps/1.")],
+    run: Annotated[
+        Path, typer.Argument(metavar="RESULT", help="Folder of a run, or of a submap such as result/maps/1.")
+    ],
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where map and figures go; default: RESULT/coverage.")
+        Path | None, typer.Option(metavar="DIR", help="Folder for the map and the figures; default: RESULT/coverage.")
     ] = None,
     export: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Write the blind spots for 3D Slicer, .mrk.json, or as a DICOM report, .dcm."
+            metavar="FILE", help="Write the blind spots for 3D Slicer (.mrk.json) or as a DICOM report (.dcm)."
         ),
     ] = None,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Estimate which share of the tissue no frame saw, with an interval of 90 %, and list where.
+    """Estimate what share of the tissue no frame saw, and where.
 
-    Writes coverage.json, map.csv, map.png and coverage.ply. Calibrated on synthetic colons and cavities; not for
-    decisions about a patient.
+    The share has a 90 % interval. Writes coverage.json, map.csv, map.png and coverage.ply. The intervals are calibrated
+    on synthetic colons and cavities: do not use them for decisions about a patient.
     """
     from scopemap.report.page import PAGE, write_report
     from scopemap.report.page_data import COVERAGE

@@ -258,7 +258,7 @@ def _checked(folder: Path) -> Result:
     if not any(map(run.depth.has, run.frames["index"][run.frames.tracked].tolist())):
         raise InputError(f"the run {folder} kept no depth maps")
     if verdict(run).level == "bad":
-        raise InputError(f"the run {folder} is not usable by its verdict: it says nothing about what was not seen")
+        raise InputError(f"the run {folder} is not usable by its verdict, so it cannot show what was not seen")
     return run
 
 

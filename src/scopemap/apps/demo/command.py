@@ -22,7 +22,10 @@ def demo(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Reconstruct a packaged clip of a phantom colon, and compare with its truth; nothing is downloaded."""
+    """Reconstruct a packaged clip and compare it with its truth.
+
+    The clip shows a phantom colon. Nothing is downloaded.
+    """
     silent = quiet or as_json
     if not silent:
         typer.echo("reconstructing a packaged clip; the first time kernels are compiled, too", err=True)

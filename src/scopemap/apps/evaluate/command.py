@@ -21,48 +21,48 @@ if TYPE_CHECKING:
 
 def evaluate(
     trajectory: Annotated[
-        Path, typer.Argument(metavar="DIR|TRAJECTORY", help="A run's folder, or a trajectory file (docs/formats.md).")
+        Path, typer.Argument(metavar="DIR|TRAJECTORY", help="Folder of a run, or trajectory file (docs/formats.md).")
     ],
     truth: Annotated[
         Path | None,
-        typer.Option(help="True poses: the folder of any data set's sequence, or a trajectory file."),
+        typer.Option(help="True poses: folder of a data set's sequence, or trajectory file."),
     ] = None,
     against_video: Annotated[
         bool,
         typer.Option(
             "--against-video",
-            help="A run's surface against its own video, no truth needed: every 10th frame is kept out of fusion and "
-            "compared with the mesh of the others; DIR/against_video holds a row per frame and a picture.",
+            help="Compare every 10th frame with the surface fused from the others; needs no truth.",
         ),
     ] = False,
     source: InputNow = None,
     align: Annotated[
-        Align, typer.Option(help="Alignment before measuring; origin: of the first frames, scale: of the size alone.")
+        Align, typer.Option(help="Align before measuring; origin: to the first frame; scale: in size only.")
     ] = "sim3",
-    align_first: Annotated[int | None, advanced(min=3, metavar="N", help="Fit on the first N tracked frames only.")] = (
-        None
-    ),
+    align_first: Annotated[
+        int | None, advanced(min=3, metavar="N", help="Fit the alignment to the first N tracked frames; default: all.")
+    ] = (None),
     time_offset: Annotated[
         str,
         advanced(
             metavar="SECONDS|fit",
-            help="Read the truth so much later, where its clock is not the pictures'; fit: the offset, of at most half "
-            "a second in either direction, that leaves the least error of positions.",
+            help="Read the truth this much later, s; fit: find the offset within half a second.",
         ),
     ] = "0",
-    unit: Annotated[Unit, advanced(help="Unit of a trajectory file that does not state one.")] = "mm",
-    truth_unit: Annotated[Unit | None, advanced(help="The same for the truth; as --unit if left out.")] = None,
-    kind: Annotated[str, advanced(help="Form of the trajectory file where its content fits two.")] = "auto",
-    truth_kind: Annotated[str, advanced(help="The same for the truth, or the name of a data set.")] = "auto",
+    unit: Annotated[Unit, advanced(help="Unit of a trajectory file that states none.")] = "mm",
+    truth_unit: Annotated[Unit | None, advanced(help="Unit of the truth; default: as --unit.")] = None,
+    kind: Annotated[str, advanced(help="Format of the trajectory file; auto: by its content.")] = "auto",
+    truth_kind: Annotated[
+        str, advanced(help="Format of the truth, or name of its data set; auto: by its content.")
+    ] = "auto",
     as_json: AsJson = False,
-    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="One line of figures, no warnings.")] = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print CSV to standard output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print one line of figures and no warnings.")] = False,
     further: Sequence[Asked] = (),
 ) -> None:
-    """Compare a trajectory with the truth, or a run's surface with its own video.
+    """Measure errors against the truth or a run's own video.
 
-    Frames are matched by number where both sides have one (line of the pose file, index in frames.csv, whole numbers
-    as TUM time stamps), else by time within 0.01 s; files without times count 30 frames per s. The package
+    Frames are matched by number if both sides have numbers (line of the pose file, index in frames.csv, whole numbers
+    as TUM time stamps), else by time within 0.01 s. Files without times count as 30 frames per second. The package
     scopemap-bench adds depth, surfaces and the protocols of other papers.
     """
     form = _output_form(as_json=as_json, as_csv=as_csv, quiet=quiet)

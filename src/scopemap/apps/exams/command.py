@@ -13,21 +13,25 @@ from scopemap.terminal.figures import print_json
 
 def compare_exams(
     first: Annotated[Path, typer.Argument(metavar="FIRST", help="Folder of the first examination's run.")],
-    second: Annotated[Path, typer.Argument(metavar="SECOND", help="Folder of the second one's.")],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the page, its pictures and tables go.")],
+    second: Annotated[Path, typer.Argument(metavar="SECOND", help="Folder of the second examination's run.")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the page, its pictures and tables.")],
     source: options.InputNow = None,
     second_input: Annotated[
-        Path | None, typer.Option("--second-input", metavar="INPUT", help="Where the second one's input is now.")
+        Path | None,
+        typer.Option("--second-input", metavar="INPUT", help="Where the second run's input is now, if it has moved."),
     ] = None,
     video: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write a film along the first one's path, coloured by what changed."),
+        typer.Option(metavar="FILE", help="Write a film along the first run's path, coloured by what changed."),
     ] = None,
     overwrite: options.Overwrite = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Bring two examinations of the same place together: matched views, what changed, what only one of them saw."""
+    """Register two examinations and show what changed.
+
+    Both must show the same place. The page shows matched views, changes, and what only one examination saw.
+    """
     options.check_output(out / "compare.html", (".html",), overwrite)
     from scopemap.apps.exams.change_painting import change_painting
     from scopemap.apps.exams.compare_exams import compare_exams as compare

@@ -17,26 +17,25 @@ To = Literal[
 
 
 def export(
-    to: Annotated[To, typer.Option("--to", help="The format (docs/exports.md).")],
+    to: Annotated[To, typer.Option("--to", help="Format to write (docs/exports.md).")],
     out: Annotated[
         Path,
-        typer.Option(
-            help="File or folder to write, by the format (docs/exports.md). kitti: a folder, or k.txt, poses alone."
-        ),
+        typer.Option(help="File or folder to write, depending on the format (docs/exports.md)."),
     ],
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a submap, result/maps/1.")],
-    units: Annotated[
-        Unit | None, typer.Option(help="Unit of lengths; default: what the format prescribes, else mm.")
-    ] = None,
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a submap such as result/maps/1.")],
+    units: Annotated[Unit | None, typer.Option(help="Unit of lengths; default: the format's own, else mm.")] = None,
     axes: Annotated[
         Literal["lps", "ras", "opencv", "gltf"] | None,
-        typer.Option(help="Axes of ply, obj, stl, surfaces; default: lps."),
+        typer.Option(help="Axes of ply, obj, stl and surfaces; default: lps."),
     ] = None,
     source: InputNow = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a run in the layout of another tool: its tracked frames, surface and depth."""
+    """Convert a run to the format of another tool.
+
+    The export holds the tracked frames, the surface or depth, depending on the format.
+    """
     from scopemap.apps.export.formats import export_run
 
     warn_of_damage(run, silent=quiet)

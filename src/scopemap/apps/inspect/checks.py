@@ -76,7 +76,7 @@ def check_timing(clip: Clip, claimed_s: float | None) -> Iterator[VideoFinding]:
         message = f"variable rate: {low:.3g} to {high:.3g} pictures per second, usually {1 / usual_s:.3g}"
         yield VideoFinding("info", "rate-variable", message, "runs use the time stamps; --fps thins out by them, too")
     if clip.rate_hz >= _FAST_HZ and np.median(clip["motion"]) < _SLOW_MOTION * clip.step:
-        message = f"{clip.rate_hz:.3g} pictures per second, between which hardly anything moves"
+        message = f"little moves from frame to frame at {clip.rate_hz:.3g} pictures per second"
         yield VideoFinding("info", "rate-high", message, f"--fps {clip.rate_hz / 2:.3g} halves the work")
 
 
@@ -132,9 +132,7 @@ def check_frames(clip: Clip) -> Iterator[VideoFinding]:
         advice = "look at them; narrow-band light is fine to run on"
         message = "not the colour of tissue in white light (outside the patient, or narrow-band light): {frames}"
         if np.mean(flags) > _MOSTLY:
-            message = (
-                "hardly any picture has the colour of tissue in white light: is it narrow-band light, or no tissue?"
-            )
+            message = "most pictures do not have the colour of tissue in white light: narrow-band light, or no tissue"
         elif not covered(segments, len(clip)).all():
             advice += ", else {selection}"
         yield clip.finding("warning", "not-tissue", message, segments, advice)
@@ -180,7 +178,7 @@ def check_dangers(clip: Clip) -> Iterator[VideoFinding]:
     """Yield what may make a run lose frames: of what was read, so of every n-th frame where these were selected."""
     flags, textureless = _dangers(clip)
     if textureless:
-        message = "hardly any texture: little tells how the camera moves along or around such walls"
+        message = "too little texture: the camera motion along such walls cannot be measured"
         yield VideoFinding("warning", "texture-low", message)
     if flags["cut"].any():
         message = "the picture changes at once, as at a cut: {frames}"
@@ -191,14 +189,14 @@ def check_dangers(clip: Clip) -> Iterator[VideoFinding]:
         f"{np.percentile(moving, 95):.1%} in the fastest; by more than {_FAST:.0%} in {{frames}}"
     )
     unlike = (
-        "hardly like the frame before, its motion undone: {frames} (fast turns, motion blur, a wall close to the lens, "
-        "water, smoke)"
+        "{frames} differ strongly from the previous frame even after motion compensation (fast turns, motion blur, "
+        "close-ups, water, smoke)"
     )
     slower = "use every frame, not one of several" if clip.step > 1 else "a recording of a higher rate moves less"
     for name, code, message, advice in (
         ("fast", "motion-fast", motion, slower),
         ("unlike", "unlike", unlike, ""),
-        ("soft", "soft", "soft, by motion blur or a wall close to the lens: {frames}", ""),
+        ("soft", "soft", "soft because of motion blur or a close-up: {frames}", ""),
     ):
         if flags[name].mean() > _SOME:
             yield clip.finding("warning", code, message, segments_of(flags[name], gap=2), advice)
@@ -210,13 +208,13 @@ def forecast(clip: Clip) -> str:
     lost, cuts = int((flags["fast"] | flags["unlike"] | flags["cut"]).sum()), int(flags["cut"].sum())
     which = f"of one frame in {clip.step}: " if clip.step > 1 else ""
     if textureless:
-        return f"{which}poor: walls without texture; expect most frames lost or in separate maps"
+        return f"{which}poor: walls without texture; expect most frames to be lost or in separate submaps"
     if lost > _MANY * len(clip):
         return (
-            f"{which}poor: about {lost} of {len(clip)} frames are hard to track; expect lost frames, and several "
-            "separate maps instead of one surface"
+            f"{which}poor: about {lost} of {len(clip)} frames are hard to track; expect lost frames and several "
+            "submaps instead of one surface"
         )
     if lost > _SOME * len(clip) or cuts:
         jumps = f", {cuts} cut{'s' * (cuts != 1)}" if cuts else ""
-        return f"{which}fair: {lost} frames are hard to track{jumps}; the surface may break into separate maps there"
-    return f"{which}good: nothing in its motion, sharpness and texture endangers a reconstruction"
+        return f"{which}fair: {lost} frames are hard to track{jumps}; the surface may break into submaps there"
+    return f"{which}good: motion, sharpness and texture suit a reconstruction"

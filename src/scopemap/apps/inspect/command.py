@@ -20,13 +20,13 @@ def inspect(
     source: options.Input,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="The picture, a PNG; by default NAME_inspection.png in this folder."),
+        typer.Option(metavar="FILE", help="PNG picture to write; default: NAME_inspection.png in this folder."),
     ] = None,
     masks: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Write one mask of overlays and of pictures in the picture, for mask.files.",
+            help="Write a mask of overlays and inset pictures to this folder, for mask.files.",
         ),
     ] = None,
     dataset: options.Dataset = None,
@@ -36,10 +36,9 @@ def inspect(
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Read a video once and show what was found in it: format, timing, field of view, overlays, bad segments.
+    """Check a video's format, timing, field of view and overlays.
 
-    That takes as long as decoding, plus some 20 ms for each frame: for a video of 2 h more than an hour, ::10 of it a
-    fraction.
+    This takes as long as decoding plus about 20 ms per frame. For a long video, --frames ::10 is faster.
     """
     file = out or Path(f"{source.resolve().stem if source.is_file() else source.resolve().name}_inspection.png")
     _refuse(file, masks, overwrite)

@@ -36,22 +36,25 @@ def live(
         str,
         typer.Argument(
             metavar="SOURCE",
-            help="Number of a camera, a device (/dev/video0), an address (rtsp://...), or a video file, played at its "
-            "own speed.",
+            help="Camera number, device (/dev/video0), address (rtsp://...), or video file played in real time.",
         ),
     ],
-    out: Annotated[Path | None, typer.Option(help="Folder for the result, written at the end.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the result, written at the end; default: none is written.")
+    ] = None,
     serve: Annotated[
         int | None,
-        typer.Option(min=0, max=65535, metavar="PORT", help="Show a page at http://localhost:PORT; 0: any free port."),
+        typer.Option(min=0, max=65535, metavar="PORT", help="Serve a page at http://localhost:PORT; 0: any free port."),
     ] = None,
     igtl: Annotated[
         int | None,
         typer.Option(
-            min=1, max=65535, metavar="PORT", help="Send pose, picture and surface to 3D Slicer or PLUS; extra igtl."
+            min=1, max=65535, metavar="PORT", help="Send pose, image and surface to 3D Slicer or PLUS (extra igtl)."
         ),
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so many seconds.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Stop after this many seconds; default: at the end of the stream.")
+    ] = None,
     camera: options.CameraFile = None,
     fov: options.FieldOfView = None,
     scope: options.Scope = None,
@@ -62,10 +65,10 @@ def live(
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Reconstruct a live picture; frames are dropped rather than late.
+    """Reconstruct a live stream; drop frames to keep latency low.
 
-    Keys: p pauses, r forgets all and begins anew, s writes a snapshot, q ends. Ctrl-C ends it, too, and writes the
-    result; a second Ctrl-C writes nothing.
+    Keys: p pauses, r discards everything and starts again, s writes a snapshot, q stops. Ctrl-C also stops and writes
+    the result; a second Ctrl-C writes nothing.
     """
     from scopemap.apps.coverage.live_map import KeptDepth, LiveCoverage
     from scopemap.engine.config import Config
@@ -172,7 +175,7 @@ def _controls(
         has_keys = stack.enter_context(terminal_keys(keys))
         if not silent:
             if has_keys:
-                typer.echo("p pause, r reset, s snapshot, q end", err=True)
+                typer.echo("p pause, r reset, s snapshot, q stop", err=True)
             thread = threading.Thread(target=_show, args=(session, ended), name="show", daemon=True)
             thread.start()
             stack.callback(thread.join)
@@ -221,7 +224,7 @@ def _line(state: dict[str, Any]) -> str:
     latency = f"latency {state['latency_p50_ms']} ms (95 % below {state['latency_p95_ms']})"
     full = ", surface full" if state["full"] else ""
     drops = f"{state['dropped']} of {state['read']} frames dropped"
-    return f"{state['words']}: {state['frames_per_s']} frames/s, {latency}, {drops}, map {state['map'] + 1}{full}"
+    return f"{state['words']}: {state['frames_per_s']} frames/s, {latency}, {drops}, submap {state['map'] + 1}{full}"
 
 
 def _print(provenance: dict[str, Any], state: dict[str, Any], out: Path | None) -> None:
@@ -229,4 +232,4 @@ def _print(provenance: dict[str, Any], state: dict[str, Any], out: Path | None) 
     typer.echo(f"{provenance['tracked']} of {provenance['frames']} frames tracked, {provenance['lost']} lost")
     typer.echo(_line(state))
     if out is not None:
-        typer.echo(f"result in {out}, with the depth of some frames; look at {out / 'report.html'}")
+        typer.echo(f"Open {out / 'report.html'} in a browser. All files of the result are in {out}.")

@@ -14,7 +14,7 @@ from scopemap.terminal.figures import print_json
 def locate(
     run: Annotated[Path, typer.Argument(metavar="RESULT", help="Folder of a run.")],
     path: options.Input,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Table to write, .csv: a line and a pose for each frame.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="CSV table to write: one row with a pose for each frame.")],
     camera: options.CameraFile = None,
     camera_fit: options.CameraFit = None,
     dataset: options.Dataset = None,
@@ -24,9 +24,9 @@ def locate(
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Find where each frame of another video is in the map of a result, or that it is not found there.
+    """Find the frames of another video in the map of a result.
 
-    Without a calibration of its own, the video has the camera of the result's input.
+    Without --camera, the camera of the result is used.
     """
     options.check_output(out, (".csv",), overwrite)
     import numpy as np

@@ -16,39 +16,46 @@ if TYPE_CHECKING:
 
 
 def measure(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a submap, result/maps/1.")],
-    frame: Annotated[int | None, typer.Option(help="Number of the frame that the pixels, or the mask, are of.")] = None,
-    points: Annotated[str, typer.Option(help='Pixels "x,y x,y": two for a distance, more for the area inside.')] = "",
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or of a submap such as result/maps/1.")],
+    frame: Annotated[int | None, typer.Option(help="Number of the frame that the pixels or the mask refer to.")] = None,
+    points: Annotated[str, typer.Option(help='Pixels "x,y x,y": two for a distance, three or more for an area.')] = "",
     lesion: Annotated[
         str,
         typer.Option(
             metavar="MASKS",
-            help='Folder of masks numbered as frames; or of --frame one mask or an outline "x,y x,y x,y".',
+            help='Folder of masks numbered like frames; or, with --frame, one mask or an outline "x,y x,y x,y".',
         ),
     ] = "",
-    second: Annotated[float | None, typer.Option(help="Time of the frame, s, instead of its number.")] = None,
+    second: Annotated[float | None, typer.Option(help="Time of the frame, s, instead of --frame.")] = None,
     reference: Annotated[
-        str, typer.Option(help='Two pixels "x,y x,y" of the same frame, whose distance is known.')
+        str, typer.Option(help='Two pixels "x,y x,y" of the same frame whose distance is the reference.')
     ] = "",
     reference_mask: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Mask of an instrument's shaft, as wide as known, instead.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Mask of an instrument shaft of known width, instead of --reference."),
     ] = None,
-    reference_frame: Annotated[int | None, typer.Option(help="Frame of the reference, with --lesion.")] = None,
+    reference_frame: Annotated[
+        int | None, typer.Option(help="Frame of the reference, with --lesion; default: --frame.")
+    ] = None,
     reference_mm: Annotated[
-        float | None, typer.Option(min=1e-6, help="Their distance, mm; without it, measures are multiples of it.")
+        float | None,
+        typer.Option(min=1e-6, help="Reference distance, mm; without it, measures are multiples of the reference."),
     ] = None,
     pictures: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Draw the lesion's outline in the frames that count.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Write pictures of the measured frames with the lesion's outline to this folder."
+        ),
     ] = None,
     export: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the lesion for 3D Slicer, .mrk.json, or as a DICOM report, .dcm."),
+        typer.Option(metavar="FILE", help="Write the lesion for 3D Slicer (.mrk.json) or as a DICOM report (.dcm)."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure on the surface between pixels of a frame, or a lesion in all frames, with intervals of 95 %.
+    """Measure distances, areas or a lesion, with 95 % intervals.
 
-    Where the run's scale is unknown, a reference is needed.
+    If the scale of the run is unknown, give a reference: two pixels or a mask, and its length.
     """
     if bool(points) == bool(lesion):
         raise typer.BadParameter("give either --points or --lesion")

@@ -29,7 +29,7 @@ _NAMES = {
     "height": ("121207", "DCM", "Height"),
 }
 _ENDOSCOPY = ("423827005", "SCT", "Endoscopy")
-_ONLY_RESEARCH = "research software, not a medical device; intervals are of 95 %"
+_ONLY_RESEARCH = "research software, not a medical device; intervals hold 95 %"
 
 
 def write_dicom_report(run: Result, findings: list[SurfaceFinding], about_scale: str, file: Path) -> None:

@@ -140,7 +140,7 @@ def _masks_of_folder(run: Result, folder: Path) -> dict[int, np.ndarray]:
 def _mask_of_frame(run: Result, mask: Path | np.ndarray, frame: int | None) -> tuple[int, np.ndarray]:
     """Return a frame's number and its mask (H, W) bool, by a picture, a mask, or corners (N, 2)."""
     if frame is None:
-        raise SettingsError("one mask of a lesion, or corners, without the frame that they are of: give both")
+        raise SettingsError("a mask or an outline of a lesion needs its frame: give both")
     if frame not in run.tracked.trajectory.indices:
         raise InputError(f"frame {frame}, of which the lesion's mask is, has no pose in {run.path}")
     if isinstance(mask, Path):
@@ -244,7 +244,9 @@ def _marked(run: Result, frame: int, mask: np.ndarray, pose: np.ndarray) -> trim
     there = ndimage.map_coordinates(seen, [v, u], order=0, cval=np.nan)
     level[~(points[:, 2] < (1 + _IN_FRONT / 2) * there) | (points[:, 2] <= 0)] = 0
     if not (level > 0.5).any():
-        raise InputError(f"no surface where frame {frame} shows the lesion: a mask there can be carried nowhere")
+        raise InputError(
+            f"no surface where frame {frame} shows the lesion: its mask cannot be transferred to other frames"
+        )
     colours = np.repeat(np.rint(255 * level).astype(np.uint8)[:, None], 3, axis=1)
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 

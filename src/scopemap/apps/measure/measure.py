@@ -132,8 +132,8 @@ def known_scale(run: Result, known: Known | None) -> KnownScale:
     if known is None:
         if not run.scale_known:
             raise InputError(
-                f"{run.path}: {run.scale}; give two points as a reference: measures are then multiples of their "
-                "distance, and millimetres where that is given, too"
+                f"{run.path}: {run.scale}; give two points as a reference; lengths are then relative to their "
+                "distance, or in mm if that is given"
             )
         scale = LogChanges.of_scale(errors["scale"])
         return KnownScale(1.0, scale, scale.times(by_focal), "mm", run.scale)

@@ -10,12 +10,12 @@ from scopemap.engine.errors import WeightsError
 from scopemap.terminal.figures import print_json, print_table
 from scopemap.terminal.options import AsJson, Quiet
 
-app = typer.Typer(help="Weights of the networks: list, pull, verify.", no_args_is_help=True)
+app = typer.Typer(help="List, download and verify weights of networks.", no_args_is_help=True)
 
 
 @app.command("list")
 def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """List the known weights and whether they are there."""
+    """List the known weights and whether they are present."""
     from scopemap.engine.models import weights
 
     rows = weights.overview()
@@ -31,11 +31,11 @@ def list_(as_json: AsJson = False, quiet: Quiet = False) -> None:
 
 @app.command()
 def pull(
-    name: Annotated[str, typer.Argument(help="A name from `scopemap models list`, or any hub id (owner/model).")],
+    name: Annotated[str, typer.Argument(help="Name from `scopemap models list`, or any hub id (owner/model).")],
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Download weights into the weights folder (SCOPEMAP_WEIGHTS_DIR, or the user's cache)."""
+    """Download weights to SCOPEMAP_WEIGHTS_DIR, or to the user's cache."""
     from scopemap.engine.models import weights
 
     path = weights.pull(name, progress=not (quiet or as_json))
@@ -47,11 +47,11 @@ def pull(
 
 @app.command()
 def verify(
-    name: Annotated[str | None, typer.Argument(help="Weights to check; all that are there, if left out.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Weights to check; default: all that are present.")] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Hash weights again and compare them with the pinned or recorded hashes."""
+    """Check the hashes of downloaded weights."""
     from scopemap.engine.models import weights
 
     states = {one.name: state for one, state in weights.overview() if state != "missing"}

@@ -13,10 +13,12 @@ def report(
     run: ResultFolder,
     pictures: Annotated[
         bool,
-        typer.Option("--pictures", help="Take the frames' pictures from the input again; done where none were kept."),
+        typer.Option(
+            "--pictures", help="Read the frames' images from the input again; default: only if the result has none."
+        ),
     ] = False,
 ) -> None:
-    """Write report.html and summary.png of a run into its folder."""
+    """Write report.html and summary.png of a run again."""
     from scopemap.engine.errors import InputError
     from scopemap.report.page import write_report
     from scopemap.result.result import Result

@@ -6,11 +6,10 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from scopemap.engine.notices import notices_of
 from scopemap.terminal import options
 from scopemap.terminal.figures import print_json, print_warnings
 from scopemap.terminal.interruption import Interruption
@@ -18,15 +17,11 @@ from scopemap.terminal.progress import run_progress
 
 if TYPE_CHECKING:
     from scopemap.engine.config import Config
-    from scopemap.result.frame_table import FrameTable
     from scopemap.result.result import Result
 
-_SKIPPED = {
-    "repeated": "which repeat the one before (--set input.skip_duplicates=false)",
-    "thinned": "by input.fps",
-    "size": "of another size",
-}
-_MOST_LOSSES = 5
+_SKIPPED = {"repeated": "skipped as repeats", "thinned": "skipped by --fps", "size": "skipped: of another size"}
+_MOST_REASONS = 6
+"""Notes are left to the report where there are more cautions and notes."""
 
 
 def run(
@@ -43,81 +38,93 @@ def run(
         str | None,
         options.advanced(
             metavar="auto|none|left-right|top-bottom|use[:...]",
-            help="Two views in one image, of which the left or upper is used; auto: recognised. use: measure depth "
-            "from both, with --camera of the pair; use:left-right, use:top-bottom, use:FILE (of the right camera).",
+            help="Two views in one image; auto (default): detect, use one; use: measure depth from both "
+            "(docs/own-video.md).",
         ),
     ] = None,
     deinterlace: Annotated[
         bool,
-        options.advanced("--deinterlace", help="Use one field of interlaced images, its missing rows interpolated."),
+        options.advanced("--deinterlace", help="Use one field of interlaced images and interpolate the missing rows."),
     ] = False,
     redact: Annotated[
         list[str] | None,
-        options.advanced(
-            metavar="X,Y,W,H", help="Blacken a box of the input's pictures, px, before anything sees it; repeatable."
+        typer.Option(
+            rich_help_panel="Privacy",
+            metavar="X,Y,W,H",
+            help="Blacken a box of every input image before processing, px; may be repeated.",
         ),
     ] = None,
     camera_at_rest: Annotated[
         bool,
         options.advanced(
-            "--camera-at-rest", help="The camera does not move (robotic surgery): one surface per frame, surfaces/."
+            "--camera-at-rest", help="State that the camera does not move: write one surface per frame to surfaces/."
         ),
     ] = False,
     surface_at: Annotated[
         float | None,
-        options.advanced(metavar="SECONDS", help="The surface as seen at that second, where tissue moves on its own."),
+        options.advanced(metavar="SECONDS", help="Show moving tissue as seen at this second of the video."),
     ] = None,
     near_far: options.NearFar = None,
     depth: Annotated[
         str | None,
-        typer.Option(
-            help="scopenet, shading, depth-anything, depth-pro, files:FOLDER (disparity or depth files), stereo."
-        ),
+        typer.Option(help="Depth: scopenet (default), shading, depth-anything, depth-pro, stereo, or files:FOLDER."),
     ] = None,
     flow: Annotated[
         str | None,
-        options.advanced(help="dis, raft-small, raft-large or none; RAFT needs the extra networks and its weights."),
+        options.advanced(
+            help="Optical flow: dis (default), raft-small, raft-large (both need the extra networks), or none."
+        ),
     ] = None,
     colours: Annotated[
         Literal["albedo", "raw"] | None,
-        options.advanced(help="Of the mesh: the tissue's, without the lamp's fall-off, or the video's own."),
+        options.advanced(
+            help="Mesh colours: without the light's fall-off (albedo, default), or as in the video (raw)."
+        ),
     ] = None,
     mesh_faces: Annotated[
-        int | None, options.advanced(min=4, metavar="N", help="Simplify the mesh to about so many faces.")
+        int | None, options.advanced(min=4, metavar="N", help="Simplify the mesh to about N triangles; default: off.")
     ] = None,
     mesh_smooth: Annotated[
-        int | None, options.advanced(min=0, metavar="N", help="Smooth the mesh, so many iterations of Taubin's filter.")
+        int | None,
+        options.advanced(
+            min=0, metavar="N", help="Smooth the mesh with N iterations of Taubin's filter; default: off."
+        ),
     ] = None,
     mesh_watertight: Annotated[
-        bool, options.advanced("--mesh-watertight", help="Close the mesh where no frame saw anything, too; grey there.")
+        bool,
+        options.advanced(
+            "--mesh-watertight", help="Close the mesh also where no frame saw tissue; such parts are grey."
+        ),
     ] = False,
     frames: options.Frames = None,
     fps: Annotated[
-        float | None, options.advanced(help="Most frames per second that are used, by the time stamps.")
+        float | None, options.advanced(help="Use at most this many frames per second; default: all.")
     ] = None,
     size: options.Size = None,
     memory: Annotated[
         str | None,
         options.advanced(
-            metavar="SIZE", help="Limit of memory, such as 2GB; coarser voxels, where the surface needs more."
+            metavar="SIZE", help="Limit memory, such as 2GB; voxels become coarser if needed; default: no limit."
         ),
     ] = None,
-    device: Annotated[Literal["auto", "cpu", "cuda"] | None, options.advanced(help="Device of the networks.")] = None,
+    device: Annotated[
+        Literal["auto", "cpu", "cuda"] | None, options.advanced(help="Device that runs networks; default: auto.")
+    ] = None,
     settings: options.SetPairs = None,
     overwrite: options.Overwrite = False,
     resume: Annotated[
         bool | None,
         typer.Option(
             "--resume/--no-resume",
-            help="Resume a killed run from its checkpoint; default: where input, settings and versions agree.",
+            help="Resume a killed run; default: if input, settings and versions are the same.",
         ),
     ] = None,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Reconstruct camera poses, depth and a tissue surface from a video.
+    """Reconstruct camera poses, depth and a surface from a video.
 
-    Ctrl-C ends it early and writes what was tracked until then; a second Ctrl-C writes nothing.
+    Ctrl-C stops the run and writes what was tracked so far; a second Ctrl-C writes nothing.
     """
     from scopemap.engine.config import Config
     from scopemap.input.frame_choice import selection_text
@@ -181,61 +188,48 @@ def run(
         raise typer.Exit(interruption.exit_code)
 
 
-def _report(result: Result, config: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
+def _report(result: Result, resolved: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
     provenance = result.provenance
-    if not quiet:
-        print_warnings(provenance)
     if as_json:
-        print_json(provenance | {"out": str(out), "preset": config.preset, "mesh_faces": len(result.mesh.faces)})
+        if not quiet:
+            print_warnings(provenance)
+        print_json(provenance | {"out": str(out), "preset": resolved.preset, "mesh_faces": len(result.mesh.faces)})
     elif not quiet:
         for line in summary_lines(result):
             typer.echo(line)
-        submaps = ", maps/" if result.others else ""
-        typer.echo(f"look at {out / 'report.html'} in a browser, or at summary.png beside it")
-        typer.echo(f"result in {out}: trajectory.tum, mesh.ply, mesh.glb, depth/, depth_preview/, frames.csv{submaps}")
+        typer.echo(f"Open {out / 'report.html'} in a browser. All files of the result are in {out}.")
 
 
 def summary_lines(result: Result) -> list[str]:
-    """Return the summary of a run, one fact per line."""
+    """Return the summary of a run: the verdict, five facts, and what speaks against it with what to do."""
     from scopemap.engine.notices import scale_words
     from scopemap.result.input_part import part_of_input
-    from scopemap.result.losses import losses
+    from scopemap.result.verdict import verdict
 
-    facts, known = result.provenance, result.provenance["scale"]["known"]
-    counts = [f"{facts['tracked']} of {facts['frames']} frames tracked"]
-    counts += [f"{facts[key]} {key.replace('_', ' ')}" for key in ("lost", "in_other_maps") if facts[key]]
-    unit = " mm" if known else " (scale unknown)"
-    lines = [
-        f"{', '.join(counts)}, path {result.trajectory.path_length_mm:.1f}{unit}",
-        scale_words(facts["scale"]) + ("" if known else "; every mm below is in this scale"),
-        f"camera: {facts['camera']['source']}",
-        f"size: {facts['camera']['size']}",
-        f"depth: {facts['estimators']['depth']}",
-        f"flow: {facts['estimators']['flow']}; perceptual distance: {facts['estimators']['perceptual']}",
-        f"mesh: {len(result.mesh.vertices)} vertices, {len(result.mesh.faces)} faces{_surface(facts['surface'])}",
-        time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
-    ]
-    lines += [f"input: {part}; shares are of these" for part in [part_of_input(facts)] if part]
-    lines += [f"skipped: {count} frames, {_SKIPPED[kind]}; see frames.csv" for kind, count in facts["skipped"].items()]
-    if result.others:
-        lines += _map_lines(result.frames)
-    lost = losses(result.frames)
-    longest = sorted(sorted(lost, key=lambda loss: -loss.frames)[:_MOST_LOSSES], key=lambda loss: loss.first)
-    lines += [f"lost: {loss.when} ({loss.size}), {loss.cause}: {loss.advice}" for loss in longest]
-    if len(lost) > _MOST_LOSSES:
-        lines.append(f"lost: {len(lost) - _MOST_LOSSES} shorter segments, see frames.csv")
-    return lines + [f"note: {notice}" for notice in notices_of(facts) if notice.level == "info"]
+    facts, found = result.provenance, verdict(result)
+    unit = " mm" if facts["scale"]["known"] else " (scale unknown)"
+    part = part_of_input(facts)
+    five = {
+        "frames": f"{_frames(facts)}{f' ({part})' if part else ''}; path {result.trajectory.path_length_mm:.1f}{unit}",
+        "scale": scale_words(facts["scale"]).removeprefix("scale").lstrip(": "),
+        "camera": facts["camera"]["source"].partition("; ")[0],
+        "surface": f"{len(result.mesh.faces):,} triangles{_surface(facts['surface'])}",
+        "time": time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
+    }
+    cautions = [reason for reason in found.reasons if reason.level in ("bad", "doubtful")]
+    notes = [reason for reason in found.reasons if reason.level == "note"]
+    shown = notes[: max(_MOST_REASONS - len(cautions), 0)]
+    lines = [f"{found.word.capitalize()}. {found.advice}"] + [f"  {name:8s} {fact}" for name, fact in five.items()]
+    lines += [f"Caution: {reason}" for reason in cautions] + [f"Note: {reason}" for reason in shown]
+    left = len(notes) - len(shown)
+    return lines + [f"{left} more notes are in the report."] * bool(left)
 
 
-def _map_lines(frames: FrameTable) -> list[str]:
-    from scopemap.result.submap_summaries import doubt_words, submaps_in_time
-
-    submaps, maps = submaps_in_time(frames), []
-    for submap in submaps:
-        facts = ", ".join(filter(None, (f"{submap.first} to {submap.last}", submap.inliers)))
-        maps.append(f"{submap.name} with {submap.frames} frames ({facts})")
-    doubt = doubt_words(submaps)
-    return [f"maps in order of time: {', '.join(maps)}"] + [f"most doubtful map: {doubt}"] * bool(doubt)
+def _frames(facts: dict[str, Any]) -> str:
+    """Return how many frames were tracked, and what became of the others."""
+    others = [(facts["lost"], "lost"), (facts["in_other_maps"], "in other submaps")]
+    others += [(count, _SKIPPED[kind]) for kind, count in facts["skipped"].items()]
+    return ", ".join([f"{facts['tracked']} of {facts['frames']} tracked"] + [f"{n} {how}" for n, how in others if n])
 
 
 def time_words(result: Result) -> str:
@@ -244,7 +238,7 @@ def time_words(result: Result) -> str:
 
     seconds, after = result.provenance["seconds"]["total"], result.provenance["resumed_after_frame"]
     since = "" if after is None else f" since it was resumed after frame {after}"
-    return f"time: {seconds:.1f} s{since}, {frames_per_s(result) or 0.0:.1f} frames/s"
+    return f"{seconds:.1f} s{since}, {frames_per_s(result) or 0.0:.1f} frames/s"
 
 
 def compiling_words(seconds: float) -> str:
@@ -252,14 +246,13 @@ def compiling_words(seconds: float) -> str:
     if seconds < 0.1:
         return ""
     is_cached = os.environ.get("NUMBA_CACHE_DIR") != ""
-    kept = "once" if is_cached else "every time: set NUMBA_CACHE_DIR to a folder to keep them"
-    return f"; {seconds:.1f} s of it, which the frames/s leave out, to compile kernels, {kept}"
+    how = "once" if is_cached else "in every run: set NUMBA_CACHE_DIR to a folder to keep them"
+    return f" (without {seconds:.1f} s of compiling kernels, {how})"
 
 
 def _surface(figures: dict[str, float]) -> str:
     """Return how well the surface agrees with the frames that it was made of, "" where that is not known."""
     if "depth_error" not in figures:
         return ""
-    mean, least = int(100 * figures["coverage_mean"]), int(100 * figures["coverage_least"])
-    seen = f"; covers {mean}% of what the frames see (least {least}%)"
-    return f"{seen}, depth {figures['depth_error']:.1%} off theirs"
+    covered = f", covers {int(100 * figures['coverage_mean'])} % of what its frames see"
+    return f"{covered}, depth differs by {100 * figures['depth_error']:.1f} %"

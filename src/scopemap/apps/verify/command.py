@@ -17,9 +17,9 @@ def verify(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compare the files of a result with its SHA256SUMS, and say which are damaged, missing or not the run's.
+    """Check the files of a result against its SHA256SUMS.
 
-    Exit code 1 where a file is damaged or missing. `sha256sum -c SHA256SUMS` in the folder checks the same.
+    The exit code is 1 if a file is damaged or missing. `sha256sum -c SHA256SUMS` in the folder checks the same.
     """
     from scopemap.apps.verify.verifying import verify_result
 

@@ -14,26 +14,33 @@ from scopemap.terminal.options import InputNow, Overwrite, ResultFolder, check_o
 
 def view(
     run: ResultFolder,
-    port: Annotated[int, typer.Option(min=0, max=65535, metavar="PORT", help="0: any free port.")] = 0,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, metavar="PORT", help="Port of the page; 0: any free port.")
+    ] = 0,
     turntable: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write a film of the surface turning once, .mp4, .mkv or .webm, and end."),
+        typer.Option(
+            metavar="FILE", help="Write a film of the turning surface (.mp4, .mkv, .webm) instead of opening the page."
+        ),
     ] = None,
     video: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write a film of the video beside the surface along the path, and end."),
+        typer.Option(
+            metavar="FILE",
+            help="Write a film of the video beside the surface (.mp4, .mkv, .webm) instead of opening the page.",
+        ),
     ] = None,
     colours: Annotated[
         Literal["coverage", "confidence"] | None,
-        typer.Option(help="Colours of --video over the surface: what was not seen, or how sure the surface is."),
+        typer.Option(help="Colour the surface in --video by what was not seen, or by confidence."),
     ] = None,
     source: InputNow = None,
     overwrite: Overwrite = False,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
-    """Show a run's page with all triangles and pictures at localhost, until Ctrl-C.
+    """Show a run's page with its full surface in a browser.
 
-    Nothing is written but measurements.json, where you measure on the page and save.
+    The page is served at localhost until Ctrl-C. It writes only measurements.json, when you measure and save.
     """
     if colours is not None and video is None:
         raise typer.BadParameter("they are those of --video", param_hint="--colours")

@@ -205,7 +205,7 @@ class AnchoredDepth:
         name = self._settings.backend if source == "estimate" else self.reference.name
         if name == "shading":
             return f"shading prior, median distance {self._settings.shading_median_mm:g} mm"
-        return f"Depth Pro on frame {frame.index}" if name == "depth-pro" else f"millimetres as {name} gives them"
+        return f"Depth Pro on frame {frame.index}" if name == "depth-pro" else f"{name}'s own scale"
 
     def _details(self, reference: DepthEstimate, frame: Frame) -> str:
         """Return what scales the depth of the reference, "" unless it finds a focal length (Depth Pro)."""

@@ -32,7 +32,7 @@ class CustomDepth:
         if kind not in _KINDS:
             raise SettingsError(f"own depth of kind '{kind}': choose one of {', '.join(_KINDS)}")
         if not callable(function):
-            raise SettingsError(f"own depth: expected a function of a picture, got {type(function).__name__}")
+            raise SettingsError(f"custom depth: expected a function of a picture, got {type(function).__name__}")
         self.name, self._function, self._kind = name, function, kind
 
     def estimate(self, frame: Frame) -> DepthEstimate:

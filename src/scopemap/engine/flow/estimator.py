@@ -78,7 +78,7 @@ class CustomFlow(FlowEstimator):
 
     def __init__(self, function: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
         if not callable(function):
-            raise SettingsError(f"own flow: expected a function of two pictures, got {type(function).__name__}")
+            raise SettingsError(f"custom flow: expected a function of two pictures, got {type(function).__name__}")
         self._function, self._calling = function, Lock()
 
     def estimate(self, rgb_from: np.ndarray, rgb_to: np.ndarray) -> np.ndarray:
@@ -87,7 +87,7 @@ class CustomFlow(FlowEstimator):
             flow = np.asarray(self._function(rgb_from, rgb_to))
         wanted = (*rgb_from.shape[:2], 2)
         if flow.shape != wanted or not np.issubdtype(flow.dtype, np.floating):
-            raise InputError(f"own flow: expected floats of shape {wanted}, got {flow.dtype} of shape {flow.shape}")
+            raise InputError(f"custom flow: expected floats of shape {wanted}, got {flow.dtype} of shape {flow.shape}")
         if not np.isfinite(flow).all():
             raise InputError("own flow: values that are not finite; extrapolate where it is unknown")
         return flow.astype(np.float32)

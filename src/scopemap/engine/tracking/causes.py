@@ -28,18 +28,17 @@ class LossCause(StrEnum):
 
 
 ADVICE = {
-    LossCause.FAST_MOTION: "turn and withdraw more slowly, and record all frames: none left out, as many a second as "
-    "possible",
-    LossCause.MOTION_BLUR: "move more slowly; more light shortens the exposure",
-    LossCause.UNSHARP: "wait until the view is clear; rinse the lens, suck off fluid and smoke",
-    LossCause.TOO_DARK: "go nearer, or turn the light up",
-    LossCause.OVEREXPOSED: "withdraw from the wall until it is no longer white",
-    LossCause.VIEW_COVERED: "withdraw from the wall, or take out of the view what covers it",
-    LossCause.CONTACT: "withdraw from the wall, until the lumen or a fold is in view again",
-    LossCause.NO_TEXTURE: "keep folds or vessels in view; near a bare wall there is nothing to follow",
-    LossCause.VIEW_CHANGED: "hold the camera still while tissue or instruments move, or the wall fills the picture",
-    LossCause.NOT_FOUND_AGAIN: "go back to where the camera was before the loss, and look from a similar angle",
-    LossCause.OTHER: "see the reason in frames.csv",
+    LossCause.FAST_MOTION: "Next time, turn and withdraw more slowly, and record every frame.",
+    LossCause.MOTION_BLUR: "Next time, move more slowly; more light shortens the exposure.",
+    LossCause.UNSHARP: "Next time, rinse the lens and remove smoke and fluid before moving on.",
+    LossCause.TOO_DARK: "Next time, go nearer or turn the light up.",
+    LossCause.OVEREXPOSED: "Next time, withdraw from the wall until it is no longer white.",
+    LossCause.VIEW_COVERED: "Next time, withdraw from the wall or remove what covers the view.",
+    LossCause.CONTACT: "Next time, withdraw from the wall until the lumen or a fold is in view.",
+    LossCause.NO_TEXTURE: "Next time, keep folds or vessels in view.",
+    LossCause.VIEW_CHANGED: "Next time, hold the camera still while tissue or instruments move.",
+    LossCause.NOT_FOUND_AGAIN: "Next time, return to the last place and look from a similar angle.",
+    LossCause.OTHER: "See the reason in frames.csv.",
 }
 """What can be done, by the cause of a loss."""
 

@@ -182,7 +182,7 @@ class KeyframeAligner:
         by_shape = keyframe.measured and settings.depth_weight > 0
         if alignment.correlation < settings.min_correlation and not by_shape:
             if alignment.texture < MIN_TEXTURE:
-                return TrackingLoss(LossCause.NO_TEXTURE, "weakly constrained, hardly any texture")
+                return TrackingLoss(LossCause.NO_TEXTURE, "weakly constrained, too little texture")
             # A supported pose may be a pixel off, which decorrelates fine texture.
             if alignment.correlation < settings.min_correlation / 3 or not alignment.is_supported:
                 return TrackingLoss(

@@ -367,7 +367,7 @@ def _unsharp(sharpness: float) -> TrackingLoss:
 
 def _in_contact(loss: TrackingLoss) -> TrackingLoss:
     """Return a loss as that of a frame in which a close-up without structure fills the picture."""
-    return TrackingLoss(LossCause.CONTACT, f"the wall fills the picture, {loss.reason}")
+    return TrackingLoss(LossCause.CONTACT, f"close-up without structure: {loss.reason}")
 
 
 def _fitted(track: Track, keyframe: Keyframe, alignment: Alignment) -> Track:

@@ -93,7 +93,7 @@ def read_cameras(file: Path) -> dict[int, ModelCamera]:
             stream.seek(0)
             found = list(_binary_cameras(stream) if is_binary else _text_cameras(stream))
         if again := [number for number, count in Counter(number for number, _ in found).items() if count > 1]:
-            raise ValueError(f"camera {again[0]} comes again; leave one out")
+            raise ValueError(f"camera {again[0]} is repeated; leave one out")
     except (OSError, ValueError) as error:
         raise CalibrationError(f"cannot read the cameras of a COLMAP model from {file}: {error}") from None
     return dict(found)
@@ -164,7 +164,7 @@ def camera_model(camera: ModelCamera, name: str) -> CameraModel:
     if found != wanted:
         raise CalibrationError(f"{name}: found {found} parameters where the model {camera.model} has {wanted}")
     if not (0 < camera.width <= LARGEST_SIDE_PX and 0 < camera.height <= LARGEST_SIDE_PX):
-        raise CalibrationError(f"{name} is for images of {camera.width}x{camera.height} px, which are none")
+        raise CalibrationError(f"{name} has an invalid image size, {camera.width}x{camera.height} px")
     if not all(map(math.isfinite, camera.parameters)):
         raise CalibrationError(f"{name}: a parameter is NaN or infinity")
     doubled = camera.parameters[:1] if camera.model in _OF_ONE_FOCAL_LENGTH else ()
@@ -214,7 +214,7 @@ def _images_in(stream: IO[bytes], where: str, binary: bool) -> list[ModelImage]:
         raise ValueError("it holds no image with its pose")
     last = {image.path: image for image in images}
     if again := [last[image.path] for image in images if last[image.path] is not image]:
-        raise ValueError(f"the image {again[0].name!r} comes again ({again[0].where}); leave one out")
+        raise ValueError(f"the image {again[0].name!r} is repeated ({again[0].where}); leave one out")
     return images
 
 

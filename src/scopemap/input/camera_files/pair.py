@@ -14,8 +14,8 @@ from scopemap.input.camera_files.parsing import Fields, calibration_bytes, read_
 from scopemap.input.camera_files.reading import of_fields, read_calibration
 
 NEEDS_PAIR = (
-    "depth from two views (--stereo use) needs the calibration of the pair: --camera FILE with both cameras and how "
-    "they lie to each other (K1, D1, K2, D2, R, T of OpenCV's stereo calibration or SCARED, or Kalibr's camchain)"
+    "depth from two views (--stereo use) needs the calibration of the pair: --camera FILE with both cameras and "
+    "their relative pose (K1, D1, K2, D2, R, T of OpenCV's stereo calibration or SCARED, or Kalibr's camchain)"
 )
 _SCARED = "camera-calibration"
 _EXTRINSICS = ("extrinsics.yml", "extrinsics.yaml", "extrinsics.xml")

@@ -65,7 +65,7 @@ class ColmapFolder(ImageFolder):
 
     def _report_model(self, file: Path, in_model: int, here: int) -> None:
         self.notes.append(
-            "poses by structure from motion (COLMAP), world-to-camera inverted; scale unknown: units are taken as mm"
+            "poses come from structure from motion (COLMAP, world-to-camera); their unknown scale is read as mm"
         )
         if len(self.poses) < len(self.files):
             self.notes.append(f"{len(self.files) - len(self.poses)} of {len(self.files)} images have no pose")

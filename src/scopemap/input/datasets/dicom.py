@@ -74,7 +74,7 @@ class Dicom(Source):
             if len(instances) == self.count and all(a < b for a, b in pairwise(instances)):
                 self.numbers = instances
             else:
-                self._warn("not every file of the series has a number of its own: counted in the order of their names")
+                self._warn("some files of the series share a number, so frames are in the order of the files' names")
         self.width, self.height = int(first.fields.Columns), int(first.fields.Rows)
         self.pixel_aspect = first.pixel_aspect or 1.0
         self.times_s, rate_hz, clock = first.clock()
@@ -129,9 +129,11 @@ class Dicom(Source):
         elif stored > 8 and self._video is None:
             self.notes.append(f"levels: all {stored} stored bits (BitsStored), scaled to 8 bit")
         if first.fields.get("FrameTimeVector") and not self.times_s and self._video is None:
-            self._warn("its FrameTimeVector does not increase, or not once for each image, and was left out")
+            self._warn("the FrameTimeVector was ignored: it does not increase once for each image")
         if first.missing:
-            self._warn(f"it claims {first.frames + first.missing} images, {first.frames} are there; these were used")
+            self._warn(
+                f"the file states {first.frames + first.missing} images and holds {first.frames}; these were used"
+            )
         if any(str(header.fields.get("BurnedInAnnotation", "")).upper() == "YES" for header in self._headers):
             self._warn(Notice("input-text-burned-in"))
 

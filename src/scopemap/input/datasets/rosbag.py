@@ -127,7 +127,7 @@ class RosBag(Source):
                     continue
                 time_s = self._time_of(message)
                 if time_s <= last_s:
-                    self._warn(f"the stamps of {self._topic.name} do not increase: images stay as they were recorded")
+                    self._warn(f"the stamps of {self._topic.name} do not increase: images keep the order of recording")
                 last_s = time_s
                 frame = self._of_one_size(SourceFrame(number, time_s, rgb, f"{self._topic.name}[{number}]"))
                 if frame is not None:
@@ -173,7 +173,7 @@ class RosBag(Source):
     def _time_of(self, message: _Message) -> float:
         stamp_ns = message.header_ns if self._stamped else 0
         if self._stamped and not stamp_ns:
-            self._warn(f"some messages of {message.topic} hold no stamp: the time of recording is used for them")
+            self._warn(f"some messages of {message.topic} hold no time stamp: their time of recording is used")
         return (stamp_ns or message.bag_ns) / _NS_PER_S
 
     @contextmanager
@@ -218,7 +218,7 @@ class RosBag(Source):
                 yield message
                 read += 1
         except InputError as error:
-            self._warn(f"after {read} messages the bag breaks off, those were used: {error}")
+            self._warn(f"after {read} messages the bag breaks off; those were used: {error}")
 
     def _reporting(self) -> AbstractContextManager[None]:
         advice = "'rosbag reindex', 'ros2 bag reindex' or 'mcap recover' may mend it"
@@ -330,7 +330,7 @@ class RosBag(Source):
         if chosen is not None:
             self.notes.append(f"depth: {chosen.name}, taken as aligned to {self._topic.name}; whole numbers mm, else m")
         if others:
-            self.notes.append(f"depth that no name says to be aligned is not used: {', '.join(others)}")
+            self.notes.append(f"depth is not used where no name states that it is aligned: {', '.join(others)}")
         return chosen
 
 

@@ -147,18 +147,20 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     wanted, scope = config.input.focal == "flow", SCOPES.get(config.input.scope, ANY_LENS)
     if wanted and estimate.reason:
         raise CalibrationError(
-            f"input.focal = flow: the motion in {sequence.path} does not determine the focal length, "
+            f"input.focal = flow: the motion in {sequence.path} does not constrain the focal length: "
             f"{estimate.reason}; give a calibration (--camera) or the field of view (--fov, with input.focal = assume)"
         )
     described = (
         f"fx {estimate.focal_px:.0f} +- {max(estimate.sigma_px, 1):.0f} px, horizontal field of view "
         f"{estimate.fov_deg:.0f} deg"
     )
-    kept, found = "", None
+    kept, why, found = "", "", None
     if estimate.reason:
-        kept = f"the motion does not determine it: {estimate.reason}"
+        kept = f"the motion does not constrain it: {estimate.reason}"
+        why = estimate.reason
     elif not wanted and estimate.share > MAX_SHARE:
         kept = f"the estimate from the motion is uncertain: {described}"
+        why = "the estimate from the camera motion is too uncertain"
     is_unknown, bends = bool(kept), abs(estimate.distortion) >= _MIN_DISTORTION
     if not wanted and (is_unknown or bends):
         # A run that adjusts nothing afterwards does not wait for windows to be adjusted.
@@ -169,9 +171,8 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
             return _with_tried(sequence, tried, windows, "estimated: by trial of lenses"), []
         if is_unknown:
             undecided = "too few of the first frames show a rigid scene" if tried is None else tried.reason
-            kept += f"; a trial of lenses does not tell it either: {undecided}" if adjusts else ""
-            default = f"the camera is unknown, and {sequence.camera_source.partition('; ')[0]}: {kept}"
-            sequence.source.warnings.append(Notice("camera-unknown", {"reason": default}))
+            kept += f"; a trial of typical lenses was inconclusive: {undecided}" if adjusts else ""
+            sequence.source.warnings.append(Notice("camera-unknown", {"reason": why}))
     if not kept and not wanted and not estimate.differs_from(assumed_px):
         kept = f"{assumed_px:.0f} px, consistent with the estimate from the motion: {described}"
     if kept and is_unknown and config.input.scope:
@@ -236,7 +237,7 @@ def combine(fits: Iterable[WindowFit], width_px: float) -> FocalEstimate:
     """Return the combined estimate of windows of images of this width; its relative deviation is 1 % or more."""
     used = [fit for fit in fits if fit.tilt_deg >= _MIN_TILT_DEG]
     if len(used) < _MIN_WINDOWS:
-        reason = "in the first frames the camera turns too little, or what it sees is not rigid"
+        reason = "the camera turns too little in the first frames, or the scene is not rigid"
         return FocalEstimate(math.nan, math.inf, math.nan, len(used), reason=reason)
     logs = np.array([fit.log_focal for fit in used])
     shared = np.array([_ROTATION_ERROR_DEG / fit.tilt_deg for fit in used])
@@ -248,7 +249,7 @@ def combine(fits: Iterable[WindowFit], width_px: float) -> FocalEstimate:
     focal_px = math.exp(float(weight @ logs))
     fov_deg = 2 * math.degrees(math.atan(width_px / 2 / focal_px))
     possible = FOV_RANGE_DEG[0] <= fov_deg <= FOV_RANGE_DEG[1]
-    reason = "" if possible else f"a horizontal field of view of {fov_deg:.0f} deg is no endoscope's"
+    reason = "" if possible else f"the motion fits a field of view of {fov_deg:.0f} deg, which no endoscope has"
     distortion = float(np.median([fit.distortion for fit in used]))
     return FocalEstimate(focal_px, share, fov_deg, len(used), distortion, reason)
 

@@ -201,9 +201,9 @@ def _judged(costs: list[dict[str, dict[float, float]]], width_px: float, prior: 
     end = _FINE // 20
     focal_px, reason = width_px * math.exp(mean), ""
     if every[:end].sum() + every[-end:].sum() > _MOST_AT_END:
-        reason = "focal lengths beyond those that were tried may fit as well"
+        reason = "focal lengths outside the trial may fit equally well"
     elif share > MAX_SHARE or certainty < _LEAST_CERTAIN:
-        reason = f"several lenses fit about as well, best {kind}, fx uncertain by {share:.0%}"
+        reason = f"several lenses fit about equally well, best {kind}, fx uncertain by {share:.0%}"
     return LensTrial(kind, focal_px, share, _fov_deg(kind, focal_px, width_px), certainty, len(costs), reason)
 
 

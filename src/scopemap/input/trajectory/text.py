@@ -52,11 +52,11 @@ class NumberTable:
         return replace(self, values=self.values[chosen], line_numbers=self.line_numbers[chosen])
 
     def sorted_by_stamp(self) -> NumberTable:
-        """Return the table in ascending order of its first column; raises `InputError` where a stamp comes again."""
+        """Return the table in ascending order of its first column; raises `InputError` where a stamp is repeated."""
         table = self.rows(np.argsort(self.values[:, 0], kind="stable"))
         repeated = np.flatnonzero(np.diff(table.values[:, 0]) == 0)
         if repeated.size:
-            raise InputError(f"{table.where[repeated[0] + 1]}: the time stamp of an earlier line comes again")
+            raise InputError(f"{table.where[repeated[0] + 1]}: the time stamp of an earlier line is repeated")
         return table
 
 

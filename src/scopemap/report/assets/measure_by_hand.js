@@ -48,7 +48,7 @@ function seenTogether(picks, reference) {
 
 async function finishPicks() {
   const { mode, picks, reference } = hand;
-  if (picks.length < (mode === "area" ? 3 : 2)) return tell("An area needs three points or more.");
+  if (picks.length < (mode === "area" ? 3 : 2)) return tell("An area needs at least three points.");
   hand.picks = [];
   tell("Measuring …");
   try {
@@ -57,7 +57,7 @@ async function finishPicks() {
     if (mode === "reference") {
       checkReference(pixels, frame.map.errors);
       hand.reference = { picture, pixels, at: points };
-      tell(`The reference is set in frame ${frame.name}. Now choose Distance or Area, and measure where a frame sees it, too.`);
+      tell(`The reference is set in frame ${frame.name}. Now choose Distance or Area, and measure in a frame that also shows it.`);
     } else {
       const mm = (reference && Math.max(0, element("reference-mm").value)) || null, number = run.places[picture.row];
       const found = measured(frame, pixels, known, mm).map((one) => ({ ...one, value: Number.isFinite(one.value) ? one.value : null }));
@@ -166,7 +166,7 @@ async function saveMeasures() {
   const link = document.createElement("a");
   Object.assign(link, { href: URL.createObjectURL(new Blob([text], { type: "application/json" })), download: "measurements.json" });
   link.click();
-  tell("Put measurements.json beside report.html: `scopemap report` and `view` then show it again.");
+  tell("Put measurements.json beside report.html: then `scopemap report` and `view` show it again.");
 }
 
 async function openMeasures() {
@@ -181,7 +181,7 @@ function listenToHand() {
     const without = mode !== "reference" && !run.scale_known && !hand.reference;
     if (mode === "reference" && hand.mode !== mode) hand.reference = null; // chosen anew, or removed by Escape
     Object.assign(hand, { mode: hand.mode === mode || without ? "" : mode, picks: [] });
-    tell(without ? "Sizes are unknown: first choose Reference and click the two points of a distance, of which all else is a multiple." : "");
+    tell(without ? "Sizes are unknown: first choose Reference and click the two ends of a distance. Other lengths are given relative to it." : "");
     writeMeasures();
   };
   for (const mode of ["distance", "area", "reference"]) element(`pick-${mode}`).addEventListener("click", () => choose(mode));

@@ -129,7 +129,7 @@ function showMap(number) {
   shown = number;
   hand.picks = [];
   turn = { yaw: -0.7, pitch: -0.4, distance: 1, shift: [0, 0, 0] };
-  put("submap", run.maps.length > 1 ? (number ? `Submap ${number}: its relative pose is unknown` : "The result") : "");
+  put("submap", run.maps.length > 1 ? (number ? `Submap ${number}: relative pose unknown` : "The result") : "");
   document.querySelectorAll("#submap-list button").forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.map) === number)));
   writeLegend();
 }
@@ -170,11 +170,11 @@ function writeSubmaps() {
     button.dataset.map = String(number);
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", number ? `Surface of submap ${number}` : "Surface of the result");
-    note.textContent = [`${number ? `by itself ${run.words[number]}, ` : ""}${map.frames} frames, ${partsInWords(run, number)}`, map.inliers].filter(Boolean).join(", ");
+    note.textContent = [`${number ? `verdict: ${run.words[number]}, ` : ""}${map.frames} frames, ${partsInWords(run, number)}`, map.inliers].filter(Boolean).join(", ");
     const pair = document.createElement("span"), seen = run.pictures.filter((picture) => run.places[picture.row] === number);
     pair.className = "pair";
     pair.append(canvas);
-    if (seen.length) pair.append(Object.assign(new Image(), { src: `data:image/jpeg;base64,${seen[seen.length >> 1].jpg}`, alt: "a frame of it" }));
+    if (seen.length) pair.append(Object.assign(new Image(), { src: `data:image/jpeg;base64,${seen[seen.length >> 1].jpg}`, alt: "a frame of this submap" }));
     button.append(pair, number ? `Submap ${number} (maps/${number})` : "The result", note);
     button.addEventListener("click", () => (showMap(number), setRow(first)));
     if (view && map.vertices) {
@@ -197,13 +197,13 @@ function writeLosses() {
   element("loss-list").replaceChildren(...kept.map((loss) => {
     const item = document.createElement("li"), button = document.createElement("button"), advice = document.createElement("span");
     button.type = "button";
-    button.textContent = `${loss.when} (${loss.frames} ${loss.frames === 1 ? "frame" : "frames"}): ${loss.cause || "no cause was kept"}`;
+    button.textContent = `${loss.when} (${loss.frames} ${loss.frames === 1 ? "frame" : "frames"}): ${loss.cause || "cause unknown"}`;
     advice.textContent = loss.advice;
     button.addEventListener("click", () => setRow(loss.row));
     item.append(button, advice);
     return item;
   }));
-  put("more-losses", left ? `And ${left} shorter ones: see frames.csv.` : "");
+  put("more-losses", left ? `${left} shorter gaps are in frames.csv.` : "");
 }
 
 // Share not seen, its map, and the blind spots, as `scopemap coverage` wrote them beside the result.

@@ -19,7 +19,7 @@ function writeVerdict(run) {
   document.querySelector(".word .icon").textContent = ICONS[level];
   put("word", word[0].toUpperCase() + word.slice(1));
   put("advice", advice);
-  list("reasons", reasons.map((reason) => [reason.text, reason.level]));
+  list("reasons", reasons.map((reason) => [`${reason.text} ${reason.next_step}`.trim(), reason.level]));
   document.querySelectorAll("#reasons li").forEach((item) => item.setAttribute("aria-label", names[item.className] + item.textContent));
 }
 
@@ -34,11 +34,11 @@ function writeDetails(run) {
   const rows = [
     ["Input", run.input], ["Kind of input", facts.dataset], ["Camera", (facts.camera || {}).source],
     ["Picture", `${run.camera.width} × ${run.camera.height} px, focal length ${run.camera.fx.toFixed(1)} px`],
-    ["Depth by", estimators.depth], ["Scale", run.scale_known ? (facts.scale.stated ? "as stated: " : "") + run.scale_source : `unknown: ${run.scale_source}`], ["Flow by", estimators.flow],
+    ["Depth", estimators.depth], ["Scale", run.scale_known ? (facts.scale.stated ? "as stated: " : "") + run.scale_source : `unknown (${run.scale_source})`], ["Optical flow", estimators.flow],
     ["Surface", `${mesh.all_faces.toLocaleString("en")} triangles (here ${(bytesOf(mesh.faces).byteLength / 12).toLocaleString("en")})`],
     ["Time", seconds ? `${seconds.toFixed(0)} s${run.frames_per_s ? `, ${run.frames_per_s.toFixed(1)} frames/s` : ""}` : null],
     ["Machine", facts.machine],
-    ["True path", run.truth ? `known; RMS distance ${(100 * run.truth.error_share).toFixed(1)} % of the path's length, after alignment with scale` : null],
+    ["True path", run.truth ? `known; RMS error ${(100 * run.truth.error_share).toFixed(1)} % of the path length, after alignment with scale` : null],
   ];
   document.getElementById("facts").replaceChildren(...rows.filter(([, value]) => value).map(([name, value]) => {
     const row = document.createElement("div"), label = document.createElement("b"), text = document.createElement("span");
@@ -48,7 +48,7 @@ function writeDetails(run) {
     return row;
   }));
   list("notes", run.notes.map((text) => [text]));
-  put("settings", run.config || "not kept");
+  put("settings", run.config || "not saved");
   const named = (pairs) => Object.entries(pairs || {}).map(([key, value]) => `${key}: ${value}`).join(" · ");
   document.getElementById("versions").replaceChildren(
     paragraph(`Versions: ${named(facts.versions)}`),
@@ -60,18 +60,18 @@ function writeDetails(run) {
 function statusOf(run, row) {
   const place = run.places[row], reason = run.reasons[run.reasonOf[row]];
   if (place === 0) return "in the result";
-  if (place > 0) return `in submap ${place} (maps/${place}), not in the result`;
-  if (place === OTHER_MAP) return "followed, but in a submap too short to be kept";
-  if (place === ROTATED) return `camera lost but for its rotation: ${reason || "no reason was kept"}`;
-  return place === NOT_USED ? `not used: ${reason || "left out"}` : `camera lost: ${reason || "no reason was kept"}`;
+  if (place > 0) return `in submap ${place} (maps/${place})`;
+  if (place === OTHER_MAP) return "tracked, but in a submap too short to be saved";
+  if (place === ROTATED) return `camera lost, rotation known: ${reason || "reason unknown"}`;
+  return place === NOT_USED ? `not used: ${reason || "left out"}` : `camera lost: ${reason || "reason unknown"}`;
 }
 
-// Numbers below a bar of colours: [[place 0..1, text], ...], and what they are of.
+// Numbers below a bar of colours: [[place 0..1, text], ...], and what they mean.
 function legendOf(run, map, paint) {
   const percent = (share) => `${Math.round(100 * share)} %`;
-  if (paint === 1) return [[0, 0.25, 1].map((share) => [Math.sqrt(share), percent(share)]), `of ${map.looked} frames looked at see it`];
-  if (paint === 4) return [[0, 0.5, 1].map((share) => [share, percent(share)]), "of the frames that see it: it moves on its own"];
-  return paint === 2 ? [[0, 0.5, 1].map((share) => [share, String(share)]), "confidence: often seen, near, from the front"] : null;
+  if (paint === 1) return [[0, 0.25, 1].map((share) => [Math.sqrt(share), percent(share)]), `of ${map.looked} sampled frames see it`];
+  if (paint === 4) return [[0, 0.5, 1].map((share) => [share, percent(share)]), "of the frames that see it show it moving on its own"];
+  return paint === 2 ? [[0, 0.5, 1].map((share) => [share, String(share)]), "confidence: high where tissue was seen often, near and from the front"] : null;
 }
 
 // A bar of colours, "rgb(...)" from left to right, with numbers at their places.
