@@ -49,18 +49,16 @@ KINDS: dict[str, _Kind] = {
     ),
     "input-interlaced-averaged": _Kind(
         "info",
-        "the pictures are interlaced: their even and odd rows were taken at two times; the working size averages both, "
-        "and what moves fast is blurred; --deinterlace (input.deinterlace=true) uses one field of each",
+        "The video is interlaced: the working size averages both fields, and fast motion is blurred.",
+        "Use one field with --deinterlace.",
     ),
     "input-resized": _Kind(
-        "info",
-        "{frames} picture(s) differ from {size} px by at most 1 % and were cut or completed at their right and bottom "
-        "edge (first: {first})",
+        "info", "{frames} pictures differ from {size} px by at most 1 % and were cut or completed (first: {first})."
     ),
     "input-other-size": _Kind(
         "note",
-        "{frames} picture(s) of another size were left out (first: {first}, {reason}); frames.csv names them",
-        "{frames} picture(s) of another size were left out",
+        "{frames} pictures of another size were left out (first: {first}, {reason}).",
+        "See frames.csv for their names.",
     ),
     "input-text-burned-in": _Kind(
         "note",

@@ -60,7 +60,7 @@ def check_pair(pair: StereoPair, views: Sequence[Views]) -> str:
         raise CalibrationError(f"the views are rectified already and {pair.source} is not: {rows}{depth}; {remedy}")
     if used.rows_px > _MOST_ROWS_PX:
         found = f"rectified by it, their rows differ by {used.rows_px:.1f} px, without it by {plain.rows_px:.1f} px"
-        remedy = "check that both views are of one moment, and that the file is of this pair and this size"
+        remedy = "check that both views show one moment, and that the file belongs to this pair and this size"
         raise CalibrationError(f"the views do not fit {pair.source}: {found}; {remedy}")
     if used.disparity_px <= 0:
         found = f"points lie {-used.disparity_px:.1f} px further to the left in the left view"
