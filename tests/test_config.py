@@ -150,7 +150,7 @@ def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_
         ("tracking.hubert", 2, "did you mean 'tracking.huber'"),
         ("tracking.huber", 0, "greater than 0"),
         ("tracking.finest_level", 4, "less than or equal to 3"),
-        ("tracking.solver", "lbfgs", "'dogleg' or 'gauss-newton'"),
+        ("tracking.solver", "lbfgs", "'dogleg', 'gauss-newton'"),
         ("mapping.keyframe_gaps", [], "at least 1 item"),
         ("mapping.keyframe_gaps", [1, 0], "greater than 0"),
         ("smoothing.alpha", 0.9, r"alpha \+ beta \+ gamma must be 1, their sum is 1\.3"),

@@ -190,7 +190,10 @@ def test_what_cannot_be_measured_is_refused(known: Path, capfd: pytest.CaptureFi
 
     assert "it is in maps/1" in said(FRAMES - 1, "10,10 20,20")
     assert "it has no pose" in said(IN_RESULT, "10,10 20,20")
-    assert "no surface at pixel 200,10 of frame 0, whose size is 80x64 px" in said(0, "10,10 200,10")
+    assert (
+        "no surface at pixel 200,10 of frame 0 (its rectified picture has 80x64 px); the nearest with a surface is"
+        in said(0, "10,10 200,10")
+    )
     assert call("measure", known, "--frame", 0, "--points", "10,10") == 2
     assert call("measure", known, "--frame", 0, "--points", "10;10 20,20") == 2
     assert call("measure", known, "--frame", 0, "--points", "10,10 20,20", "--reference", "1,1") == 2

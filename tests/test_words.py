@@ -99,7 +99,7 @@ def test_sentences_are_short(page: Path) -> None:
     assert [one for one in found if length(one) > 45] == []
 
 
-@pytest.mark.parametrize("page", [*PAGES, *GENERATED, *ASSETS], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [*PAGES, *sorted(GENERATED), *sorted(ASSETS)], ids=lambda page: page.name)
 def test_pages_have_no_unclear_words(page: Path) -> None:
     assert unclear(page.read_text(encoding="utf-8")) == []
 

@@ -185,15 +185,19 @@ def parse_near_far(text: str) -> tuple[float, float]:
     return near_mm, far_mm
 
 
-def parse_settings(pairs: list[str]) -> dict[str, Any]:
-    """Return the settings of "key=value" texts; values are numbers, true, false, lists in JSON, or plain text."""
+def parse_settings(pairs: list[str], *, of_runs: bool = True) -> dict[str, Any]:
+    """Return the settings of "key=value" texts; values are numbers, true, false, lists in JSON, or plain text.
+
+    of_runs : whether they are those of a `Config`, whose names are known.
+    """
     settings: dict[str, Any] = {}
     for pair in pairs:
         key, found, value = pair.partition("=")
         if not found:
-            from scopemap.engine.config.config import check_setting
+            if of_runs:
+                from scopemap.engine.config.config import check_setting
 
-            check_setting(key)
+                check_setting(key)
             raise SettingsError(
                 f"cannot read the setting '{pair[:_QUOTED]}': expected KEY=VALUE such as tracking.keyframe_every=5"
             )

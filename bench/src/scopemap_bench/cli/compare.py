@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -54,7 +55,7 @@ def compare(
     from scopemap_bench.two_runs import refuse_run_as_truth
 
     for path in paths:
-        if not path.exists():
+        if not os.path.exists(path):
             raise InputError(f"comparing {path}: no such file or folder")
     given = [name.strip() for name in names.split(",")] if names else []
     if truth is not None:

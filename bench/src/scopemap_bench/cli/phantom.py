@@ -69,7 +69,7 @@ def phantom(
         loop=loop,
         events=parse_events(events),
         polyps=parse_polyps(polyps),
-    ).with_settings(parse_settings(settings or []))
+    ).with_settings(parse_settings(settings or [], of_runs=False))
     with count_progress("rendering", "rendered", silent=quiet or as_json) as progress:
         write_phantom(spec, folder, progress)
     description = json.loads((folder / "phantom.json").read_text(encoding="utf-8"))

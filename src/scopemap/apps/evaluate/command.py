@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -69,7 +70,7 @@ def evaluate(
     offset = _offset_of(time_offset)
     if truth is None and (not against_video or any(measure.by_name for measure in further)):
         raise typer.BadParameter("needed for all figures but those of --against-video", param_hint="--truth")
-    if trajectory.is_dir():
+    if os.path.isdir(trajectory):
         warn_of_damage(trajectory, silent=quiet)
     figures = _against_own_video(trajectory, source) if against_video else {}
     if truth is not None:
