@@ -245,9 +245,9 @@ def _of_surface(run: Result) -> list[Reason]:
         if "within_10_percent_mean" in surface:
             mean, least_share = (float(surface[f"within_10_percent_{name}"]) for name in ("mean", "least"))
             levels.append(_level(-mean, -GOOD_WITHIN, -LEAST_WITHIN))
-            seen = f"; {_percent(mean)} of a frame agree within 10 % (worst frame: {_percent(least_share)})"
+            seen = f"; {_percent(mean)} of the picture agrees within 10 % (worst frame: {_percent(least_share)})"
         level = max(levels, key=("good", "doubtful", "bad").index)
-        words = {"good": "fits", "doubtful": "fits poorly", "bad": "contradicts"}[level]
+        words = {"good": "fits", "doubtful": "only roughly fits", "bad": "contradicts"}[level]
         text = f"The surface {words} the frames: depth differs by {_percent(error, 1)} (median){seen}."
         found.append(Reason("surface-depth", level, text))
     return found
