@@ -41,7 +41,7 @@ def _left(number: int) -> np.ndarray:
 )
 def test_a_stereo_video_gives_its_left_view(draw: Draw, layout: str, left: Draw, aspect: float, tmp_path: Path) -> None:
     sequence = open_sequence(_video(tmp_path / "v.mp4", draw))
-    notes = [note for note in sequence.notes if note.startswith("stereo")]
+    notes = [str(note) for note in sequence.notes if str(note).startswith("stereo")]
     assert len(notes) == 1
     assert f"stereo, {layout}: the " in notes[0]
     assert "--stereo none" in notes[0]
@@ -60,17 +60,17 @@ def test_what_is_said_of_stereo_overrules_what_is_found(tmp_path: Path) -> None:
     file = _video(tmp_path / "v.mp4", beside)
     whole = open_sequence(file, settings=InputSettings(stereo="none"))
     assert (whole.source.width, whole.source.height) == (2 * WIDTH, HEIGHT)
-    assert not any("stereo" in note for note in whole.notes)
+    assert not any("stereo" in str(note) for note in whole.notes)
     mono = _video(tmp_path / "m.mp4", tissue)
     upper = open_sequence(mono, settings=InputSettings(stereo="top-bottom"))
     assert (upper.source.width, upper.source.height) == (WIDTH, HEIGHT // 2)
-    assert any("stereo, top-bottom: the upper half" in note and "as asked" in note for note in upper.notes)
+    assert any("stereo, top-bottom: the upper half" in str(note) and "as asked" in str(note) for note in upper.notes)
 
 
 def test_ordinary_videos_and_data_sets_are_left_alone(tmp_path: Path) -> None:
     ordinary = open_sequence(_video(tmp_path / "v.mp4", tissue))
     assert (ordinary.source.width, ordinary.source.height) == (WIDTH, HEIGHT)
-    assert [note for note in ordinary.notes if "stereo" in note] == ordinary.warnings == []
+    assert [note for note in ordinary.notes if "stereo" in str(note)] == ordinary.warnings == []
     folder = write_c3vd(tmp_path / "c3vd")
     with pytest.raises(InputError, match=r"'c3vd' defines the view; leave input\.stereo=left-right"):
         open_sequence(folder, settings=InputSettings(stereo="left-right"))
@@ -104,7 +104,7 @@ def test_interlaced_material_is_told_and_undone(tmp_path: Path) -> None:
     assert told.warnings == [Notice("input-interlaced")]
     undone = open_sequence(file, settings=InputSettings(deinterlace=True))
     assert undone.warnings == []
-    assert any("deinterlaced" in note for note in undone.notes)
+    assert any("deinterlaced" in str(note) for note in undone.notes)
     for comb, frame in zip(told.source.frames(slice(None)), undone.source.frames(slice(None)), strict=True):
         np.testing.assert_array_equal(frame.rgb[::2], comb.rgb[::2])
         assert combing(comb.rgb) > 10 * combing(frame.rgb)

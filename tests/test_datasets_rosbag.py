@@ -125,7 +125,7 @@ def test_as_many_of_16_bits_are_used_as_the_first_image_needs(tmp_path: Path, fo
             bag.image(IMAGE, number, values, form)
     source = RosBag(bag.write_bag1(tmp_path / "a.bag"))
     assert [int(frame.rgb[20, 20].max()) for frame in source.frames(slice(None))] == [200, 100, 255]
-    assert any(f"samples of 16 bits: {bits} are used" in note for note in source.notes)
+    assert any(f"samples of 16 bits: {bits} are used" in str(note) for note in source.notes)
     assert any("brighter than" in warning for warning in source.warnings) == (bits < 16)
 
 
@@ -211,7 +211,7 @@ def test_depth_that_is_aligned_is_truth(tmp_path: Path) -> None:
     assert np.isnan(truth.depth_mm[0, :3]).all()
     np.testing.assert_allclose(truth.depth_mm[1:], 180, rtol=1e-6)
     assert source.truth(1) is None
-    assert any("not used: /endoscope/depth/image" in note for note in source.notes)
+    assert any("not used" in str(note) and "/endoscope/depth/image" in str(note) for note in source.notes)
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def test_a_frame_between_two_keyframes_interpolates_both_fields() -> None:
     frame = Frame(15, 0.0, rgb, camera, valid, depth_mm, np.eye(4), depth_sigma_mm=0.1 * depth_mm)
     done = corrected_frame(frame, correction)
     np.testing.assert_allclose(done.depth_sigma_mm / done.depth_mm, [[0.1, np.nan]], rtol=1e-5)
-    assert "corrected by 22%" in correction.notice.text
+    assert correction.notice.values["depth_change"] == pytest.approx(0.2214, abs=1e-4)
 
 
 def _bent(number: int) -> Frame:

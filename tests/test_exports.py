@@ -282,7 +282,9 @@ def test_the_scale_is_said_once(run: Path, tmp_path: Path, capfd: pytest.Capture
 def test_what_cannot_be_exported_is_refused(run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     without = draw_run(tmp_path / "a", pictures=False)
-    assert "is not there any more" in refused(capfd, "export", without, "--to", "colmap", "--out", out)
+    assert "was not found; name it with --input PATH" in refused(
+        capfd, "export", without, "--to", "colmap", "--out", out
+    )
     assert "no finished run" in refused(capfd, "export", tmp_path, "--to", "tum", "--out", tmp_path / "a.txt")
     assert "must end in .stl" in refused(capfd, "export", run, "--to", "stl", "--out", out)
     assert "--units mm: euroc has m" in refused(

@@ -41,7 +41,7 @@ def test_a_part_is_said_and_repeated(
     first, again = tmp_path / "first", tmp_path / "again"
     call("run", video, "--out", first, f"--frames={frames}", "--set", "input.skip_duplicates=false", *FAST)
     said = capfd.readouterr().out
-    assert f"input: {part}; shares are of these" in said
+    assert f"tracked ({part});" in said
     run = Result(first)
     assert run.config.input.frames == frames
     assert run.provenance["selection"] == {"frames": frames, "of": 14}
