@@ -36,7 +36,7 @@ def test_without_its_input_a_report_shows_no_frames(tmp_path: Path, capfd: pytes
     assert call("report", out) == 0
     assert "the page shows no frames" in capfd.readouterr().err
     assert '"pictures": []' in (out / "report.html").read_text(encoding="utf-8")
-    assert "is not there any more" in refused(capfd, "report", out, "--pictures")
+    assert "was not found; name it with --input PATH" in refused(capfd, "report", out, "--pictures")
 
 
 def test_no_run_has_no_report(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

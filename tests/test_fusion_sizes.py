@@ -135,4 +135,4 @@ def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: P
     assert len(again.mesh.vertices) == pytest.approx(len(other.mesh.vertices), rel=0.001)
     assert len(other.mesh.vertices) == pytest.approx(len(same.mesh.vertices), rel=0.15)
     assert other.mesh.area == pytest.approx(factor**2 * same.mesh.area, rel=0.1)
-    assert any(f"voxels of {other.config.fusion.voxel_mm:g} mm" in note for note in said(other.provenance))
+    assert any(f"Voxels measure {other.config.fusion.voxel_mm:g} mm" in note for note in said(other.provenance))

@@ -171,7 +171,7 @@ def test_a_run_whose_video_is_gone_and_no_truth_are_refused(run_folder: Path, tm
     )
     gone = CliRunner().invoke(app, ["evaluate", str(moved), "--against-video"])
     assert gone.exit_code != 0
-    assert "is not there any more" in gone.output + str(gone.exception)
+    assert "was not found; name it with --input PATH" in gone.output + str(gone.exception)
     neither = CliRunner().invoke(app, ["evaluate", str(run_folder)])
     assert neither.exit_code == 2
     assert "--against-video" in neither.output

@@ -51,7 +51,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "frames in words": (lambda path: open_sequence(path, frames="first ten"), "frames 'first ten': expected START"),
     "frames as a number": (lambda path: open_sequence(path, frames=10), "frames '10': expected START"),  # type: ignore[arg-type]
     "a step back": (lambda path: open_sequence(path, frames="9:0:0"), "the step must be positive"),
-    "size as a text": (lambda path: open_sequence(path, size="64x48"), r"size '64x48' is none: give \(width"),  # type: ignore[arg-type]
+    "size as a text": (lambda path: open_sequence(path, size="64x48"), r"size '64x48' is invalid: give \(width"),  # type: ignore[arg-type]
     "an unknown preset": (lambda path: reconstruct(path, "fast"), "unknown preset 'fast'"),
     "settings of another kind": (lambda path: reconstruct(path, {"fps": 3}), "holds no settings: give a Config"),  # type: ignore[arg-type]
     "no file": (lambda path: reconstruct("clip.mp4"), "reading clip.mp4: no such file"),

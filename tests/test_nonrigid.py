@@ -264,7 +264,7 @@ def test_a_correction_states_the_motion_and_carries_it_into_another_world(breath
     motion = TissueMotion(found.deformation, found.left_out, 20.0)
     correction = FrameCorrection(index, at_rest, np.zeros(KEYFRAMES), 0.2, depth_mm=40.0, tissue=motion)
     assert correction.notice.code == "mapping-tissue-moves"
-    assert "60 nodes" in correction.notice.text
+    assert correction.notice.values["nodes"] == 60
     assert "20 times a minute" in correction.notice.text
     T = se3_exp(np.array([0.1, 0.2, 0.3, 5, 6, 7]))
     there = correction.in_world(T).tissue
