@@ -83,8 +83,9 @@ def test_bombs(bomb: str, tmp_path: Path) -> None:
     (tmp_path / "bomb").write_bytes(BINARY.get(bomb) or BOMBS[bomb].encode())
     message = refused(tmp_path / "bomb")
     assert "bomb" in message
-    named = {"entities": "entities", "brackets": "deeper", "dashes": "deeper"}
-    assert named.get(bomb, "") in message
+    named = {"entities": "entities", "brackets": "deep", "dashes": "deep"}
+    # Newer readers of YAML have a limit of their own: "maximum nesting depth".
+    assert named.get(bomb, "") in message or "nesting depth" in message
 
 
 def test_a_large_file_is_not_read(tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ class StereoPair:
         baseline, px mm.
         """
         left, right = (one.central.resized(*size).matrix for one in (self.left, self.right))
-        turned = self.T_right_left[:3, :3], self.T_right_left[:3, 3]
+        turned = self.T_right_left[:3, :3], self.T_right_left[:3, 3:]
         R_left, R_right, P_left, P_right, *_ = cv2.stereoRectify(
             left, np.zeros(4), right, np.zeros(4), size, *turned, flags=cv2.CALIB_ZERO_DISPARITY
         )
