@@ -15,7 +15,9 @@ from scopemap.engine.geometry.se3 import rotation_angle_rad
 NOT_DETERMINED = "not determined"
 """The word for figures that may be the alignment's own error."""
 
-_LIMIT_RAD, _LIMIT_MM = float(np.radians(0.5)), 0.5
+# A turn that changes rotations by less, or surfaces by less, leaves them as they are.
+_LIMIT_RAD = float(np.radians(0.5))
+_LIMIT_MM = 0.5
 # Of 500 drawn odometries along tubes and lines whose relative poses err, by noise and by a bias, the turn was within
 # two of its standard deviations in 97 %, within three in more than 99 %.
 _BOUND = 3.0

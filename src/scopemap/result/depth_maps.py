@@ -119,7 +119,7 @@ class DepthReader:
 
     @property
     def sigma_shares(self) -> np.ndarray:
-        """What the levels of the standard deviation are of the depth, (256,) float32; NaN for 0, unknown."""
+        """The share of the depth that each level of the standard deviation stands for, (256,) float32; NaN for 0."""
         shares = np.asarray(_LEAST_SIGMA * _SIGMA_STEP ** (np.arange(256, dtype=np.float32) - 1), np.float32)
         shares[0] = np.nan
         return shares

@@ -178,7 +178,7 @@ class Run:
 
 @dataclass
 class _Finishing:
-    """Makes the result of a run from the table of all its frames, as tracked; `notices` are of all submaps."""
+    """Makes the result of a run from the table of all its frames, as tracked; `notices` concern all submaps."""
 
     run: Run
     frames: FrameTable

@@ -107,7 +107,7 @@ def crossed(slits: np.ndarray, rest_mm: np.ndarray, faces: np.ndarray) -> np.nda
 
 
 def in_wound(slits: np.ndarray, rest_mm: np.ndarray) -> np.ndarray:
-    """Return which rest points (..., 3) that are seen are of a slit's walls or its floor, (...) bool."""
+    """Return which visible rest points (..., 3) belong to a slit's walls or its floor, (...) bool."""
     wound = np.zeros(rest_mm.shape[:-1], bool)
     for s in slits:
         x, y = ((rest_mm - s[:3]) @ s[axis : axis + 3] for axis in (3, 6))

@@ -50,7 +50,7 @@ _ENTRY = np.dtype(
 
 
 class StoredFile:
-    """A file of a frame store, created with its first bytes; `size` and `crc` are of all that was put in.
+    """A file of a frame store, created with its first bytes; `size` and `crc` count all that was put in.
 
     Raises `InputError` where the folder is full or read-only, and where what is read is not what was put in.
     """

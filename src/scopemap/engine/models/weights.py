@@ -137,7 +137,7 @@ def sha256_of(path: Path) -> str:
 
 
 def recorded_revision(name: str) -> str:
-    """Return the commit that the weights `name` are of by their hashes or were pulled at; "" where unknown."""
+    """Return the commit of the weights `name`, by their hashes or as they were pulled; "" where unknown."""
     checkpoint = find(name)
     of_hashes = checkpoint.revision if checkpoint.files else ""
     return _read_lock().get(checkpoint.name, {}).get("revision", "") or of_hashes

@@ -13,7 +13,8 @@ import numpy as np
 from scopemap.input.camera_files.parsing import Fields
 
 LARGEST_BYTES = 1 << 24
-_NPY, _NPZ = b"\x93NUMPY", b"PK\x03\x04"
+_NPY = b"\x93NUMPY"
+_NPZ = b"PK\x03\x04"
 _DEEPEST = 3
 _DAMAGED = (ValueError, OSError, EOFError, KeyError, zlib.error, zipfile.BadZipFile, MemoryError, RuntimeError)
 

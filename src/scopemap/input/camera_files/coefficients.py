@@ -24,10 +24,15 @@ _TANGENTIAL_LISTS = (
     "TangentialDistortion", "tangential", "tangential_distortion_coefficients", "tangential_coefficients",
 )  # fmt: skip
 # A list of coefficients, or a camera matrix.
-_LIST_OR_MATRIX, _MATRIX_COUNTS = ("k",), (9, 12, 16)
+_LIST_OR_MATRIX = ("k",)
+_MATRIX_COUNTS = (9, 12, 16)
 # Letters before the number of a coefficient: radial, tangential, and one of a list in the order of the lens.
-_RADIAL, _TANGENTIAL, _LISTED = "k", ("p", "t", "r"), ("d", "kc", "dist")
-_MOST_RADIAL, _MOST_TANGENTIAL, _MOST_FISHEYE = 6, 2, 4
+_RADIAL = "k"
+_TANGENTIAL = ("p", "t", "r")
+_LISTED = ("d", "kc", "dist")
+_MOST_RADIAL = 6
+_MOST_TANGENTIAL = 2
+_MOST_FISHEYE = 4
 _ALL_RATIONAL = (4, 5, 6)
 # camodocal counts a fisheye's from 2, by the power of the angle before.
 _FROM_TWO = {2, 3, 4, 5}

@@ -18,7 +18,8 @@ _LENSES = {"pinhole": "pinhole", "fov": "fov", "radtan": "radtan", "equidistant"
 _FIRST_LINE = re.compile(r"(?:([A-Za-z]\w*)\s+)?([-+.\deE\s,]+)")
 _OUTPUTS = ("crop", "full", "none")
 _COUNT = {"pinhole": (4, 5), "fov": (5,), "radtan": (8,), "equi": (8,)}
-_SHORTEST, _LONGEST = 4, 10
+_SHORTEST = 4
+_LONGEST = 10
 
 
 def direct_method_camera(text: str, image_size: Size) -> Calibration | None:

@@ -18,7 +18,9 @@ from scopemap.input.camera_files.calibration import Calibration
 from scopemap.input.camera_files.parsing import Fields, mappings_below
 from scopemap.input.camera_files.scaramuzza import of_ocamcalib
 
-_HEADER, _HEADER_BYTES, _ORDER_AT = b"MATLAB ", 128, 126
+_HEADER = b"MATLAB "
+_HEADER_BYTES = 128
+_ORDER_AT = 126  # two letters that tell the order of bytes
 _COMPRESSED = 15
 _FIRST_PIXEL = 1.0
 _EXPORT = (

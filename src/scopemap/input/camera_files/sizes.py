@@ -27,7 +27,7 @@ _SIDES = (
 _UNSURE_SIDES = (
     ("width", "height"), ("w", "h"), ("cols", "rows"), ("columns", "rows"), ("ncols", "nrows"), ("nx", "ny"),
 )  # fmt: skip
-# Mappings beside that of the camera in which a width is the image's; and those that are of something else.
+# Mappings beside that of the camera in which a width is the image's; and those that belong to something else.
 _OF_IMAGE = re.compile(r"^(image|img|im|frame|picture|video|camera|resolution|size)", re.IGNORECASE)
 _OF_ANOTHER = re.compile(r"^cam\d|right|[_-]?[2r]$|depth|roi|board|target|pattern|sensor", re.IGNORECASE)
 _SMALLEST_SIDE_PX = 16

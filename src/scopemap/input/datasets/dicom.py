@@ -97,7 +97,7 @@ class Dicom(Source):
         return not image_files(path) and bool(_files(path)) if path.is_dir() else _is_dicom(path)
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
-        """Yield the selected frames without those that cannot be decoded, with a warning, or are of another size."""
+        """Yield the selected frames without those that cannot be decoded, with a warning, or have another size."""
         if self._video is not None:
             for read in self._video.frames(selection):
                 time_s = self.times_s.get(read.index, read.time_s)

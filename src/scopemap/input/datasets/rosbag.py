@@ -35,12 +35,15 @@ from scopemap.input.decoding import first_bytes
 from scopemap.input.images import image_files, numeric_order
 from scopemap.input.source import Source, SourceFrame
 
-_IMAGE, _COMPRESSED, _CAMERA_INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
+_IMAGE = "sensor_msgs/msg/Image"
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _MAGIC = {".bag": b"#ROSBAG V", ".mcap": b"\x89MCAP0\r\n", ".db3": b"SQLite format 3\0"}
 _METADATA = "metadata.yaml"
 _RECTIFIED = re.compile(r"rect(ified)?(?![a-z])")
 _ALIGNED = re.compile(r"(?<!un)(?<!not_)(aligned|registered)(?:_depth_to_([a-z0-9]+))?")
-_LEFT, _RIGHT = (re.compile(rf"(?<![a-z]){side}(?![a-z])") for side in ("left", "right"))
+_LEFT = re.compile(r"(?<![a-z])left(?![a-z])")
+_RIGHT = re.compile(r"(?<![a-z])right(?![a-z])")
 _LARGEST_GAP_S = 0.02
 _NS_PER_S = 10**9
 

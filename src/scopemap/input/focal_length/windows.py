@@ -60,7 +60,7 @@ class Window:
 def frames_of_windows(sequence: Sequence, config: Config) -> Iterator[list[Frame]]:
     """Yield a host and the frames after it, as soon as they are read, for each window of the first `MAX_FRAMES` frames.
 
-    They are of the default working size or smaller.
+    They have the default working size or are smaller.
     """
     frames, first = list[Frame](), 0
     for frame in _kept(_at_default_size(sequence), config):
