@@ -23,7 +23,8 @@ from scopemap_bench.result import RunResult
 # flow both ways. Only their ratios count.
 _FLOW_S = {"dis": 0.02, "raft-small": 0.7, "raft-large": 2.6}
 _PERCEPTUAL_S = {"lpips": 0.05, "structure": 0.01}
-_TRACKING_S, _SCORING_S = 0.2, 0.1  # with reading, masks, fusion and the back end
+_TRACKING_S = 0.2  # with reading, masks, fusion and the back end
+_SCORING_S = 0.1
 # These see pictures of a size of their own.
 _DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 100.0}
 _SURFACE_S = 10.0  # a surface against the true one

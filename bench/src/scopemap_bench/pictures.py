@@ -26,8 +26,12 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 _LETTERS_PER_INCH = 12
-BAR_COLOUR, _NOTE_COLOUR, _MEAN_COLOUR = "#4575b4", "#666666", "#d95f02"
-_PANELS_ACROSS, _LONGEST_NAME, _SHOWN_MATCHES = 4, 34, 400
+BAR_COLOUR = "#4575b4"
+_NOTE_COLOUR = "#666666"
+_MEAN_COLOUR = "#d95f02"
+_PANELS_ACROSS = 4
+_LONGEST_NAME = 34
+_SHOWN_MATCHES = 400
 _BARS_PT = 140.0  # width of a panel, less the gaps between its bars
 
 

@@ -25,7 +25,8 @@ from scopemap_bench.evaluation.depth import DepthScaling
 from scopemap_bench.evaluation.protocols import PROTOCOLS
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 
-_PLANS, _METHOD_SETS = "plans", "method_sets"
+_PLANS = "plans"
+_METHOD_SETS = "method_sets"
 _NESTING = 2  # folders around or within a sequence that the pattern does not name
 
 

@@ -39,7 +39,8 @@ from scopemap_bench.plan import ProtocolPlan
 from scopemap_bench.result import Figures
 from scopemap_bench.true_depth import TrueDepths
 
-_CONSISTENCY_PX, _MAX_VIEWS = 1.0, 40
+_CONSISTENCY_PX = 1.0
+_MAX_VIEWS = 40
 
 
 def score(

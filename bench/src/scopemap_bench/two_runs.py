@@ -25,9 +25,11 @@ from scopemap.result.result import Result
 
 _NO_UNIT = "units of the second run"
 _LEAST_COMMON = 3
-_MOST_VIEWS, _DRAWN = 16, 3
+_MOST_VIEWS = 16
+_DRAWN = 3
 _WITHIN_PERCENT = (2, 5)
-_DRAWN_PERCENT, _CELL_PX = 10, (320, 256)
+_DRAWN_PERCENT = 10
+_CELL_PX = (320, 256)
 
 
 @dataclass(frozen=True)

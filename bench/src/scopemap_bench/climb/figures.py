@@ -18,7 +18,10 @@ LEAST_FRAMES = 250
 """Frames of the reference that a submap needs to count, 5 s of video; 100 before the challenge's commit 79d7435."""
 
 # What a factor of the score adds at most, and the errors of a clip of which not more than half is found.
-_MOST_ADDED, _FAILED_MM, _FAILED_DEG, _LEAST_TFR_PERCENT = 0.5, 25.0, 20.0, 50.0
+_MOST_ADDED = 0.5
+_FAILED_MM = 25.0
+_FAILED_DEG = 20.0
+_LEAST_TFR_PERCENT = 50.0
 _RPE_FRAMES = (1, 10, 20, 40)
 _RPE_NAMES = tuple(f"rpe_{step}_mean_{unit}" for step in _RPE_FRAMES for unit in ("mm", "deg"))
 _ERRORS = ("ate_mean_mm", "ate_median_mm", "ate_std_mm", *_RPE_NAMES)

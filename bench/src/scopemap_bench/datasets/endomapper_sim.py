@@ -23,7 +23,8 @@ CAMERA = PinholeCamera(472.64955, 472.64955, 479.5, 359.5, 960, 720)
 
 _TRAJECTORY = "trajectory.csv"
 _MM_PER_DM = 100.0
-_NEAR_DM, _FAR_DM = 0.01, 4.0
+_NEAR_DM = 0.01
+_FAR_DM = 4.0
 _ASPECT_TOLERANCE = 0.01
 
 

@@ -19,9 +19,11 @@ from scopemap.input.trajectory.poses import rigid
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 _POSES = ("poses_bounds.npy", "pose_bounds.npy")
-_MASKS, _MASKS_WITH_HOLES = "gt_masks", "masks"
+_MASKS = "gt_masks"
+_MASKS_WITH_HOLES = "masks"
 _COLUMNS = 17  # a 3x5 matrix [R | t | height, width, focal length] by rows, then near and far
-_IDENTITY_TOLERANCE, _REST_TOLERANCE = 1e-2, 1e-6
+_IDENTITY_TOLERANCE = 1e-2
+_REST_TOLERANCE = 1e-6
 
 
 class EndoNerfFolder(LayoutFolder):

@@ -32,12 +32,15 @@ DEPTH_UNIT_MM = 10.0
 """Rendered depth read as cm, as most do; its unit is not documented."""
 
 _DEPTHS = ("Pixelwise Depths/", "Depths/Pixelwise Depths/", "Pixelwise Depths/Pixelwise Depths/")
-_POSES, _POSE_FILES = ("Poses", "Poses/Poses"), ("*position_rotation.csv", "*.xlsx")
+_POSES = ("Poses", "Poses/Poses")
+_POSE_FILES = ("*position_rotation.csv", "*.xlsx")
 _TRAJECTORY = re.compile(r"Tumor\w*Trajectory_\d+")
 _COLUMNS = ("imageframe", "trans_x", "trans_y", "trans_z", "quot_x", "quot_y", "quot_z", "quot_w")
-_MM_PER_METRE, _SAME = 1000.0, 1e-6
+_MM_PER_METRE = 1000.0
+_SAME = 1e-6
 # Some hundred thousand cells; in memory they take many times as much.
-_MOST_BYTES, _MOST_CELLS = 32 << 20, 4_000_000
+_MOST_BYTES = 32 << 20
+_MOST_CELLS = 4_000_000
 
 
 class EndoSlamFolder(UnityFolder):

@@ -27,8 +27,11 @@ from scopemap.input.trajectory.text import tum_poses
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 from scopemap_bench.datasets.tum import read_stamped
 
-_CALIBRATION, _MASK, _POSES = "calibration.json", "mask.bmp", "poses_gt.txt"
-_DEPTHS_PER_UNIT, _TISSUE = 1000.0, 255
+_CALIBRATION = "calibration.json"
+_MASK = "mask.bmp"
+_POSES = "poses_gt.txt"
+_DEPTHS_PER_UNIT = 1000.0
+_TISSUE = 255
 
 
 class OneSlamFolder(LayoutFolder):

@@ -33,8 +33,10 @@ _CALIBRATIONS = ("endoscope_calibration.yaml", "camera_calibration.yaml")
 _VIDEOS = ("data/rgb.mp4", "rgb.mp4")
 _IMAGES = ("image_02/data", "left", "data/left", "left_finalpass")
 _SCENE_POINTS = ("data/scene_points", "scene_points", "image_02/data/groundtruth")
-_INTRINSICS, _LOG = "intrinsics_colmap.yaml", "frame_log.json"
-_BADLY_CALIBRATED, _STACKED_ASPECT = (4, 5), 1.4
+_INTRINSICS = "intrinsics_colmap.yaml"
+_LOG = "frame_log.json"
+_BADLY_CALIBRATED = (4, 5)
+_STACKED_ASPECT = 1.4
 # COLMAP puts the centre of the top-left pixel at (0.5, 0.5).
 _COLMAP_CENTRE_PX = 0.5
 

@@ -24,7 +24,8 @@ from scopemap_bench.datasets.layouts import LayoutFolder, Place
 
 _CALIBRATION = "Rectified_calibration"
 _TRUTHS = ("Ground_truth_CT", "Reference_CT", "Ground_truth_RGB", "Reference_RGB")
-_SAME_CAMERA_PX, _BLUE = 0.01, (0, 0, 255)
+_SAME_CAMERA_PX = 0.01
+_BLUE = (0, 0, 255)
 
 
 class ServCtFolder(LayoutFolder):

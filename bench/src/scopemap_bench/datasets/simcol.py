@@ -18,7 +18,8 @@ from scopemap_bench.datasets.layouts import LayoutFolder, Place, mirrored
 
 DEPTH_RANGE_MM = 200.0
 _MM_PER_CM = 10.0
-_POSITION, _ROTATION = "SavedPosition", "SavedRotationQuaternion"
+_POSITION = "SavedPosition"
+_ROTATION = "SavedRotationQuaternion"
 
 
 class SimColFolder(LayoutFolder):

@@ -20,7 +20,8 @@ from scopemap.input.camera_files.parsing import calibration_bytes
 from scopemap.input.decoding import read_decoded
 from scopemap_bench.datasets.posed_video import PosedVideo, videos_in
 
-_START, _END = "segmentation/icgstartseg.png", "segmentation/icgendseg.png"
+_START = "segmentation/icgstartseg.png"
+_END = "segmentation/icgendseg.png"
 _CALIBRATION = "calib.json"
 
 

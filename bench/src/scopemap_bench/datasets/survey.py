@@ -21,8 +21,10 @@ from scopemap.input.picture_difference import is_repeat
 from scopemap.input.sequence import Sequence
 from scopemap.input.trajectory.trajectory import path_length_mm
 
-LAGS, LEAST_OVERLAP = (10, 30, 90), 0.2
-_KEPT_EVERY, _MOST_POINTS = 5, 20_000
+LAGS = (10, 30, 90)
+LEAST_OVERLAP = 0.2
+_KEPT_EVERY = 5
+_MOST_POINTS = 20_000
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _LEFT_HANDED = np.diag([1.0, -1.0, 1.0, 1.0])
 RIGID_TOLERANCE = 1e-2

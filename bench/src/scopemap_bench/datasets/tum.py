@@ -28,8 +28,12 @@ CAMERAS: dict[str, CameraModel] = {
 }
 """Of the colour images of freiburg1, 2 and 3 as published; those of freiburg3 were undistorted."""
 
-DEPTH_UNIT_MM, ASSOCIATED_WITHIN_S = 0.2, 0.02
-_IMAGES, _DEPTHS, _POSES, _PAIRS = "rgb.txt", "depth.txt", "groundtruth.txt", "associations.txt"
+DEPTH_UNIT_MM = 0.2
+ASSOCIATED_WITHIN_S = 0.02
+_IMAGES = "rgb.txt"
+_DEPTHS = "depth.txt"
+_POSES = "groundtruth.txt"
+_PAIRS = "associations.txt"
 _NAMED = re.compile(r"freiburg([123])|(?<![a-z0-9])fr([123])(?![a-z0-9])", re.IGNORECASE)
 
 

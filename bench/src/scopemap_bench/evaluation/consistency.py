@@ -26,12 +26,15 @@ from scopemap.engine.geometry.warp import moved_depth, pull
 from scopemap.evaluation.poses import ErrorSummary
 from scopemap_bench.evaluation.depth import depth_scale, scale_jitter
 
-FEATURES, RATIO = 1000, 0.8
+FEATURES = 1000
+RATIO = 0.8
 # OpenCV's default of 20 finds 7 corners in a smooth colon; 7 is ORB-SLAM's lower threshold, and the best 1000 stay.
 _FAST_THRESHOLD = 7
 # The five-point solver needs 5; with fewer than 8 no match is left to confirm a model.
 _FEWEST_MATCHES = 8
-_EPIPOLAR_PX, _RANSAC_CONFIDENCE, _RNG_SEED = 1.0, 0.999, 0
+_EPIPOLAR_PX = 1.0
+_RANSAC_CONFIDENCE = 0.999
+_RNG_SEED = 0
 # exp(-50 |difference|) > 1e-2, with colours in 0..1.
 _COLOUR_DISTANCE = 255 * np.log(1e2) / 50
 _FLOW_LIMIT_PX = 250.0
@@ -40,7 +43,8 @@ OrbFeatures = tuple[np.ndarray, np.ndarray]
 """ORB features of one image: pixels (N, 2) float64, px, and descriptors (N, 32) uint8."""
 _POSES = ("reference", "estimated")
 _CHANGES = ("same_pixel", "along_flow", "opw", "opw_reference", "opw_estimated")
-_CHANGE, _RTC_RATIO = ("mean_mm", "relative", "rtc"), 1.01
+_CHANGE = ("mean_mm", "relative", "rtc")
+_RTC_RATIO = 1.01
 
 
 @dataclass(frozen=True)

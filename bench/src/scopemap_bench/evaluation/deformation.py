@@ -22,7 +22,8 @@ from scopemap_bench.datasets.d4d import D4dClip, End
 from scopemap_bench.phantom.writer import DISPLACEMENT
 
 _MOVED_MM = 1.0
-_FITS, _OUTLIER = 3, 3.0
+_FITS = 3
+_OUTLIER = 3.0
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,9 @@ _FIGURES = (
     *("delta_1", "delta_2", "delta_3"),
 )
 # Bins of the logarithm of depth: medians read from them are exact to 1e-5 of their value, in bounded memory.
-_LOG_LOW, _LOG_HIGH, _LOG_STEP = float(np.log(1e-4)), float(np.log(1e6)), 2e-5
+_LOG_LOW = float(np.log(1e-4))
+_LOG_HIGH = float(np.log(1e6))
+_LOG_STEP = 2e-5
 
 
 @dataclass(frozen=True)

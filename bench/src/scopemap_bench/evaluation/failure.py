@@ -23,13 +23,19 @@ LIMITS_PX = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 LIMIT_PX = 3.0
 
 # Frames between the two that are compared, and how many in a row must contradict.
-_STEP, _IN_A_ROW = 5, 3
+_STEP = 5
+_IN_A_ROW = 3
 # Spacing of the points, largest forward-backward error of their flow, px, and fewest that tell anything.
-_SPACING_PX, _CONSISTENCY_PX, _FEWEST = 12, 1.0, 30
-_NEAREST, _LEAST_Z = 2.0, 0.05  # depth over translation, and of a ray
+_SPACING_PX = 12
+_CONSISTENCY_PX = 1.0
+_FEWEST = 30
+_NEAREST = 2.0  # depth over translation, and of a ray
+_LEAST_Z = 0.05
 # The implied depth jumps where it is so many times that of the frames before, of which so many are kept; it is known
 # from so many px of parallax.
-_JUMP, _KEPT, _LEAST_PARALLAX_PX = 3.0, 10, 1.0
+_JUMP = 3.0
+_KEPT = 10
+_LEAST_PARALLAX_PX = 1.0
 
 
 class FailureMeter:

@@ -26,7 +26,9 @@ from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures
 
 _EVO_MODES: tuple[AlignMode, ...] = ("none", "se3", "sim3")
 _EVO_STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
-_ONESLAM_PATH_MM, _AF_MOTIONS, _SURGCUT3R_FRAMES = 1.0, 4, 16
+_ONESLAM_PATH_MM = 1.0
+_AF_MOTIONS = 4
+_SURGCUT3R_FRAMES = 16
 
 
 @dataclass(frozen=True)

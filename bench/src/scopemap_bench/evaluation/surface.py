@@ -23,10 +23,17 @@ THRESHOLDS_MM = (1.0, 2.0, 5.0)
 
 _SAMPLES_PER_MM2 = 4.0
 _SAMPLES = (1_000, 200_000)
-_COVERED_MM, _NEIGHBOURS, _CUBE_MM = 2.0, 10, 0.2
-_LARGEST_EDGE_MM, _MOST_TRIANGLES = 2.0, 1_000_000
-_CANDIDATES, _CHUNK = (8, 32, 128), 5_000
-_MOVED_POINTS, _FEWEST_POINTS, _KEPT_SHARE, _MOST_ITERATIONS = 20_000, 10, 0.8, 60
+_COVERED_MM = 2.0
+_NEIGHBOURS = 10
+_CUBE_MM = 0.2
+_LARGEST_EDGE_MM = 2.0
+_MOST_TRIANGLES = 1_000_000
+_CANDIDATES = (8, 32, 128)
+_CHUNK = 5_000
+_MOVED_POINTS = 20_000
+_FEWEST_POINTS = 10
+_KEPT_SHARE = 0.8
+_MOST_ITERATIONS = 60
 # Neighbours that swap places never let the last thousandths of a mm come to rest.
 _STILL_MM = 5e-3
 # Directions in which the surface slides along itself (a plane has three) are not moved in.

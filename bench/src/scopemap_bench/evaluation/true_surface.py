@@ -39,9 +39,12 @@ from scopemap_bench.evaluation.surface import (
 TrueView = tuple[np.ndarray, np.ndarray]
 """One frame's pose (4, 4), camera to world, mm, and its true depth (H, W), mm, NaN = unknown."""
 
-_TOLERANCE, _NEARER = 0.02, 0.01
-_SUBPIXEL_BITS, _PAINTED_PX = 4, 1280
-_OBSERVED, _MISSED = 1, 2
+_TOLERANCE = 0.02
+_NEARER = 0.01
+_SUBPIXEL_BITS = 4
+_PAINTED_PX = 1280
+_OBSERVED = 1
+_MISSED = 2
 
 
 def seen_points(points_mm: np.ndarray, camera: CameraModel, view: TrueView) -> np.ndarray:

@@ -30,7 +30,9 @@ from scopemap.engine.tracking.tracker import Tracker
 UNIT_MM = 100.0
 """Length of one Open3D unit, mm."""
 
-_DEPTH_MAX_UNITS, _VOXEL_MM, _ICP_MAX_DISTANCE_MM = 5.0, 1.0, 3.0
+_DEPTH_MAX_UNITS = 5.0
+_VOXEL_MM = 1.0
+_ICP_MAX_DISTANCE_MM = 3.0
 _MIN_KNOWN_SHARE = 0.1  # of the image with known depth, the default of our own tracker
 _SINGULAR = "Open3D's linear system is singular: it took no step"
 

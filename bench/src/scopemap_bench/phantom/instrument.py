@@ -11,12 +11,15 @@ from scopemap_bench.phantom.march import SurfaceBuffers, rays_of
 
 _METAL = np.array([0.50, 0.51, 0.53], np.float32)
 _SHAFT = np.array([0.09, 0.09, 0.10], np.float32)
-_GLOSS_SHARPNESS, _GLOSS = 30.0, 1.2
+_GLOSS_SHARPNESS = 30.0
+_GLOSS = 1.2
 # Port and working point in camera axes, mm, radius, and how far the tip wanders; a rigid one beside the laparoscope,
 # and forceps out of the endoscope's channel.
 _RIGID = (np.array([55.0, 34.0, -20.0]), np.array([4.0, 4.0, 46.0]), 2.5, 9.0)
 _FORCEPS = (np.array([5.0, 5.0, -2.0]), np.array([1.0, 2.0, 17.0]), 1.1, 3.0)
-_JAWS_MM, _OPEN_RAD, _CLOSED_RAD = (11.0, 4.0), 0.35, 0.08
+_JAWS_MM = (11.0, 4.0)
+_OPEN_RAD = 0.35
+_CLOSED_RAD = 0.08
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,10 @@ from scopemap_bench.phantom.motion import Displacement
 from scopemap_bench.phantom.slit import gap_at, shift_at
 
 _MARGIN = 2
-_MAX_STEPS, _NEWTON_STEP_VOXELS, _TOLERANCE_VOXELS, _LEAST_STEP_VOXELS = 1000, 0.5, 1e-5, 1e-3
+_MAX_STEPS = 1000
+_NEWTON_STEP_VOXELS = 0.5
+_TOLERANCE_VOXELS = 1e-5
+_LEAST_STEP_VOXELS = 1e-3
 
 Grids = tuple[np.ndarray, np.ndarray, np.ndarray, float, float]
 Moved = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -16,7 +16,9 @@ from scopemap_bench.phantom.march import Volume, march
 from scopemap_bench.phantom.motion import REST
 from scopemap_bench.phantom.spec import Polyp
 
-_CROSS, _RIM_MM, _MELT_PER_MM = 0.8, 0.25, 4.0
+_CROSS = 0.8
+_RIM_MM = 0.25
+_MELT_PER_MM = 4.0
 _HEIGHT = {"sessile": 0.45, "flat": 0.0, "pedunculated": 1.1}  # of the diameter
 _FLAT_MM, _STALK, _STALK_MM, _HEAD, _BEHIND, _BEHIND_MM = (
     1.5,
@@ -28,7 +30,11 @@ _FLAT_MM, _STALK, _STALK_MM, _HEAD, _BEHIND, _BEHIND_MM = (
 )  # a head's half height, a stalk's radius, of the diameter
 _REDDER = np.array([1.0, 0.6, 0.6], np.float32)
 # Where they grow: share of the picture's sides that stays free, and what the camera keeps away from them.
-_MARGIN, _LEAST_FACING, _FARTHEST, _AWAY_MM, _BENT = 0.06, 0.5, 70, 4.0, 0.12
+_MARGIN = 0.06
+_LEAST_FACING = 0.5
+_FARTHEST = 70
+_AWAY_MM = 4.0
+_BENT = 0.12
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,14 @@ from scipy.spatial.distance import cdist
 
 from scopemap_bench.phantom.march import Volume, noise_at
 
-_WALL_MM, _FLOOR_MM, _BEHIND_MM = 95.0, 62.0, 45.0
-_VOXEL_MM, _SLABS = 1.25, 16
-_MELT_PER_MM, _DEEPEST_MM, _RELIEF_MM = 0.8, -6.0, 16.0
+_WALL_MM = 95.0
+_FLOOR_MM = 62.0
+_BEHIND_MM = 45.0
+_VOXEL_MM = 1.25
+_SLABS = 16
+_MELT_PER_MM = 0.8
+_DEEPEST_MM = -6.0
+_RELIEF_MM = 16.0
 
 # Linear RGB of floor (omentum fat), abdominal wall, and the organs in the order of `_organs`.
 _TINTS = np.array(
@@ -30,11 +35,18 @@ _TINTS = np.array(
 # A third of the floor's fat: what is full of blood is as dark.
 _OMENTUM_RGB = _TINTS[0] / 3
 # Its middle line below the view's, and its half widths along and across the lower edge.
-_OMENTUM_DOWN_MM, _OMENTUM_ALONG_MM, _OMENTUM_ACROSS_MM = 26.0, 70.0, 20.0
-_SPACING_MM, _AHEAD_MM, _RADIUS_MM = 4.0, 84.0, 18.0
-_SHARPNESS_PER_MM, _OUTSIDE_MM = 0.35, -8.0
-_BRICK, _VOXEL_BUDGET = 8, 20e6
-_TUBE_RADIUS_MM, _TUBE_AHEAD_MM = 16.0, 130.0
+_OMENTUM_DOWN_MM = 26.0
+_OMENTUM_ALONG_MM = 70.0
+_OMENTUM_ACROSS_MM = 20.0
+_SPACING_MM = 4.0
+_AHEAD_MM = 84.0
+_RADIUS_MM = 18.0
+_SHARPNESS_PER_MM = 0.35
+_OUTSIDE_MM = -8.0
+_BRICK = 8
+_VOXEL_BUDGET = 20e6
+_TUBE_RADIUS_MM = 16.0
+_TUBE_AHEAD_MM = 130.0
 
 
 @dataclass(frozen=True)

@@ -27,20 +27,31 @@ _MOTTLES = ((22.0, 0.22), (8.0, 0.16), (3.0, 0.14), (1.2, 0.14))
 _VESSEL_COLOUR = np.array([0.80, 0.42, 0.50], np.float32)
 # Lattice spacing mm, width mm, depth of colour.
 _VESSELS = ((17.0, 0.45, 0.75), (8.0, 0.22, 0.55))
-_RIPPLE_MM, _PUDDLE_MM, _FILM_TILT = 1.9, 14.0, 0.3
-_HIGHLIGHT_SHARPNESS, _HIGHLIGHT_STRENGTH = 350.0, 1.6
-_VIGNETTE, _KNEE, _OPTICS_SIGMA_PX, _SHOT_NOISE = 0.35, 0.6, 0.55, 2.5
-_EXPOSED_SHARE, _EXPOSED_LEVEL = 80.0, 0.48
+_RIPPLE_MM = 1.9
+_PUDDLE_MM = 14.0
+_FILM_TILT = 0.3
+_HIGHLIGHT_SHARPNESS = 350.0
+_HIGHLIGHT_STRENGTH = 1.6
+_VIGNETTE = 0.35
+_KNEE = 0.6
+_OPTICS_SIGMA_PX = 0.55
+_SHOT_NOISE = 2.5
+_EXPOSED_SHARE = 80.0
+_EXPOSED_LEVEL = 0.48
 _BLUR_PX = 13
-_WATER_PX, _WATER_LENGTH_PX, _WATER_FRAMES = 5.0, 40.0, 7.0
+_WATER_PX = 5.0
+_WATER_LENGTH_PX = 40.0
+_WATER_FRAMES = 7.0
 _WATER_RGB = np.array([0.55, 0.45, 0.22], np.float32)
 _SMOKE_GREY = np.array([0.42, 0.43, 0.44], np.float32)
 _VEIL = 1.2  # optical depth at the usual distance, where a cloud is of density 1
 MAX_SAMPLES = 8
 """Of light within one exposure."""
 
-_SHIFT_PERCENTILE, _PX_PER_SAMPLE = 95, 2.0
-_ENCODER, _FULL_EVERY = "libx264", 60
+_SHIFT_PERCENTILE = 95
+_PX_PER_SAMPLE = 2.0
+_ENCODER = "libx264"
+_FULL_EVERY = 60
 # Endoscopy towers record live: no frames from the future, a full frame every two seconds.
 _OPTIONS = {"preset": "fast", "tune": "zerolatency"}
 

@@ -13,8 +13,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-_GAPE_MM, _FADE_MM, _REACH_MM, _DEEP_MM, _LENGTH_MM, _RAMP_MM = 2.2, 8.0, 5.0, 3.5, 14.0, 10.0
-_COLUMNS, _BLADE, _UNIT = 20, 18, 19
+_GAPE_MM = 2.2
+_FADE_MM = 8.0
+_REACH_MM = 5.0
+_DEEP_MM = 3.5
+_LENGTH_MM = 14.0
+_RAMP_MM = 10.0
+_COLUMNS = 20
+_BLADE = 18
+_UNIT = 19
 _INVERSE_STEPS = 30
 _WOUND_MM = 0.02
 UNCUT = np.zeros((0, _COLUMNS))

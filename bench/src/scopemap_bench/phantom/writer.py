@@ -49,7 +49,8 @@ _OWN_FILES = (
 _FOLLOWED_POINTS = 1000
 _NEWTON_STEPS = 4
 _BESIDE_MM = 2.0
-_SEEN_MARGIN_VOXELS, _RIM_VOXELS = 2, 4
+_SEEN_MARGIN_VOXELS = 2
+_RIM_VOXELS = 4
 
 
 def seen_surface(volume: Volume, seen: np.ndarray) -> trimesh.Trimesh:

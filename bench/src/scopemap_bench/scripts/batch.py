@@ -28,7 +28,9 @@ from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.demo_clip import write_clip
 
-SIZE, CAMERA, POISONED = (160, 128), "80 80 79.5 63.5", "colon_03_poisoned"
+SIZE = (160, 128)
+CAMERA = "80 80 79.5 63.5"
+POISONED = "colon_03_poisoned"
 SETTINGS = ("--preset", "realtime", "--camera", CAMERA)
 RETRIES = 2
 # They hold times, or what holds times.

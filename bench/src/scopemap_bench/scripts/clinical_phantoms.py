@@ -20,7 +20,8 @@ from scopemap_bench.scoring import true_pairs
 from scopemap_bench.scripts import measuring
 from scopemap_bench.true_depth import TrueDepths
 
-FRAMES, SEED = 120, 21
+FRAMES = 120
+SEED = 21
 EXPOSURE = ("--set", "auto_exposure=true", "--set", "exposure_lag_frames=4")
 CAMERA = ("--set", "shutter=0.8", "--set", "h264_crf=30", "--set", "indirect=0.15", *EXPOSURE)
 PHANTOMS = {

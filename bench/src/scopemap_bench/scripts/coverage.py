@@ -31,8 +31,11 @@ from scopemap_bench.evaluation.coverage import (
 from scopemap_bench.scripts import measuring
 
 FAST = ("--frames", 50, "--set", "speed=3")
-BACK, DEEP, SHALLOW = ("--set", "route=withdrawal"), ("--set", "fold_mm=9"), ("--set", "fold_mm=4")
-TURNS, TURNS_BACK = ("--events", "turn:14-20,turn:34-40"), ("--events", "turn:18-24,turn:34-40")
+BACK = ("--set", "route=withdrawal")
+DEEP = ("--set", "fold_mm=9")
+SHALLOW = ("--set", "fold_mm=4")
+TURNS = ("--events", "turn:14-20,turn:34-40")
+TURNS_BACK = ("--events", "turn:18-24,turn:34-40")
 CAVITY = ("--scene", "laparoscopy")
 PHANTOMS: dict[str, tuple[object, ...]] = {
     **{f"wander-{seed}": FAST for seed in (71, 72)},
@@ -44,7 +47,9 @@ PHANTOMS: dict[str, tuple[object, ...]] = {
     **{f"deep-{seed}": (*FAST, *DEEP) for seed in (80, 81, 82)},
     **{f"laparoscopy-{seed}": (*FAST, *CAVITY) for seed in (83, 84)},
 }
-_SLOW, _NARROW, _WIDE = ("--frames", 150), ("--set", "fov_deg=70"), ("--set", "fov_deg=110")
+_SLOW = ("--frames", 150)
+_NARROW = ("--set", "fov_deg=70")
+_WIDE = ("--set", "fov_deg=110")
 _FITTED_WORDS: list[tuple[object, ...]] = [
     *(FAST, FAST, (*FAST, *_NARROW), (*FAST, *_WIDE), _SLOW, (*_SLOW, *BACK), (*_SLOW, *DEEP), (*FAST, *BACK)),
     *((*FAST, *BACK), (*FAST, *BACK, *_NARROW), (*FAST, *TURNS), (*FAST, *TURNS), (*FAST, *BACK, *TURNS_BACK)),
@@ -54,7 +59,8 @@ _FITTED_WORDS: list[tuple[object, ...]] = [
     *(("--frames", 30, *CAVITY), (*FAST, "--set", "fold_mm=8"), (*FAST, *BACK, *SHALLOW), (*FAST, *DEEP, *TURNS), FAST),
 ]
 FITTED = {f"fitted-{101 + number}": words for number, words in enumerate(_FITTED_WORDS)}
-_EVERY, _STEPS = 12, 12
+_EVERY = 12
+_STEPS = 12
 
 
 def found_and_true(name: str, words: tuple[object, ...], folder: Path) -> tuple[Coverage, CoverageErrors, np.ndarray]:

@@ -37,8 +37,12 @@ from scopemap_bench.evaluation.depth import evaluate_depth, evaluate_depth_seque
 from scopemap_bench.scripts.measuring import options_of, print_head, print_row
 
 Size = tuple[int, int]  # width and height, px
-_DARK_LEVEL, _CLIPPED_MM, _INSTRUMENT_MARGIN_PX, _SATURATED_LEVEL = 12, 99.9, 9, 250
-_ENDONERF_FOCAL_PX, _TRUTH_EVERY = 569.468, 6
+_DARK_LEVEL = 12
+_CLIPPED_MM = 99.9
+_INSTRUMENT_MARGIN_PX = 9
+_SATURATED_LEVEL = 250
+_ENDONERF_FOCAL_PX = 569.468
+_TRUTH_EVERY = 6
 SIZES: tuple[Size, ...] = ((160, 128), (320, 256))
 Predicted = tuple[np.ndarray, np.ndarray | None]
 """Depth and, if known, its standard deviation, (H, W) mm each, NaN = unknown."""

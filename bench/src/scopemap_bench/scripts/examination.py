@@ -31,13 +31,18 @@ from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.phantom.shading import develop, disturb
 from scopemap_bench.scripts import measuring
 
-LENGTH, FPS, SIZE = 150, 30, (320, 256)
-CLEAR, ROOM = "clear view", "room"
+LENGTH = 150
+FPS = 30
+SIZE = (320, 256)
+CLEAR = "clear view"
+ROOM = "room"
 BETWEEN = ("covered lamp", "contact", "cut", "at rest", "water", "blur", "smoke")
 """What follows a walk, in turn; of the last three the walk goes on behind."""
-SHORT, LONG = 45, 150  # frames of what lies between, in turn
+SHORT = 45  # frames of what lies between, in turn
+LONG = 150
 _DISTURBED = {"water": "fluid", "blur": "blur", "smoke": "smoke"}
-_GAMMA, _NOISE = 2.4, 0.004
+_GAMMA = 2.4
+_NOISE = 0.004
 _USABLE_S = 3.0
 _STEADY = 10  # frames into a row of skipped ones, from which their time counts
 

@@ -22,10 +22,13 @@ from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.locating import errors
 
 FRAMES = 120
-STAYS, WENT, CAME = "sessile:8@30", "sessile:6@90", "sessile:6@65"
+STAYS = "sessile:8@30"
+WENT = "sessile:6@90"
+CAME = "sessile:6@65"
 LIGHT = ("--set", "examination=1", "--set", "auto_exposure=true", "--set", "h264_crf=26")
 TISSUE = ("--set", "insufflation=0.05", "--deform", "--set", "breath_mm=1", "--events", "fluid:50-59")
-RIGHT_MM, RIGHT_DEG = 5.0, 10.0
+RIGHT_MM = 5.0
+RIGHT_DEG = 10.0
 
 
 def changes(folder: Path, run: Path, first: Path, second: Path) -> tuple[bool, bool, int]:

@@ -24,7 +24,10 @@ from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.overview import clips, drawn
 
 NAMES = ("colon phantom", "laparoscopy phantom", "colon phantom, breathing")
-LEAST_MM, SQUARES_PX, BREAK, TRIES = 8.0, (30, 80), 1.05, 50
+LEAST_MM = 8.0
+SQUARES_PX = (30, 80)
+BREAK = 1.05
+TRIES = 50
 
 
 def random_pairs(points: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, float, float]:

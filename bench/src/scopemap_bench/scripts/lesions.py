@@ -24,11 +24,21 @@ from scopemap.engine.frame import Frame
 from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.scripts import measuring
 
-SEEDS, FRAMES, AT = (*range(401, 410), 411, 413, 415), 48, (8, 20, 32, 44)
-KINDS, LARGEST_MM = ("sessile", "flat", "pedunculated"), (18.0, 18.0, 10.0)
-LEAST_PX, EDGE_PX, BESIDE, TRIES = 150, 3, 1.5, 2000
-REFERENCE_MM, SAME_DEPTH, LEAST_REFERENCE_PX, LEVEL = (5.0, 15.0), 1.25, 20, 0.3
-SMOOTH_PX, BREAK = 7, 1.1
+SEEDS = (*range(401, 410), 411, 413, 415)
+FRAMES = 48
+AT = (8, 20, 32, 44)
+KINDS = ("sessile", "flat", "pedunculated")
+LARGEST_MM = (18.0, 18.0, 10.0)
+LEAST_PX = 150
+EDGE_PX = 3
+BESIDE = 1.5
+TRIES = 2000
+REFERENCE_MM = (5.0, 15.0)
+SAME_DEPTH = 1.25
+LEAST_REFERENCE_PX = 20
+LEVEL = 0.3
+SMOOTH_PX = 7
+BREAK = 1.1
 TRUTHS = {
     "largest diameter": "diameter_mm",
     "diameter across it": "cross_diameter_mm",

@@ -31,7 +31,8 @@ from scopemap_bench.scripts import measuring
 
 PERIOD = 300  # frames of the phantom
 EVERY_S = 1.0
-PARTS, FPS = 5, 15  # of a live session
+PARTS = 5  # of a live session
+FPS = 15
 MOST_READ = 250  # frames of the clip
 
 

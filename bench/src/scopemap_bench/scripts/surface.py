@@ -34,10 +34,12 @@ CLIPS = (
     *("C3VD cecum_t1_a", "colonoscopy video", "laparoscopy video", PULLING),
     *("colon phantom", "laparoscopy phantom", "colon phantom, breathing"),
 )
-AT_REST, AT_A_SECOND = "camera at rest", "surface at a second"
+AT_REST = "camera at rest"
+AT_A_SECOND = "surface at a second"
 POKED = ("--scene", "laparoscopy", "--frames", 90, "--events", "poke:35-55", "--seed", 32)
 SECONDS = {0: 0.0, 89: 89 / 30}
-MOVED_MM, GROWN_PX = 2.0, 9
+MOVED_MM = 2.0
+GROWN_PX = 9
 
 
 def print_surface(clip: Clip, out: Path) -> None:

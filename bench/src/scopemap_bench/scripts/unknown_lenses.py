@@ -30,7 +30,9 @@ from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec, SceneName
 from scopemap_bench.scripts import measuring
 
-SIZE, EVERY, FRAMES = (320, 256), 4, 120
+SIZE = (320, 256)
+EVERY = 4
+FRAMES = 120
 # Scene, kind of the lens, horizontal field of view in degrees, seed, whether tissue breathes.
 MODELS: tuple[tuple[SceneName, str, float, int, bool], ...] = (
     ("laparoscopy", "pinhole", 60.0, 301, False),
@@ -62,7 +64,9 @@ def lens_of(kind: str, fov_deg: float, size: tuple[int, int] = SIZE, across: flo
 
 # Labels are of the widest chord: of C3VD's colonoscope, labelled 170 degrees, 1.13 widths (corners are cut); of
 # MiroCam, labelled 170 degrees, the diagonal of a square, through an equidistant fisheye. Round fields: the width.
-_CUT_CORNERS, _DIAGONAL, _SQUARE = 2 * 769.24 * math.sin(math.radians(85)) / 1350, math.sqrt(2), (320, 320)
+_CUT_CORNERS = 2 * 769.24 * math.sin(math.radians(85)) / 1350
+_DIAGONAL = math.sqrt(2)
+_SQUARE = (320, 320)
 ENDOSCOPES = (
     # EndoMapper (doi 10.1038/s41597-023-02564-7), Endoscope_01, calibrated.
     Endoscope(

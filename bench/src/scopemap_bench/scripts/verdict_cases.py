@@ -15,7 +15,8 @@ from scopemap_bench.scripts import overview
 
 Words = tuple[object, ...]
 FAST: Words = ("--preset", "realtime")
-SCENES, SEEDS = ("colon", "laparoscopy"), (31, 32)
+SCENES = ("colon", "laparoscopy")
+SEEDS = (31, 32)
 CODED = ("shutter=0.8", "h264_crf=30", "indirect=0.15", "auto_exposure=true", "exposure_lag_frames=4")
 DIFFICULT: dict[str, Words] = {
     "blur, smoke": ("--events", "blur:20-26,smoke:40-46"),

@@ -37,7 +37,8 @@ from scopemap_bench.evaluation.partial_truth import drift, pairs_in_order
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.verdict_cases import Case, phantom_cases, real_cases
 
-MOST_PATH, MOST_SURFACE = 0.03, 0.05
+MOST_PATH = 0.03
+MOST_SURFACE = 0.05
 LEAST_IN_ORDER = 0.9
 UNKNOWN = float("nan")
 

@@ -19,7 +19,8 @@ from typing import IO, TypeAlias
 from scopemap.engine.errors import check_bytes, reporting
 
 LARGEST_FILE_BYTES = 256 << 20
-_MOST_MEMBERS, _LARGEST_HEADER_BYTES = 200_000, 1 << 20
+_MOST_MEMBERS = 200_000
+_LARGEST_HEADER_BYTES = 1 << 20
 _LONG_NAMES = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK)
 _HEADERS = (*_LONG_NAMES, tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE)
 ARCHIVES = (".tar.gz", ".tgz", ".tar")

@@ -23,13 +23,15 @@ from scopemap.input.trajectory.poses import rigid, stamped
 from scopemap.input.trajectory.trajectory import Trajectory, Unit
 from scopemap_bench.trajectories.numbered import ARCHIVES, ArchiveFiles, NumberedFiles, find_numbered
 
-_PREFIX, _SUFFIXES = "frame_data", (".json",)
+_PREFIX = "frame_data"
+_SUFFIXES = (".json",)
 # AF-SfMLearner unpacks to image_02/data. A place that ends in a dot has loose files.
 _PLACES = ("frame_data", ".", "data/frame_data", "data/.", "image_02/data/frame_data", "image_02/data/.")
 SCARED_FILES = tuple(f"{place}{end}" for place in _PLACES for end in (f"/{_PREFIX}*.json", *ARCHIVES))
 """Where the poses of a keyframe's folder are: a file of any of these names holds some."""
 
-_SHORTEST_STEP_POWER, _LARGEST_STAMP = -2, 1e30
+_SHORTEST_STEP_POWER = -2
+_LARGEST_STAMP = 1e30
 _LARGEST_FILE_BYTES = 1 << 20  # a file of poses and calibrations holds 2 kB
 
 
