@@ -19,8 +19,8 @@ _IMAGES = "images"
 class ColmapFolder(ImageFolder):
     """All images of the folder; those in the model have its pose. A `camera.yaml` in the folder wins over its camera.
 
-    Raises `InputError` where the model is damaged or has none of the images. Cameras that are damaged, differ, do not fit
-    or have a model without a counterpart here are its `camera_fault`.
+    Raises `InputError` where the model is damaged or has none of the images. Cameras that are damaged, differ, do not
+    fit, or have a model without a counterpart here are its `camera_fault`.
     """
 
     name = "colmap"
