@@ -89,8 +89,9 @@ class FramePanels {
     if (codes) this.#depth(canvas("depth"), codes, mask);
     else blank(canvas("depth"), width, height, "no depth was kept");
     if (!pose || !mesh.vertices) {
-      blank(canvas("rendered"), width, height, pose ? "no surface" : "camera lost");
-      blank(canvas("residual"), width, height, pose ? "no surface" : "camera lost");
+      const missing = !this.view ? "needs WebGL 2" : pose ? "no surface" : "camera lost";
+      blank(canvas("rendered"), width, height, missing);
+      blank(canvas("residual"), width, height, missing);
       return null;
     }
     this.#rendered(canvas("rendered"), mesh, pose, far, images && bytesOfImage(images.video, width, height), mask);
