@@ -174,8 +174,9 @@ def without_outliers(
 
 def _attempt(views: list[BoardView], size: tuple[int, int], form: LensForm, start: PinholeCamera | None) -> Fit | None:
     """Return OpenCV's fit from `start`, None: its own guess; None where it fails."""
-    boards = [view.corners.board_mm.astype(np.float32)[:, None] for view in views]
-    pixels = [view.corners.pixels.astype(np.float32)[:, None] for view in views]
+    # Rows, not columns: OpenCV 5 fits no fisheye to columns.
+    boards = [view.corners.board_mm.astype(np.float32)[None] for view in views]
+    pixels = [view.corners.pixels.astype(np.float32)[None] for view in views]
     matrix, is_fisheye = np.eye(3) if start is None else start.matrix, form.model == "fisheye"
     flags = sum(flag for term, flag in (_FIX_FISHEYE if is_fisheye else _FIX).items() if term not in form.terms)
     try:
@@ -206,7 +207,8 @@ def _resected(camera: CameraModel, corners: Corners, T_camera_board: np.ndarray)
     """Return corners seen minus projected (N, 2), px, for the refined pose; NaN beyond the lens' field."""
     rays = camera.unproject(corners.pixels)
     seen = np.isfinite(rays).all(axis=1)
-    rotation, translation = cv2.Rodrigues(T_camera_board[:3, :3])[0], T_camera_board[:3, 3].copy()
+    # A column: OpenCV 5 starts elsewhere from a flat translation.
+    rotation, translation = cv2.Rodrigues(T_camera_board[:3, :3])[0], T_camera_board[:3, 3:].copy()
     if seen.sum() >= _FEWEST_CORNERS:
         board, plane = corners.board_mm[seen], rays[seen, :2]
         rotation, translation = cv2.solvePnPRefineLM(board, plane, np.eye(3), None, rotation, translation)
