@@ -14,6 +14,7 @@ from typing import Any
 import typer
 
 from scopemap.apps.batch.command import batch
+from scopemap.apps.browser.command import app as window_app
 from scopemap.apps.calibrate.command import calibrate
 from scopemap.apps.coverage.command import coverage
 from scopemap.apps.demo.command import demo
@@ -41,7 +42,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 _GROUPS = {
-    "Reconstruct": ("run", "demo", "live"),
+    "Reconstruct": ("app", "run", "demo", "live"),
     "Look": ("view", "report", "export", "verify"),
     "Measure": ("measure", "coverage", "locate", "compare-exams"),
     "Compare and evaluate": ("evaluate", "compare", "bench", "climb"),
@@ -51,7 +52,7 @@ _GROUPS = {
 """Commands in the groups of --help, those of scopemap-bench among them; others stand in a group of their own."""
 _MEASURES = [one for _, added in plugins("scopemap.measures") for one in added]
 _OWN = (
-    run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage,
+    window_app, run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage,
     locate, compare_exams, verify, calibrate, models.app,
 )  # fmt: skip
 

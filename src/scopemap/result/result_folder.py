@@ -28,7 +28,10 @@ LOCK = "process"
 STORED = "stored_frames"
 """Folder there with the frames that are fused after the last one; it is not of the result."""
 
-NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT)
+VIEW = "view"
+"""Folder there with what can be seen of the run while it goes on; it is not of the result."""
+
+NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT, VIEW)
 """Files and folders there that a run needs to go on, and that go with the folder."""
 
 _REPLACED = "replaced"

@@ -29,7 +29,7 @@ from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.memory import memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import refuse_own_input
-from scopemap.runner.run import Clock, FrameWriter, KeptObserver, Observer, Progress, Run
+from scopemap.runner.run import Clock, FinalFrameObserver, FrameWriter, KeptObserver, Observer, Progress, Run
 
 _NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
 
@@ -106,6 +106,7 @@ def _reconstruct(
         writers: tuple[FrameWriter, ...] = tuple(each for each in (write_depth, previews) if each is not None)
         if folder is not None and config.tracking.camera_at_rest:
             writers += (SurfaceWriter(folder, config, estimators),)
+        writers += tuple(observer.final for observer in observers if isinstance(observer, FinalFrameObserver))
         lasting = tuple(observer for observer in observers if isinstance(observer, KeptObserver))
         with closing(store):
             pipeline = Pipeline(config, estimators, store, tracker)

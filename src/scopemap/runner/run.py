@@ -46,6 +46,17 @@ class KeptObserver(Protocol):
         """Write what was observed to the folder of the result."""
 
 
+@runtime_checkable
+class FinalFrameObserver(Protocol):
+    """An `Observer` that also sees each frame with its final depth and pose, as it is written."""
+
+    def __call__(self, step: Step) -> bool | None:
+        """Take a step."""
+
+    def final(self, frame: Frame) -> None:
+        """Take a frame whose depth and pose are final."""
+
+
 Progress = Callable[[str, int, int], None]
 """Called with what is done outside of tracking (such as "fusing"), frames done, and all frames; 0: not in frames."""
 FrameWriter = Callable[[Frame], None]

@@ -29,6 +29,18 @@ class RunProgress(NamedTuple):
     progress: Callable[[str, int, int], None]
 
 
+def both(
+    one: Callable[[str, int, int], None], other: Callable[[str, int, int], None]
+) -> Callable[[str, int, int], None]:
+    """Return the progress that tells two."""
+
+    def tell(doing: str, done: int, frames: int) -> None:
+        one(doing, done, frames)
+        other(doing, done, frames)
+
+    return tell
+
+
 @contextmanager
 def run_progress(total: int | None, *, silent: bool, adjusts: bool = True) -> Iterator[RunProgress]:
     """Yield what shows the progress of a run of `total` frames; adjusts : as of `RunState`."""

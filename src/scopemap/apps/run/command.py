@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,7 +16,7 @@ import typer
 from scopemap.terminal import options
 from scopemap.terminal.figures import print_json, print_warnings
 from scopemap.terminal.interruption import Interruption
-from scopemap.terminal.progress import run_progress
+from scopemap.terminal.progress import both, run_progress
 
 if TYPE_CHECKING:
     from scopemap.engine.config import Config
@@ -119,6 +122,10 @@ def run(
             help="Resume a killed run; default: if input, settings and versions are the same.",
         ),
     ] = None,
+    in_app: Annotated[
+        bool, typer.Option("--app", help="Show the run in a browser while it goes on, and its result (extra app).")
+    ] = False,
+    watched: Annotated[bool, typer.Option("--watched", hidden=True)] = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -165,9 +172,12 @@ def run(
             size=options.parse_size(size) if size else None,
             settings=resolved.input,
         )
+    from scopemap.apps.browser.beside import window_beside
+    from scopemap.result.run_view import view_folder
     from scopemap.runner.checkpoints import check_resumable, discard_unfinished
     from scopemap.runner.estimators import missing_weights
     from scopemap.runner.network_cost import network_cost
+    from scopemap.runner.watched import RunWatch
     from scopemap.runner.with_report import reconstruct_with_report
 
     if resume:
@@ -177,12 +187,20 @@ def run(
     if not (quiet or as_json or missing_weights(resolved)) and (cost := network_cost(resolved, sequence)):
         typer.echo(cost, err=True)
     shows = run_progress(sequence.used_count, silent=quiet or as_json, adjusts=resolved.mapping.at_end)
-    with shows as shown, Interruption() as interruption:
-        seen = (*shown.observers, interruption.observe)
-        result = reconstruct_with_report(
-            sequence, resolved, out, overwrite=overwrite, observers=seen, progress=shown.progress
-        )
-    _report(result, resolved, out, as_json=as_json, quiet=quiet)
+    with ExitStack() as beside:
+        if in_app:
+            stop = {"stop": partial(os.kill, os.getpid(), signal.SIGINT)}
+            beside.enter_context(window_beside(out, view_folder(out), stop, say=partial(typer.echo, err=True)))
+        with ExitStack() as stack:
+            shown, interruption = stack.enter_context(shows), stack.enter_context(Interruption())
+            observers, progress = (*shown.observers, interruption.observe), shown.progress
+            if watched or in_app:
+                watch = stack.enter_context(RunWatch(out, sequence.used_count, adjusts=resolved.mapping.at_end))
+                observers, progress = (watch, *observers), both(progress, watch.progress)
+            result = reconstruct_with_report(
+                sequence, resolved, out, overwrite=overwrite, observers=observers, progress=progress
+            )
+        _report(result, resolved, out, as_json=as_json, quiet=quiet)
     # After the last frame there is nothing to cut short: the result is whole.
     if interruption.exit_code and result.provenance["interrupted_at_frame"] is not None:
         raise typer.Exit(interruption.exit_code)

@@ -1,0 +1,104 @@
+"""A window beside a command that runs in a terminal: in a process of its own, so that it cannot slow the run down.
+
+The window's process writes lines to the command: first where it is, then the names of buttons that were pressed. The
+command writes one line at its end: "done", or "failed: " and why. What is shown is read from the folder of the view.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from scopemap.apps.browser.serving import NOT_INSTALLED
+from scopemap.engine.errors import InputError
+
+_DONE, _FAILED = "done", "failed: "
+
+
+@contextmanager
+def window_beside(
+    out: Path | None,
+    view: Path,
+    actions: Mapping[str, Callable[[], None]],
+    arguments: tuple[str, ...] = (),
+    say: Callable[[str], None] = print,
+) -> Iterator[None]:
+    """Context in which a window shows what a run writes to `view`, and its result in `out` afterwards until Ctrl-C.
+
+    actions : called by the names of the window's buttons. arguments : further ones of `scopemap app`. say : is told
+    where the window is. Raises `InputError` where viser is not installed.
+    """
+    import importlib.util
+
+    if importlib.util.find_spec("viser") is None:
+        raise InputError(NOT_INSTALLED)
+    command = [sys.executable, "-m", "scopemap", "app", "--watch", str(view), *arguments]
+    command += [] if out is None else ["--result", str(out)]
+    # Ctrl-C is the command's.
+    window = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert window.stdin is not None and window.stdout is not None
+    lines = window.stdout
+
+    def listen() -> None:
+        for line in lines:
+            name = line.strip()
+            if name in actions:
+                actions[name]()
+            elif name.startswith("http"):
+                say(f"look at {name} in a browser of this machine")
+
+    threading.Thread(target=listen, name="window", daemon=True).start()
+
+    def tell(line: str) -> None:
+        with suppress(OSError):  # the window was closed
+            window.stdin.write(f"{line}\n")  # type: ignore[union-attr]
+            window.stdin.flush()  # type: ignore[union-attr]
+
+    try:
+        yield
+        tell(_DONE)
+        say("the window stays until Ctrl-C")
+        with suppress(KeyboardInterrupt):
+            window.wait()
+    except BaseException as error:
+        tell(f"{_FAILED}{error}")
+        raise
+    finally:
+        window.terminate()
+        window.wait()
+
+
+class RunBeside:
+    """The run of the command that this process is the window of; `WatchedRun` for its page."""
+
+    printed = ""
+
+    def __init__(self) -> None:
+        self.status, self.sentence = "running", "the command has ended"
+        threading.Thread(target=self._listen, name="command", daemon=True).start()
+
+    def poll(self) -> None:
+        """Nothing is to be looked at: the command tells."""
+
+    def press(self, button: str) -> None:
+        """Tell the command that a button was pressed."""
+        with suppress(OSError):
+            print(button, flush=True)
+
+    def stop(self) -> None:
+        """Ask the command to end and write what it has."""
+        self.press("stop")
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            if line.strip() == _DONE:
+                self.status = "done"
+                return
+            if line.startswith(_FAILED):
+                self.sentence, self.status = line.removeprefix(_FAILED).strip(), "failed"
+                return
+        self.status = "failed"

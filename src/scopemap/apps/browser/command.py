@@ -1,0 +1,98 @@
+"""`scopemap app`: choose a video in the browser, watch its surface grow, ask it questions."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from scopemap.terminal.options import Quiet
+
+if TYPE_CHECKING:
+    from scopemap.apps.browser.window import Window
+
+_OPEN_TO_ALL = "warning: whoever reaches {host} sees the pictures and can start runs; a tunnel is safer (docs/app.md)"
+
+
+def app(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[FOLDER]", help="Folder of videos; results are written to FOLDER/scopemap.")
+    ] = Path(),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0: any free port.")] = 0,
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Address to serve at; others than this machine's reach it then.")
+    ] = "127.0.0.1",
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
+    anonymous: Annotated[bool, typer.Option("--anonymous", help="Show no names of files.")] = False,
+    keep_uploads: Annotated[
+        bool, typer.Option("--keep-uploads", help="Keep videos that are sent to the page in FOLDER/scopemap/uploads.")
+    ] = False,
+    upload_limit: Annotated[
+        float, typer.Option(min=0.001, metavar="GB", help="Largest video that the page takes, GB.")
+    ] = 4.0,
+    quiet: Quiet = False,
+    watch: Annotated[Path | None, typer.Option("--watch", hidden=True)] = None,
+    result: Annotated[Path | None, typer.Option("--result", hidden=True)] = None,
+) -> None:
+    """Reconstruct, look and measure in a browser window.
+
+    Everything stays on this machine. Ctrl-C ends the window and the run that it shows; the run resumes next time.
+    """
+    from scopemap.apps.browser.serving import LOOPBACK
+    from scopemap.apps.browser.start_page import StartPage
+    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.workspace import Workspace
+    from scopemap.engine.errors import InputError
+
+    if watch is not None:
+        _beside_a_command(Window(port, host, anonymous=anonymous), watch, result, browser=browser)
+        return
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder: name the folder of the videos")
+    if host not in (LOOPBACK, "localhost", "::1"):
+        typer.echo(_OPEN_TO_ALL.format(host=host), err=True)
+    with Workspace(folder, keep_uploads=keep_uploads, most_bytes=round(upload_limit * 1e9)) as workspace:
+        window = Window(port, host, anonymous=anonymous)
+        window.always(workspace.runs.tick)
+        window.show(StartPage(workspace))
+        serve(window, browser=browser, quiet=quiet)
+
+
+def _beside_a_command(window: Window, view: Path, result: Path | None, *, browser: bool) -> None:
+    """Show the run of another command, and then its result; lines of text go to and fro."""
+    from scopemap.apps.browser.beside import RunBeside
+    from scopemap.apps.browser.result_page import ResultPage
+    from scopemap.apps.browser.run_page import RunPage
+
+    run = RunBeside()
+
+    def finished() -> None:
+        if result is not None:
+            window.show(ResultPage(result))
+
+    name = "" if result is None else result.name
+    window.show(RunPage(run, view, name, finished))
+    typer.echo(window.url)
+    serve(window, browser=browser, quiet=True)
+
+
+def serve(window: Window, *, browser: bool, quiet: bool, ends: Callable[[], bool] = lambda: False) -> None:
+    """Run a window until Ctrl-C, or until it `ends`."""
+    if not quiet:
+        typer.echo(f"{window.url} until Ctrl-C")
+    if browser:
+        webbrowser.open(window.url)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, lambda number, frame: window.stop())
+    try:
+        window.run(ends)
+    except KeyboardInterrupt:
+        if not quiet:
+            typer.echo("ended", err=True)
+    finally:
+        window.close()

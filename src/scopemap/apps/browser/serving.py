@@ -1,0 +1,112 @@
+"""viser's server, for pages of this machine alone: other hosts and origins are refused, and nothing leaves it."""
+
+from __future__ import annotations
+
+import contextlib
+import http
+import io
+import re
+import socket
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+from scopemap.engine.errors import InputError
+
+LOOPBACK = "127.0.0.1"
+_OWN_NAMES = {LOOPBACK, "localhost", "[::1]", "::1"}
+_TITLE = "scopemap"
+# What the page may load: itself, what it makes in memory, and its own connection.
+_POLICY = (
+    "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval'; "
+    "connect-src 'self' ws: data: blob:; form-action 'none'; frame-ancestors 'none'; object-src 'none'"
+)
+_HEADERS = {
+    "Content-Security-Policy": _POLICY,
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
+NOT_INSTALLED = "the window in the browser needs viser: pip install 'scopemap[app]'"
+
+
+def start_server(port: int = 0, host: str = LOOPBACK) -> Any:
+    """Return viser's server at a port of this machine; 0: any free one.
+
+    Requests that name another host than this machine (unless `host` lets others in), and those of pages of another
+    origin, are refused: a page in the web must not see an operation or press its buttons. viser's tunnel is closed.
+
+    Raises `InputError` where viser is not installed or the port is taken.
+    """
+    try:
+        import viser
+        from viser import _messages
+    except ImportError:
+        raise InputError(NOT_INSTALLED) from None
+    _refuse_taken(host, port)
+    # It prints a banner.
+    with _guarded(only_own=host in _OWN_NAMES), contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host, port, verbose=False)
+    server._websock_server.unregister_handler(_messages.ShareUrlRequest)
+    return server
+
+
+def stop_server(server: Any) -> None:
+    """Stop it; what it prints is left out."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def _refuse_taken(host: str, port: int) -> None:
+    """Raise `InputError` where nothing can be served there: viser would take the next port."""
+    try:
+        with socket.socket() as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tried.bind((host, port))
+    except (OSError, OverflowError) as error:
+        raise InputError(f"cannot serve on {host}, port {port}: {error}; choose another one") from None
+
+
+@contextlib.contextmanager
+def _guarded(*, only_own: bool) -> Iterator[None]:
+    """Context in which servers of websockets refuse foreign requests: viser itself has no such setting."""
+    import websockets.asyncio.server as websockets
+
+    serve = websockets.serve
+
+    def guarded(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        return serve(*arguments, process_request=_checked(process_request, only_own=only_own), **options)
+
+    websockets.serve = guarded  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        websockets.serve = serve  # type: ignore[misc]
+
+
+def _checked(answer: Callable[..., Any], *, only_own: bool) -> Callable[..., Any]:
+    """Return what answers a request as `answer` does, where it may be answered."""
+
+    def checked(connection: Any, request: Any) -> Any:
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        is_own = (not only_own or (urlsplit(f"//{host}").hostname or "") in _OWN_NAMES) and (
+            origin is None or urlsplit(origin).netloc == host
+        )
+        if not is_own:
+            return connection.respond(http.HTTPStatus.FORBIDDEN, "only for pages of this machine\n")
+        # Compressed it could not be given a title.
+        if "Accept-Encoding" in request.headers:
+            del request.headers["Accept-Encoding"]
+        response = answer(connection, request)
+        if response is not None:
+            for name, value in _HEADERS.items():
+                response.headers[name] = value
+            if response.headers.get("Content-Type", "").startswith("text/html"):
+                response.body = re.sub(rb"<title>.*?</title>", f"<title>{_TITLE}</title>".encode(), response.body)
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
+        return response
+
+    return checked

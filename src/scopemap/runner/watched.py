@@ -1,0 +1,240 @@
+"""Writes what can be seen of a run while it goes on, for whoever looks (`result/run_view.py`), without slowing it down.
+
+What is observed is put down in the run's threads; a thread of its own draws and writes it, twice a second at most.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+import cv2
+import numpy as np
+
+from scopemap.engine.flow.corners import detect_corners
+from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.se3 import transform
+from scopemap.engine.odometry import Step
+from scopemap.report.depth_figures import colour_depth
+from scopemap.report.frame_pictures import shrunk
+from scopemap.report.run_state import RunState
+from scopemap.result.run_view import RunProgressState, SeenMap, view_folder, write_map, write_pictures, write_state
+
+_EVERY_S = 0.5
+_POINTS_EVERY_S = 0.25
+_POINTS_OF_A_FRAME = 1500
+_MOST_POINTS = 150_000
+_MOST_POSES = 5_000
+_PICTURE_PX = 480
+_CORNER_CELL_PX = 12  # that of the tracker's corners
+_DEPTH_PERCENTILES = (2, 98)
+_MASKED_SHARE = 0.4
+"""Brightness that is left of a pixel which is not used."""
+
+
+class RunWatch:
+    """Observes a run that writes to `out`, and shows it; a context that ends with the run.
+
+    out : the folder of the result; or, with `folder`, nothing: what is seen is written there. total : frames of the
+    input, None: not known. adjusts : as of `RunState`. facts : what else is shown, by name, asked when it is written.
+    """
+
+    def __init__(
+        self,
+        out: Path | None,
+        total: int | None = None,
+        *,
+        adjusts: bool = True,
+        folder: Path | None = None,
+        facts: Callable[[], dict[str, str]] = dict,
+    ) -> None:
+        if out is None and folder is None:
+            raise ValueError("a folder is needed to show a run in")
+        self._out, self._folder, self._facts = out, folder, facts
+        self._total, self._progress = total, RunState(total, adjusts=adjusts)
+        self._words, self._done, self._frames = "preparing", 0, 0
+        self._step: Step | None = None
+        self._tracked, self._final = _Cloud(), _Cloud()
+        self._map_of: dict[int, int] = {}
+        self._keyframes = set[int]()
+        self._final_map: int | None = None
+        self._pointed_s, self._written = 0.0, 0
+        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._write_until_ended, name="watch", daemon=True)
+
+    def __enter__(self) -> RunWatch:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def __call__(self, step: Step) -> None:
+        """Take a step: an observer for `reconstruct`."""
+        now, frame, track = time.monotonic(), step.frame, step.track
+        with self._lock:
+            self._progress.add(step)
+            self._words, self._done, self._frames = "tracking", self._progress.done, self._total or 0
+            if self._step is not None and self._step.track.map != track.map:
+                self._tracked = _Cloud()  # another world
+            self._step = step
+            if frame.T_world_camera is None:
+                return
+            self._map_of[frame.index] = track.map
+            self._keyframes.add(track.keyframe)
+            is_due = now - self._pointed_s > _POINTS_EVERY_S
+            self._pointed_s = now if is_due else self._pointed_s
+            self._tracked.put(frame, with_points=is_due, keyframe=track.keyframe)
+
+    def final(self, frame: Frame) -> None:
+        """Take a frame whose depth and pose are final."""
+        if frame.T_world_camera is None:
+            return
+        with self._lock:
+            number = self._map_of.get(frame.index, 0)
+            if number != self._final_map:  # of a submap with a world of its own
+                self._final, self._final_map = _Cloud(), number
+                self._final.keyframes = self._keyframes
+            self._final.put(frame, with_points=frame.index in self._tracked.points or self._final.is_sparse)
+
+    def progress(self, doing: str, done: int, frames: int) -> None:
+        """Take what is done outside of tracking, as `Progress` is called."""
+        with self._lock:
+            self._progress.words(doing, done, frames)
+            self._words, self._done, self._frames = doing, done, frames
+
+    def state(self) -> RunProgressState:
+        """Return how far the run is now."""
+        with self._lock:
+            step = self._step
+            return RunProgressState(
+                doing=self._words,
+                done=self._done,
+                total=self._frames,
+                time_left=self._progress.time_left.rstrip(", ") if self._words == "tracking" else "",
+                status="" if step is None else step.track.status,
+                reason="" if step is None or step.track.status != "lost" else step.track.reason,
+                lost=self._progress.lost,
+                frame=-1 if step is None else step.frame.index,
+                time_s=0.0 if step is None else step.frame.time_s,
+                submap=0 if step is None else step.track.map,
+                adjusted=bool(self._final.poses) and self._words != "tracking",
+                written=self._written,
+                facts=self._facts(),
+            )
+
+    def _write_until_ended(self) -> None:
+        while not self._ended.wait(_EVERY_S):
+            self._write()
+        self._write()
+
+    def _write(self) -> None:
+        """Write what is seen now. Where that fails the run goes on: looking at it is not what it is for."""
+        folder = self._folder
+        if self._out is not None:
+            folder = view_folder(self._out)
+            if not folder.parent.is_dir():  # not yet, or the result is in its place
+                return
+        assert folder is not None
+        with self._lock:
+            step = self._step
+            seen = (self._tracked if self._words == "tracking" or not self._final.poses else self._final).copy()
+        try:
+            folder.mkdir(exist_ok=True)
+            if step is not None:
+                write_pictures(folder, *_pictures(step.frame))
+                if seen.poses:
+                    write_map(folder, seen.map(step.frame))
+            self._written += 1
+            write_state(folder, self.state())
+        except OSError:
+            return
+
+
+class _Cloud:
+    """Poses of a submap's frames, and points of some of them: of fewer, the more there are."""
+
+    def __init__(self) -> None:
+        self.poses: dict[int, np.ndarray] = {}
+        self.points: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.keyframes: set[int] = set()
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether there is room for the points of more frames without leaving any out."""
+        return len(self.points) < _MOST_POINTS // (2 * _POINTS_OF_A_FRAME)
+
+    def copy(self) -> _Cloud:
+        """Return the same, to be read while this one grows."""
+        other = _Cloud()
+        other.poses, other.points, other.keyframes = dict(self.poses), dict(self.points), set(self.keyframes)
+        return other
+
+    def put(self, frame: Frame, *, with_points: bool, keyframe: int | None = None) -> None:
+        """Add a frame that has a pose."""
+        assert frame.T_world_camera is not None
+        self.poses[frame.index] = frame.T_world_camera.astype(np.float32)
+        if keyframe is not None:
+            self.keyframes.add(keyframe)
+        if len(self.poses) > _MOST_POSES:
+            kept = list(self.poses)[::2]
+            self.poses = {index: self.poses[index] for index in kept}
+        if with_points and frame.depth_mm is not None:
+            self.points[frame.index] = _points(frame)
+        if len(self.points) * _POINTS_OF_A_FRAME > _MOST_POINTS:
+            self.points = dict(list(self.points.items())[::2])
+
+    def map(self, frame: Frame) -> SeenMap:
+        """Return what is shown of it; frame : any of its camera."""
+        clouds, colours = zip(*self.points.values(), strict=True) if self.points else ((), ())
+        index, camera = np.fromiter(self.poses, int, len(self.poses)), frame.camera
+        return SeenMap(
+            index=index,
+            T_world_camera=np.stack(list(self.poses.values())),
+            keyframe=np.isin(index, list(self.keyframes)),
+            points=np.concatenate([np.zeros((0, 3), np.float32), *clouds]),
+            colours=np.concatenate([np.zeros((0, 3), np.uint8), *colours]),
+            fov_rad=float(2 * np.arctan(camera.height / (2 * camera.fy))),
+            aspect=camera.width / camera.height,
+        )
+
+
+def _points(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 3) float32, world mm, and colours (n, 3) uint8 of usable pixels on a coarse grid."""
+    assert frame.depth_mm is not None and frame.T_world_camera is not None
+    step_px = max(1, int(np.ceil(np.sqrt(frame.valid.size / _POINTS_OF_A_FRAME))))
+    row, column = (
+        side.ravel() for side in np.mgrid[: frame.valid.shape[0] : step_px, : frame.valid.shape[1] : step_px]
+    )
+    depth_mm = frame.depth_mm[row, column]
+    known = frame.valid[row, column] & np.isfinite(depth_mm)
+    row, column, depth_mm = row[known], column[known], depth_mm[known]
+    rays = frame.camera.unproject(np.column_stack([column, row]).astype(float))
+    points = transform(frame.T_world_camera, rays * depth_mm[:, None])
+    return points.astype(np.float32), frame.rgb[row, column]
+
+
+def _pictures(frame: Frame) -> tuple[bytes, bytes]:
+    """Return a frame's picture, dark where it is not used, with its corners; and its depth in colours, near blue."""
+    shown = np.where(frame.valid[..., None], frame.rgb, (frame.rgb * _MASKED_SHARE).astype(np.uint8))
+    depth_mm = np.full(frame.valid.shape, np.nan, np.float32) if frame.depth_mm is None else frame.depth_mm
+    known = frame.valid & np.isfinite(depth_mm)
+    if known.any():
+        for x, y in detect_corners(frame, _CORNER_CELL_PX).tolist():
+            cv2.circle(shown, (x, y), 1, (60, 255, 90), -1)
+        near, far = np.percentile(depth_mm[known], _DEPTH_PERCENTILES)
+        coloured = colour_depth(np.where(known, depth_mm, np.nan), float(near), float(max(far, near * 1.001)))
+    else:
+        coloured = np.zeros_like(frame.rgb)
+    return _jpeg(shown), _jpeg(coloured)
+
+
+def _jpeg(rgb: np.ndarray) -> bytes:
+    small = shrunk(rgb, _PICTURE_PX)
+    return cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
