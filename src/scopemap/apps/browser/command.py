@@ -36,8 +36,12 @@ def app(
         float, typer.Option(min=0.001, metavar="GB", help="Largest video that the page takes, GB.")
     ] = 4.0,
     quiet: Quiet = False,
-    watch: Annotated[Path | None, typer.Option("--watch", hidden=True)] = None,
-    result: Annotated[Path | None, typer.Option("--result", hidden=True)] = None,
+    watch: Annotated[
+        Path | None, typer.Option("--watch", hidden=True, help="Show the run that writes to this folder.")
+    ] = None,
+    result: Annotated[
+        Path | None, typer.Option("--result", hidden=True, help="Folder of the result of --watch.")
+    ] = None,
 ) -> None:
     """Reconstruct, look and measure in a browser window.
 
