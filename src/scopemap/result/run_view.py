@@ -81,7 +81,7 @@ def write_pictures(folder: Path, picture: bytes, depth: bytes) -> None:
 def write_map(folder: Path, seen: SeenMap) -> None:
     """Write the current submap; raises `OSError`."""
     held = io.BytesIO()
-    np.savez(held, **{name: np.asarray(value) for name, value in vars(seen).items()})
+    np.savez(held, allow_pickle=False, **{name: np.asarray(value) for name, value in vars(seen).items()})
     _replace(folder / _MAP, held.getvalue())
 
 

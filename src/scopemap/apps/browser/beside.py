@@ -40,8 +40,9 @@ def window_beside(
     command += [] if out is None else ["--result", str(out)]
     # Ctrl-C is the command's.
     window = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
-    assert window.stdin is not None and window.stdout is not None
-    lines = window.stdout
+    to_window, lines = window.stdin, window.stdout
+    assert to_window is not None
+    assert lines is not None
 
     def listen() -> None:
         for line in lines:
@@ -55,8 +56,8 @@ def window_beside(
 
     def tell(line: str) -> None:
         with suppress(OSError):  # the window was closed
-            window.stdin.write(f"{line}\n")  # type: ignore[union-attr]
-            window.stdin.flush()  # type: ignore[union-attr]
+            to_window.write(f"{line}\n")
+            to_window.flush()
 
     try:
         yield
@@ -87,7 +88,8 @@ class RunBeside:
     def press(self, button: str) -> None:
         """Tell the command that a button was pressed."""
         with suppress(OSError):
-            print(button, flush=True)
+            sys.stdout.write(f"{button}\n")
+            sys.stdout.flush()
 
     def stop(self) -> None:
         """Ask the command to end and write what it has."""

@@ -26,7 +26,9 @@ _LOST = (200, 40, 40)
 class WatchedRun(Protocol):
     """What the page needs to know of the process that it shows."""
 
-    status: str
+    @property
+    def status(self) -> str:
+        """Where it is, as `BrowserRun` has it."""
 
     @property
     def printed(self) -> str:
