@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from scopemap.engine.notices import scale_words
 from scopemap.result.input_part import part_of_input
 from scopemap.result.result import Result
 from scopemap.result.verdict import frames_per_s, verdict
@@ -30,28 +29,29 @@ def summary_lines(result: Result) -> list[str]:
 
 def summary_facts(result: Result) -> dict[str, str]:
     """Return the facts of a summary in words, by what they are about: frames, scale, camera, surface, time."""
-    facts = result.provenance
-    unit = " mm" if facts["scale"]["known"] else " (scale unknown)"
+    facts = result.frames.counts | result.provenance
+    unit = " mm" if result.scale_known else " (scale unknown)"
     part = part_of_input(facts)
     return {
         "frames": f"{_frames(facts)}{f' ({part})' if part else ''}; path {result.trajectory.path_length_mm:.1f}{unit}",
-        "scale": scale_words(facts["scale"]).removeprefix("scale").lstrip(": "),
+        "scale": result.scale.removeprefix("scale").lstrip(": "),
         "camera": facts["camera"]["source"].partition("; ")[0],
-        "surface": f"{len(result.mesh.faces):,} triangles{_surface(facts['surface'])}",
-        "time": time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
+        "surface": f"{len(result.mesh.faces):,} triangles{_surface(facts.get('surface') or {})}",
+        "time": time_words(result) + compiling_words(facts.get("seconds", {}).get("compile kernels", 0.0)),
     }
 
 
 def _frames(facts: dict[str, Any]) -> str:
     """Return how many frames were tracked, and what became of the others."""
     others = [(facts["lost"], "lost"), (facts["in_other_maps"], "in other submaps")]
-    others += [(count, _SKIPPED[kind]) for kind, count in facts["skipped"].items()]
+    others += [(count, _SKIPPED[kind]) for kind, count in facts.get("skipped", {}).items()]
     return ", ".join([f"{facts['tracked']} of {facts['frames']} tracked"] + [f"{n} {how}" for n, how in others if n])
 
 
 def time_words(result: Result) -> str:
     """Return how long the run took and its frames per second; of a resumed one since then."""
-    seconds, after = result.provenance["seconds"]["total"], result.provenance["resumed_after_frame"]
+    facts = result.provenance
+    seconds, after = facts.get("seconds", {}).get("total", 0.0), facts.get("resumed_after_frame")
     since = "" if after is None else f" since it was resumed after frame {after}"
     return f"{seconds:.1f} s{since}, {frames_per_s(result) or 0.0:.1f} frames/s"
 

@@ -47,7 +47,7 @@ class FramePart:
         self._image = gui.add_image(np.zeros((8, 640, 3), np.uint8))
         self._shown = gui.add_markdown("")
         window.on(gui.add_button("Look from here"), view.look_from_frame)
-        self._with_camera = window.on(gui.add_checkbox("Go with the camera", initial_value=False), self._go_with)
+        self._with_camera = window.on(gui.add_checkbox("Fly along", initial_value=False), self._go_with)
         self._with_camera.hint = "Look from each frame that is chosen or played"
         self._reread = window.on(gui.add_button("Read its own picture from the video", visible=False), self._read_again)
         self._has_input = bool(places_of_input(view.whole.folder))

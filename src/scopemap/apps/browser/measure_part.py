@@ -27,6 +27,7 @@ _HINTS: dict[Mode, str] = {
     "Area": "Click on three or more points around the area, then press Measure the area.",
     "Lesion": "Click around the lesion as this frame shows it, then press Measure the lesion.",
 }
+_UNKNOWN = "Sizes are unknown. Choose **Distance** and click on a length that you know: it becomes the reference."
 _PICKED = "/page/picked"
 _KEPT = "/page/measured"
 
@@ -150,12 +151,6 @@ def _label(one: HandMeasure) -> str:
 
 
 def _hint(mode: Mode, *, known: bool) -> str:
-    if mode == "Look":
-        return (
-            "Choose what to measure."
-            if known
-            else (
-                "Sizes are unknown. Choose **Distance** and click on a length that you know; the others are relative to it."
-            )
-        )
-    return f"**{mode}.** {_HINTS[mode]}"
+    if mode != "Look":
+        return f"**{mode}.** {_HINTS[mode]}"
+    return "Choose what to measure." if known else _UNKNOWN

@@ -32,6 +32,7 @@ class ResultPage:
 
     def __init__(self, folder: Path, workspace: Workspace | None = None) -> None:
         self._run, self._workspace = Result(folder).checked(), workspace
+        self._frames: FramePart | None = None
 
     def open(self, window: Window) -> None:
         """Make the elements."""
@@ -49,9 +50,9 @@ class ResultPage:
             gui.add_divider()
             UnseenPart(view)
         with tabs.add_tab("Frames"):
-            self._frames = FramePart(view)
+            self._frames = frames = FramePart(view)
         with list_place:
-            self._frames.add_list()
+            frames.add_list()
         with tabs.add_tab("Measure"):
             self._measure = MeasurePart(view)
         with tabs.add_tab("Files"):
@@ -66,7 +67,8 @@ class ResultPage:
     def close(self) -> None:
         """End what plays, and what takes clicks."""
         self._window.scene.remove_click_callback(self._clicked)
-        self._frames.close()
+        if self._frames is not None:
+            self._frames.close()
 
     def _clicked(self, event: SceneClickEvent) -> None:
         """Take a click in the scene; called by a thread of the server."""
@@ -74,13 +76,14 @@ class ResultPage:
 
     def click(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Take a click by its ray, (3,) each, in the world of the submap that is shown, mm."""
-        pick = self._view.surface.pick(origin, direction, self._view.state)
+        pick, frames = self._view.surface.pick(origin, direction, self._view.state), self._frames
+        assert frames is not None
         if pick is None:
             self._view.note("There is no surface there.")
         elif self._measure.mode == "Look":
-            self._frames.list_that_saw(pick)
+            frames.list_that_saw(pick)
         else:
-            self._frames.hide_list()
+            frames.hide_list()
             self._measure.add(pick)
 
     def _add_ways_on(self) -> None:

@@ -46,9 +46,8 @@ class SurfacePart:
         self._path = window.on(gui.add_checkbox("Camera path", initial_value=True), lambda value: self._draw_path())
         self._frusta = window.on(gui.add_checkbox("Keyframes", initial_value=False), lambda value: self._draw_path())
         if view.surface.moves:
-            self._state = window.on(
-                gui.add_checkbox("Tissue in the state of the frame", initial_value=True), self._choose_state
-            )
+            self._state = window.on(gui.add_checkbox("Moving tissue", initial_value=True), self._choose_state)
+            self._state.hint = "In the state of the frame; play the frames to see it move"
         window.on(gui.add_button("Look at the whole surface"), view.look_at_all)
         view.follow(frame=self._follow_frame, submap=self._follow_submap)
         self._follow_submap()

@@ -48,7 +48,8 @@ class UnseenPart:
         self._words.content = escaped(f"{found.sentence} {found.scale.capitalize()}. {count}")
         with self._place:
             for number, spot in enumerate(shown, 1):
-                label = f"{number}. {spot.area:.3g} {area} at {spot.time_s:.1f} s"
+                size = np.format_float_positional(float(f"{spot.area:.3g}"), trim="-")
+                label = f"{number}. {size} {area} at {spot.time_s:.1f} s"
                 button = self._view.window.gui.add_button(label, hint=spot.where(along))
                 self._view.window.on(button, self._fly, number, spot)
 
