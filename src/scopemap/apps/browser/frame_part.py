@@ -19,7 +19,7 @@ from scopemap.result.run_input import places_of_input
 from scopemap.runner.reread_frames import reread_frames
 
 _FRUSTUM = "/page/frame"
-_FRUSTUM_SHARE = 0.06
+_FRUSTUM_SHARE = 0.045
 _COLOUR = (30, 160, 70)
 _STEP_S = 0.2
 _MOST_STEPS = 150

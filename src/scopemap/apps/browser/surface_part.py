@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,11 +11,14 @@ from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
 from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, legend_picture
 from scopemap.apps.browser.unlit_mesh import unlit_glb
 from scopemap.engine.geometry.rendering import vertex_colours
-from scopemap.report.coverage_picture import COLOURS, OUTSIDE
+from scopemap.report.coverage_picture import COLOURS
 from scopemap.report.sheet import Sheet
 from scopemap.report.shown_mesh import simplified
 from scopemap.report.video_parts import video_parts
 from scopemap.result.verdict import WORDS, level_of_submap
+
+if TYPE_CHECKING:
+    from scopemap.apps.coverage.coverage import Coverage
 
 _SURFACE = "/page/surface"
 _PATH = "/page/path"
@@ -87,10 +90,12 @@ class SurfacePart:
         if found.ramp is not None:
             self._legend.image = legend_picture(found.ramp)
 
-    def _paint_coverage(self, found: Any) -> None:
-        painted = simplified(found.painted, _MOST_FACES)
+    def _paint_coverage(self, found: Coverage) -> None:
+        # What was not examined would close the view into it.
+        part = found.painted.submesh([np.flatnonzero(np.isfinite(found.unseen))], append=True, repair=False)
+        painted = simplified(part, _MOST_FACES)
         seen, _, hidden = COLOURS
-        colours = {seen: COLOURS[seen], hidden: COLOURS[hidden], "not examined": OUTSIDE}
+        colours = {name: COLOURS[name] for name in (seen, hidden)}
         sheet = Sheet(*_LEGEND_PX)
         sheet.legend((6, 6), colours, _LEGEND_PX[0] / len(colours), 12)
         self._legend.image, self._legend.visible = sheet.rgb, True
