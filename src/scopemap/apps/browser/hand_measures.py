@@ -16,7 +16,7 @@ from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
 from scopemap.apps.measure.measure import Measure, measure
 from scopemap.engine.errors import InputError
 from scopemap.report.page import keep_measurements
-from scopemap.report.page_data import read_measurements
+from scopemap.report.page_data import checked_measurements, read_measurements
 from scopemap.result.json_numbers import without_nan
 from scopemap.result.result import Result
 
@@ -126,7 +126,7 @@ def folder_in_whole(run: Result) -> str:
 def add_measurements(folder: Path, measured: Sequence[HandMeasure]) -> int:
     """Put measurements to those kept in a result's folder, each once; return how many are kept then."""
     kept = read_measurements(folder)
-    new = [one.as_json for one in measured]
+    new = checked_measurements(json.dumps([one.as_json for one in measured]).encode())
     kept += [one for one in new if one not in kept]
     keep_measurements(folder, json.dumps(kept).encode())
     return len(kept)

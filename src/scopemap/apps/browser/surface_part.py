@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
 
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
@@ -93,6 +94,7 @@ class SurfacePart:
     def _paint_coverage(self, found: Coverage) -> None:
         # What was not examined would close the view into it.
         part = found.painted.submesh([np.flatnonzero(np.isfinite(found.unseen))], append=True, repair=False)
+        assert isinstance(part, trimesh.Trimesh)
         painted = simplified(part, _MOST_FACES)
         seen, _, hidden = COLOURS
         colours = {name: COLOURS[name] for name in (seen, hidden)}

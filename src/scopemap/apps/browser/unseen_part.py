@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,12 +29,13 @@ class UnseenPart:
         )
         self._words = gui.add_markdown("It takes some seconds. Colour by coverage shows it on the surface.")
         self._place = gui.add_folder(None)
-        self._spots: list[BlindSpot] = []
+        self._buttons: list[Any] = []
         view.follow(submap=self._clear)
 
     def _clear(self) -> None:
-        for child in tuple(self._place._children.values()):
-            child.remove()
+        for button in self._buttons:
+            button.remove()
+        self._buttons = []
         self._view.window.scene.remove_by_name(_MARK)
         self._ask.disabled, self._words.content = self._view.surface.is_empty, ""
 
@@ -51,7 +52,7 @@ class UnseenPart:
                 size = np.format_float_positional(float(f"{spot.area:.3g}"), trim="-")
                 label = f"{number}. {size} {area} at {spot.time_s:.1f} s"
                 button = self._view.window.gui.add_button(label, hint=spot.where(along))
-                self._view.window.on(button, self._fly, number, spot)
+                self._buttons.append(self._view.window.on(button, self._fly, number, spot))
 
     def _fly(self, number: int, spot: BlindSpot) -> None:
         view, place = self._view, np.array(spot.position_mm)
