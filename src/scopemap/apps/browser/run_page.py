@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, look_at, quaternion
-from scopemap.apps.browser.window import escaped
+from scopemap.apps.browser.window import escaped, fenced
 from scopemap.result.run_view import RunProgressState, SeenMap, read_map, read_pictures, read_state
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ _MOST_FRUSTA = 60
 _FRUSTUM_SHARE = 0.05
 _POINT_SHARE = 0.006
 _LOST = (200, 40, 40)
+_MOST_LOG = 4000
 
 
 class WatchedRun(Protocol):
@@ -67,19 +68,19 @@ class RunPage:
         """Make the elements."""
         gui = window.gui
         self._window = window
-        gui.add_markdown(f"### {escaped(self._title)}")
+        gui.add_markdown(f"### {escaped(window.names.hidden(self._title))}")
         self._words = gui.add_markdown("starting")
         self._bar = gui.add_progress_bar(0, animated=True)
         self._stop = window.on(gui.add_button("Stop and keep what there is", icon=_icon("PLAYER_STOP")), self._stop_run)
         self._picture = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Frame: unused parts dark, corners green")
         self._depth = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Depth: blue near, red far")
         self._facts = gui.add_markdown("", visible=False)
+        self._size = gui.add_markdown("", visible=False)
         self._picture.visible = self._depth.visible = False
         with gui.add_folder("Log", expand_by_default=False):
             self._log = gui.add_markdown("")
-        self._back_button = None
         if self._back is not None:
-            self._back_button = window.on(gui.add_button("Back", visible=False), self._back)
+            window.on(gui.add_button("Back to the start", hint="The run goes on."), self._back)
         self.tick()
 
     def close(self) -> None:
@@ -90,7 +91,7 @@ class RunPage:
         if self._ended:
             return
         self._run.poll()
-        self._log.content = f"```\n{self._run.printed[-4000:]}\n```"
+        self._log.content = fenced(self._window.names.hidden(self._run.printed[-_MOST_LOG:]))
         status = self._run.status
         if status == "waiting":
             self._words.content = f"waiting: {self._waiting()} run(s) come first"
@@ -109,18 +110,17 @@ class RunPage:
             self._finished()
             return
         if status == "failed":
-            self._window.fail(self._run.sentence, self._run.printed[-4000:])
+            self._window.fail(self._run.sentence, self._run.printed[-_MOST_LOG:])
             self._words.content = "**The run has failed.**"
         else:
             self._words.content = "**Stopped.** Nothing was written."
-        if self._back_button is not None:
-            self._back_button.visible = True
 
     def _show_state(self) -> None:
         state = read_state(self._folder)
         if state is None:
             lines = [line for line in self._run.printed.splitlines() if line.strip()]
-            self._words.content = escaped(lines[-1]) if lines and not self._seen else "preparing"
+            last = self._window.names.hidden(lines[-1]) if lines and not self._seen else "preparing"
+            self._words.content = escaped(last)
             return
         self._words.content = words_of(state)
         self._bar.value, self._bar.animated = share_of(state), True
@@ -133,6 +133,8 @@ class RunPage:
             for handle, content in zip((self._picture, self._depth), pictures, strict=True):
                 handle.image, handle.visible = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")), True
         if (seen := read_map(self._folder)) is not None:
+            self._size.content = f"The surface so far: {len(seen.points):,} points from {len(seen.index):,} frames"
+            self._size.visible = True
             self._draw(seen, is_lost=state.status == "lost")
 
     def _draw(self, seen: SeenMap, *, is_lost: bool) -> None:

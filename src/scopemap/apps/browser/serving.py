@@ -15,6 +15,7 @@ from scopemap.engine.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 _OWN_NAMES = {LOOPBACK, "localhost", "[::1]", "::1"}
+_ALL = ("0.0.0.0", "::")
 _TITLE = "scopemap"
 # What the page may load: itself, what it makes in memory, and its own connection.
 _POLICY = (
@@ -49,8 +50,16 @@ def start_server(port: int = 0, host: str = LOOPBACK) -> Any:
     # It prints a banner.
     with _guarded(only_own=host in _OWN_NAMES), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host, port, verbose=False)
-    server._websock_server.unregister_handler(_messages.ShareUrlRequest)
+    # viser keeps all of a file that is sent in memory, however large: `uploads.py` takes files instead.
+    for refused in (_messages.ShareUrlRequest, _messages.FileTransferStartUpload, _messages.FileTransferPart):
+        server._websock_server.unregister_handler(refused)
     return server
+
+
+def url_of(host: str, port: int) -> str:
+    """Return where a browser of this machine finds what is served at a host's port."""
+    name = "localhost" if host in (LOOPBACK, *_ALL) else host
+    return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
 
 
 def stop_server(server: Any) -> None:
@@ -62,7 +71,7 @@ def stop_server(server: Any) -> None:
 def _refuse_taken(host: str, port: int) -> None:
     """Raise `InputError` where nothing can be served there: viser would take the next port."""
     try:
-        with socket.socket() as tried:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as tried:
             tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             tried.bind((host, port))
     except (OSError, OverflowError) as error:
