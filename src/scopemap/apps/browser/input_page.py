@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from scopemap.apps.browser.looking import LeftEarlier, Look, look, measured_rates, time_in_words
 from scopemap.apps.browser.run_choice import LAYOUTS, LEAST_FOV_DEG, MOST_FOV_DEG, PRESETS, RunChoice, boxes_of
 from scopemap.apps.browser.runs import BrowserRun
@@ -15,6 +17,7 @@ from scopemap.apps.browser.window import escaped, fenced
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.engine.errors import ScopemapError, SettingsError
 from scopemap.input.scopes import SCOPES
+from scopemap.report.frame_pictures import shrunk
 
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import Window
@@ -23,6 +26,9 @@ _UNKNOWN = "not known"
 _ESTIMATED, _BY_FOV = "estimated from the video", "by its field of view"
 _PRESETS = {"default: best quality": PRESETS[0], "realtime: about twice as fast": PRESETS[1]}
 _LAYOUTS = {"found by itself": LAYOUTS[0], "one view": LAYOUTS[1], "left and right": LAYOUTS[2], "above": LAYOUTS[3]}
+_NEXT_LINE = " \\\n  "
+_PICTURE_PX = 240
+_PICTURES = 3
 _MOST_MEASURED = 5
 _MOST_FINDINGS = 8
 _USUAL_FOV_DEG = 70.0
@@ -50,7 +56,7 @@ class InputPage:
         gui.add_markdown(f"### {escaped(self._name)}")
         self._bar = gui.add_progress_bar(0, animated=True)
         self._place = gui.add_folder(None)
-        window.on(gui.add_button("Back to the start"), self._back)
+        window.on(gui.add_button("Back to the start", color="gray"), self._back)
         window.job("looking at the video", self._look, self._show)
 
     def tick(self) -> None:
@@ -83,17 +89,17 @@ class InputPage:
         self._rates = {preset: measured_rates(results, preset) for preset in PRESETS}
         with self._place:
             gui = self._window.gui
+            gui.add_image(_strip(found), format="jpeg")
             gui.add_markdown(words_of(found, self._window.names.hidden))
             self._time = gui.add_markdown("")
             self._add_switches(found)
+            self._start = self._window.on(gui.add_button("Reconstruct", color="green"), self._reconstruct)
             self._command = gui.add_markdown("")
-            self._start = gui.add_button("Reconstruct", color="green")
-            self._window.on(self._start, self._reconstruct)
         self._show_choice()
 
     def _add_switches(self, found: Look) -> None:
         """Add what the findings advise, and what is usually asked, in sight; the rest in a folder."""
-        self._add_list("Kind of endoscope", {_UNKNOWN: "", **{scope: scope for scope in SCOPES}}, "scope")
+        self._add_list("Endoscope", {_UNKNOWN: "", **{scope: scope for scope in SCOPES}}, "scope")
         self._add_camera(found)
         self._add_list("Quality", _PRESETS, "preset")
         overlays = found.spread.overlays
@@ -198,10 +204,10 @@ class InputPage:
         self._window.clear_error()
         self._start.disabled = False
         self._time.content = f"**Time:** {escaped(time_in_words(frames, choice.preset, self._rates[choice.preset]))}"
-        command = shlex.join(["scopemap", "run", str(self._source), *choice.arguments()])
         out = self._workspace.new_result(self._source)
-        words = self._window.names.hidden(f"{command} --out {shlex.quote(str(out))}")
-        self._command.content = f"The same in a terminal:\n\n{fenced(words)}"
+        words = [f"scopemap run {shlex.quote(str(self._source))}", f"--out {shlex.quote(str(out))}"]
+        command = _NEXT_LINE.join([*words, *map(shlex.quote, choice.arguments())])
+        self._command.content = f"The same in a terminal:\n\n{fenced(self._window.names.hidden(command))}"
 
     def _reconstruct(self) -> None:
         from scopemap.apps.inspect.inspection_sheet import write_mask
@@ -233,6 +239,13 @@ def words_of(found: Look, hidden: Callable[[str], str] = str) -> str:
     if found.part:
         lines.append(f"To be quick, {escaped(found.part)}.")
     return "\n\n".join(lines)
+
+
+def _strip(found: Look) -> np.ndarray:
+    """Return pictures from its beginning to its end, beside each other, (h, w, 3) uint8."""
+    samples = found.spread.samples
+    places = np.linspace(0, len(samples) - 1, min(_PICTURES, len(samples))).round().astype(int)
+    return np.hstack([shrunk(samples[place].rgb, _PICTURE_PX) for place in places])
 
 
 def _of_list(values: dict[str, Any], label: str) -> Any:

@@ -80,7 +80,7 @@ class RunPage:
         with gui.add_folder("Log", expand_by_default=False):
             self._log = gui.add_markdown("")
         if self._back is not None:
-            window.on(gui.add_button("Back to the start", hint="The run goes on."), self._back)
+            window.on(gui.add_button("Back to the start", hint="The run goes on.", color="gray"), self._back)
         self.tick()
 
     def close(self) -> None:
@@ -94,7 +94,7 @@ class RunPage:
         self._log.content = fenced(self._window.names.hidden(self._run.printed[-_MOST_LOG:]))
         status = self._run.status
         if status == "waiting":
-            self._words.content = f"waiting: {self._waiting()} run(s) come first"
+            self._words.content = f"It waits in the queue: runs before it: {self._waiting()}"
         elif status == "running":
             self._show_state()
         else:

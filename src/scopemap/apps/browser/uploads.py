@@ -57,7 +57,8 @@ class Receiver:
         self._lock = threading.Lock()
         server._websock_server.register_handler(messages.FileTransferStartUpload, self._start)
         server._websock_server.register_handler(messages.FileTransferPart, self._take_part)
-        server.on_client_disconnect(self._disconnected)
+        # Not the server's own: it tells nothing of clients that never sent where they look from.
+        server._websock_server.on_client_disconnect(self._disconnected)
 
     def button(self, gui: Any, label: str, kinds: str) -> Any:
         """Return a new button that sends a file; kinds : of files that the browser offers, as in HTML's `accept`."""
@@ -112,8 +113,8 @@ class Receiver:
         if size <= 0:
             return "the file that was sent is empty"
         if size > self._most_bytes:
-            most = f"at most {_in_words(self._most_bytes)} are taken (scopemap app --upload-limit GB)"
-            return f"the video has {_in_words(size)}: {most}; one that is on this machine need not be sent"
+            most = f"the video has {_in_words(size)}, at most {_in_words(self._most_bytes)} are taken"
+            return f"{most}: put it into the folder of scopemap app, or start that with --upload-limit GB"
         if len(self._transfers) >= _MOST_AT_ONCE:
             return f"{_MOST_AT_ONCE} videos are being sent: wait for one of them"
         coming = sum(one.size - one.received for one in self._transfers.values())
@@ -133,7 +134,8 @@ class Receiver:
                 return
             transfer.received += len(message.content)
             try:
-                if message.part_index != transfer.parts or transfer.received > transfer.size:
+                fits = message.part_index == transfer.parts and transfer.received <= transfer.size
+                if not (fits and isinstance(message.content, bytes)):
                     raise OSError("its parts do not make up the file that was announced")
                 transfer.parts += 1
                 transfer.file.write(message.content)
@@ -153,7 +155,7 @@ class Receiver:
                 transfer.quieted_s = time.monotonic()
                 self._quiet(client, number)
 
-    async def _disconnected(self, client: Any) -> None:
+    def _disconnected(self, client: Any) -> None:
         with self._lock:
             for number in [number for number, one in self._transfers.items() if one.client == client.client_id]:
                 self._refusals.append(_LOST)
@@ -181,4 +183,5 @@ class Receiver:
 
 
 def _in_words(size: int) -> str:
-    return f"{size / 1e9:.1f} GB" if size >= 1e8 else f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size} bytes"
+    unit, name = next(((u, n) for u, n in ((1e9, "GB"), (1e6, "MB")) if size >= u), (1e3, "kB"))
+    return f"{size / unit:.1f} {name}"

@@ -130,7 +130,7 @@ class Workspace:
 
     @staticmethod
     def _stem(source: Path) -> str:
-        stem = re.sub(r"[^\w.-]+", "_", source.stem if source.is_file() else source.name).strip(".") or "video"
+        stem = re.sub(r"[^\w.-]+", "_", source.name if source.is_dir() else source.stem).strip(".") or "video"
         return f"{stem}_" if stem in (_UPLOADS, _MASKS, DEMONSTRATION) else stem
 
     def reconstruct(self, source: Path, arguments: Sequence[str], out: Path | None = None) -> BrowserRun:
