@@ -99,11 +99,7 @@ def _checked(answer: Callable[..., Any], *, only_own: bool) -> Callable[..., Any
     """Return what answers a request as `answer` does, where it may be answered."""
 
     def checked(connection: Any, request: Any) -> Any:
-        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        is_own = (not only_own or (urlsplit(f"//{host}").hostname or "") in _OWN_NAMES) and (
-            origin is None or urlsplit(origin).netloc == host
-        )
-        if not is_own:
+        if not _is_own(request.headers.get_all("Host"), request.headers.get_all("Origin"), only_own=only_own):
             return connection.respond(http.HTTPStatus.FORBIDDEN, "only for pages of this machine\n")
         # Compressed it could not be given a title.
         if "Accept-Encoding" in request.headers:
@@ -119,3 +115,14 @@ def _checked(answer: Callable[..., Any], *, only_own: bool) -> Callable[..., Any
         return response
 
     return checked
+
+
+def _is_own(hosts: list[str], origins: list[str], *, only_own: bool) -> bool:
+    """Return whether a request that names these hosts and origins is one of this machine's own page."""
+    if len(hosts) != 1 or len(origins) > 1:
+        return False
+    try:
+        named = urlsplit(f"//{hosts[0]}").hostname or ""
+        return (not only_own or named in _OWN_NAMES) and all(urlsplit(one).netloc == hosts[0] for one in origins)
+    except ValueError:  # brackets that do not close
+        return False
