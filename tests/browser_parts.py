@@ -53,7 +53,7 @@ def words(window: Window) -> str:
     for element in elements(window):
         texts += [str(getattr(element, name)) for name in ("content", "label", "value") if hasattr(element, name)]
         texts += map(str, getattr(element, "options", ()))
-    return "\n".join(texts).replace("\\", "")
+    return "\n".join(texts).replace("\\", "").replace("**", "")
 
 
 def element(window: Window, label: str) -> Any:

@@ -102,7 +102,18 @@ def test_a_look_ends_where_it_is_no_longer_wanted() -> None:
 
 def test_a_choice_makes_the_arguments_of_a_run() -> None:
     choice = RunChoice(
-        "realtime", "colonoscope", Path("/v/c d.yaml"), 0, "none", True, 12.5, "-50:", ((1, 2, 3, 4),), Path("/m"), 5, 80
+        "realtime",
+        "colonoscope",
+        Path("/v/c d.yaml"),
+        0,
+        "none",
+        True,
+        12.5,
+        "-50:",
+        ((1, 2, 3, 4),),
+        Path("/m"),
+        5,
+        80,
     )
     assert choice.checked().arguments() == [
         *("--preset=realtime", "--scope=colonoscope", "--camera=/v/c d.yaml", "--stereo=none", "--fps=12.5"),

@@ -133,7 +133,7 @@ def test_an_address_that_others_reach_is_warned_of(
 def test_where_it_is_can_be_opened_on_this_machine() -> None:
     assert url_of("0.0.0.0", 80) == url_of("127.0.0.1", 80) == "http://localhost:80/"
     assert url_of("::1", 80) == "http://[::1]:80/"
-    assert url_of("10.0.0.7", 80) == "http://10.0.0.7:80/"
+    assert url_of("theatre.example", 80) == "http://theatre.example:80/"
 
 
 def test_anonymous_pages_show_no_names(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ class InputPage:
                 self._add_boxes(f"{label} ({len(boxes)})", boxes)
         if found.spread.insets:
             self._add_mask()
-        seen, rest = [], []
+        seen, rest = list[Callable[[], None]](), list[Callable[[], None]]()
         for add, is_advised in (
             (self._add_layout, self.choice.stereo != LAYOUTS[0]),
             (self._add_fields, self.choice.deinterlace),
@@ -128,7 +128,7 @@ class InputPage:
         shown = next((label for label, value in values.items() if value == getattr(self.choice, name)), None)
         handle = self._window.gui.add_dropdown(label, tuple(values), initial_value=shown)
         # What a browser sends need not be of the list.
-        self._window.on(handle, lambda chosen: self._set(**{name: _of_list(values, chosen)}))
+        self._window.on(handle, lambda chosen: self._set({name: _of_list(values, chosen)}))
 
     def _add_camera(self, found: Look) -> None:
         files: dict[str, Path] = {}
@@ -143,10 +143,10 @@ class InputPage:
         def chosen(label: str) -> None:
             fov.visible = label == _BY_FOV
             file = None if label in (_ESTIMATED, _BY_FOV) else _of_list(files, label)
-            self._set(camera=file, fov_deg=float(fov.value) if fov.visible else 0.0)
+            self._set({"camera": file, "fov_deg": float(fov.value) if fov.visible else 0.0})
 
         self._window.on(camera, chosen)
-        self._window.on(fov, lambda value: self._set(fov_deg=float(value)) if fov.visible else None)
+        self._window.on(fov, lambda value: self._set({"fov_deg": float(value)}) if fov.visible else None)
 
     def _add_boxes(self, label: str, boxes: tuple[tuple[int, int, int, int], ...]) -> None:
         are_set = set(boxes) <= set(self.choice.redact)
@@ -154,7 +154,7 @@ class InputPage:
 
         def changed(is_on: bool) -> None:
             rest = [box for box in self.choice.redact if box not in boxes]
-            self._set(redact=tuple(sorted([*rest, *(boxes if is_on else ())])))
+            self._set({"redact": tuple(sorted([*rest, *(boxes if is_on else ())]))})
 
         self._window.on(handle, changed)
 
@@ -162,32 +162,32 @@ class InputPage:
         folder = self._workspace.masks_of(self._source)
         self.choice = replace(self.choice, masks=folder)
         handle = self._window.gui.add_checkbox("Leave out the picture in the picture", True)
-        self._window.on(handle, lambda is_on: self._set(masks=folder if is_on else None))
+        self._window.on(handle, lambda is_on: self._set({"masks": folder if is_on else None}))
 
     def _add_layout(self) -> None:
         self._add_list("Two views in a picture", _LAYOUTS, "stereo")
 
     def _add_fields(self) -> None:
         handle = self._window.gui.add_checkbox("Interlaced: use one field", self.choice.deinterlace)
-        self._window.on(handle, lambda is_on: self._set(deinterlace=bool(is_on)))
+        self._window.on(handle, lambda is_on: self._set({"deinterlace": bool(is_on)}))
 
     def _add_rate(self) -> None:
         hint = "Leave out frames beyond this rate; 0: use all."
         handle = self._window.gui.add_number("Most frames per second", self.choice.fps, min=0.0, step=0.1, hint=hint)
-        self._window.on(handle, lambda value: self._set(fps=float(value)))
+        self._window.on(handle, lambda value: self._set({"fps": float(value)}))
 
     def _add_frames(self) -> None:
         hint = "From the first to before the last, such as 50:900; with a step: ::2. Empty: all."
         handle = self._window.gui.add_text("Frames", self.choice.frames, hint=hint)
-        self._window.on(handle, lambda text: self._set(frames=str(text).strip()))
+        self._window.on(handle, lambda text: self._set({"frames": str(text).strip()}))
 
     def _add_range(self) -> None:
         hint = "In the first frame, mm; both set the scale. 0: not known."
         for label, name in (("Nearest tissue, mm", "near_mm"), ("Farthest tissue, mm", "far_mm")):
             handle = self._window.gui.add_number(label, 0.0, min=0.0, step=0.1, hint=hint)
-            self._window.on(handle, lambda value, name=name: self._set(**{name: float(value)}))
+            self._window.on(handle, lambda value, name=name: self._set({name: float(value)}))
 
-    def _set(self, **changes: Any) -> None:
+    def _set(self, changes: dict[str, Any]) -> None:
         self.choice = replace(self.choice, **changes)
         self._show_choice()
 

@@ -27,7 +27,9 @@ _MOST_LOG = 4000
 class WatchedRun(Protocol):
     """What the page needs to know of the process that it shows."""
 
-    status: str
+    @property
+    def status(self) -> str:
+        """Where it is, as `BrowserRun` has it."""
 
     @property
     def printed(self) -> str:

@@ -15,7 +15,7 @@ from scopemap.engine.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 _OWN_NAMES = {LOOPBACK, "localhost", "[::1]", "::1"}
-_ALL = ("0.0.0.0", "::")
+_ALL = ("0.0.0.0", "::")  # noqa: S104
 _TITLE = "scopemap"
 # What the page may load: itself, what it makes in memory, and its own connection.
 _POLICY = (

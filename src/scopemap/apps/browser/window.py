@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, Protocol
 
 from scopemap.apps.browser.names import Names
@@ -140,10 +141,8 @@ class Window:
         """Do what is to be done until `stop`, or until `ends`."""
         ticked_s = 0.0
         while not (self._ended or ends()):
-            try:
+            with suppress(queue.Empty):
                 self._guarded(self._calls.get(timeout=_TICK_S / 5))
-            except queue.Empty:
-                pass
             if time.monotonic() - ticked_s > _TICK_S:
                 ticked_s = time.monotonic()
                 for call in (*self._ticking, *([self._page.tick] if self._page is not None else [])):

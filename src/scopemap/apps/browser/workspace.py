@@ -123,9 +123,9 @@ class Workspace:
         stem, number = self._stem(source), 1
         while True:
             out = self.results / (stem if number == 1 else f"{stem}_{number}")
-            if not out.exists() or _is_left(out):
-                if all(run.out != out or run.status in ("failed", "stopped") for run in self.runs.runs):
-                    return out
+            is_taken = any(run.out == out and run.status not in ("failed", "stopped") for run in self.runs.runs)
+            if not is_taken and (not out.exists() or _is_left(out)):
+                return out
             number += 1
 
     @staticmethod
