@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 import viser
-from browser_parts import Client, element, press, settle, until, words
 from front_door import refused
 from typer.testing import CliRunner
 from viser import _messages as messages
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
+from window_without_browser import Client, element, press, settle, until, words
 
 from scopemap.apps.browser import command
 from scopemap.apps.browser.input_page import InputPage

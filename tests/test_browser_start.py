@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser_parts import element, elements, press, settle, until, words
+from window_without_browser import element, elements, press, settle, until, words
 
 from scopemap.apps.browser import command
 from scopemap.apps.browser.input_page import InputPage

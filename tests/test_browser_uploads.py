@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from browser_parts import Client, element, settle, until, words
+from window_without_browser import Client, element, settle, until, words
 
 from scopemap.apps.browser.input_page import InputPage
 from scopemap.apps.browser.start_page import StartPage

@@ -29,7 +29,7 @@ class WatchedRun(Protocol):
 
     @property
     def status(self) -> str:
-        """Where it is, as `BrowserRun` has it."""
+        """Where it is: waiting, running, done, failed or stopped."""
 
     @property
     def printed(self) -> str:
@@ -71,13 +71,12 @@ class RunPage:
         gui = window.gui
         self._window = window
         gui.add_markdown(f"### {escaped(window.names.hidden(self._title))}")
-        self._words = gui.add_markdown("starting")
+        self._words, self._size = gui.add_markdown("starting"), ""
         self._bar = gui.add_progress_bar(0, animated=True)
         self._stop = window.on(gui.add_button("Stop and keep what there is", icon=_icon("PLAYER_STOP")), self._stop_run)
         self._picture = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Frame: unused parts dark, corners green")
         self._depth = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Depth: blue near, red far")
         self._facts = gui.add_markdown("", visible=False)
-        self._size = gui.add_markdown("", visible=False)
         self._picture.visible = self._depth.visible = False
         with gui.add_folder("Log", expand_by_default=False):
             self._log = gui.add_markdown("")
@@ -124,7 +123,7 @@ class RunPage:
             last = self._window.names.hidden(lines[-1]) if lines and not self._seen else "preparing"
             self._words.content = escaped(last)
             return
-        self._words.content = words_of(state)
+        self._words.content = words_of(state) + self._size
         self._bar.value, self._bar.animated = share_of(state), True
         if state.written == self._written:
             return
@@ -135,14 +134,13 @@ class RunPage:
             for handle, content in zip((self._picture, self._depth), pictures, strict=True):
                 handle.image, handle.visible = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")), True
         if (seen := read_map(self._folder)) is not None:
-            self._size.content = f"The surface so far: {len(seen.points):,} points from {len(seen.index):,} frames"
-            self._size.visible = True
             self._draw(seen, is_lost=state.status == "lost")
 
     def _draw(self, seen: SeenMap, *, is_lost: bool) -> None:
         scene = self._window.scene
         if not len(seen.index):
             return
+        self._size = f"\n\nThe surface so far: {len(seen.points):,} points from {len(seen.index):,} frames."
         positions = seen.T_world_camera[:, :3, 3]
         everything = np.concatenate([positions, seen.points]) if len(seen.points) else positions
         size = float(np.linalg.norm(np.ptp(np.percentile(everything, [5, 95], axis=0), axis=0))) or 1.0

@@ -41,14 +41,14 @@ class Workspace:
     """
 
     def __init__(self, folder: Path, *, keep_uploads: bool = False, most_bytes: int = 4_000_000_000) -> None:
+        self._receiver: Receiver | None = None
         # Absolute: a name that begins with "-" would be an option of the run's command.
         self.folder, self.most_bytes = folder.absolute(), most_bytes
         self.results = self.folder / _RESULTS
         self._session = Path(tempfile.mkdtemp(prefix="scopemap-app-"))
         self.uploads = self.results / _UPLOADS if keep_uploads else self._session / _UPLOADS
         self.keeps_uploads = keep_uploads
-        self.runs = RunQueue(self._session / "logs")
-        self._receiver: Receiver | None = None
+        self.runs = RunQueue(self.logs)
 
     def __enter__(self) -> Workspace:
         return self
@@ -83,6 +83,11 @@ class Workspace:
         """Folders in FOLDER/scopemap of runs that were killed, and that no run of this session writes to."""
         writing = {run.out for run in self.runs.runs if run.status in ("waiting", "running")}
         return [path for path in _inside(self.results) if path not in writing and _is_left(path)][:_MOST_LISTED]
+
+    @property
+    def logs(self) -> Path:
+        """Folder for what processes print; it goes with the session."""
+        return self._session / "logs"
 
     def receiver(self, server: Any) -> Receiver:
         """Return what takes videos that are sent to the page of viser's server."""

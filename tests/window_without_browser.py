@@ -15,7 +15,6 @@ from websockets.sync.client import connect
 from scopemap.apps.browser.window import Window
 
 PATIENCE_S = 120.0
-Page = Any
 
 
 def until(window: Window, is_so: Callable[[], object], patience_s: float = PATIENCE_S) -> None:
