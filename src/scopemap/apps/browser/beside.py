@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from scopemap.apps.browser.serving import NOT_INSTALLED
-from scopemap.engine.errors import InputError
+from scopemap.apps.browser.serving import check_installed
 
+LIVE_BUTTONS = {"Pause or go on": "pause", "Forget all and begin anew": "reset", "Write a snapshot": "snapshot"}
+"""Of a live stream: names of what they do by what is written on them."""
 _DONE, _FAILED = "done", "failed: "
 
 
@@ -29,18 +30,18 @@ def window_beside(
 ) -> Iterator[None]:
     """Context in which a window shows what a run writes to `view`, and its result in `out` afterwards until Ctrl-C.
 
-    actions : called by the names of the window's buttons. arguments : further ones of `scopemap app`. say : is told
-    where the window is. Raises `InputError` where viser is not installed.
+    actions : called by the names of the window's buttons; there may be more of them later. arguments : further ones of
+    `scopemap app`. say : is told where the window is. Raises `InputError` where viser is not installed.
     """
-    import importlib.util
-
-    if importlib.util.find_spec("viser") is None:
-        raise InputError(NOT_INSTALLED)
+    check_installed()
     command = [sys.executable, "-m", "scopemap", "app", "--watch", str(view), *arguments]
     command += [] if out is None else ["--result", str(out)]
     # Ctrl-C is the command's.
-    window = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
-    assert window.stdin is not None and window.stdout is not None
+    window = subprocess.Popen(  # noqa: S603
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert window.stdin is not None
+    assert window.stdout is not None
     lines = window.stdout
 
     def listen() -> None:
@@ -87,7 +88,8 @@ class RunBeside:
     def press(self, button: str) -> None:
         """Tell the command that a button was pressed."""
         with suppress(OSError):
-            print(button, flush=True)
+            sys.stdout.write(f"{button}\n")
+            sys.stdout.flush()
 
     def stop(self) -> None:
         """Ask the command to end and write what it has."""

@@ -6,6 +6,7 @@ import signal
 import threading
 import webbrowser
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,6 +39,7 @@ def app(
     quiet: Quiet = False,
     watch: Annotated[Path | None, typer.Option("--watch", hidden=True)] = None,
     result: Annotated[Path | None, typer.Option("--result", hidden=True)] = None,
+    live: Annotated[bool, typer.Option("--live", hidden=True)] = False,
 ) -> None:
     """Reconstruct, look and measure in a browser window.
 
@@ -50,7 +52,7 @@ def app(
     from scopemap.engine.errors import InputError
 
     if watch is not None:
-        _beside_a_command(Window(port, host, anonymous=anonymous), watch, result, browser=browser)
+        _beside_a_command(Window(port, host, anonymous=anonymous), watch, result, live=live, browser=browser)
         return
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder: name the folder of the videos")
@@ -63,9 +65,9 @@ def app(
         serve(window, browser=browser, quiet=quiet)
 
 
-def _beside_a_command(window: Window, view: Path, result: Path | None, *, browser: bool) -> None:
+def _beside_a_command(window: Window, view: Path, result: Path | None, *, live: bool, browser: bool) -> None:
     """Show the run of another command, and then its result; lines of text go to and fro."""
-    from scopemap.apps.browser.beside import RunBeside
+    from scopemap.apps.browser.beside import LIVE_BUTTONS, RunBeside
     from scopemap.apps.browser.result_page import ResultPage
     from scopemap.apps.browser.run_page import RunPage
 
@@ -75,8 +77,9 @@ def _beside_a_command(window: Window, view: Path, result: Path | None, *, browse
         if result is not None:
             window.show(ResultPage(result))
 
-    name = "" if result is None else result.name
-    window.show(RunPage(run, view, name, finished))
+    name = "Live" if live else "" if result is None else result.name
+    buttons = {name: partial(run.press, button) for name, button in LIVE_BUTTONS.items()} if live else None
+    window.show(RunPage(run, view, name, finished, buttons=buttons))
     typer.echo(window.url)
     serve(window, browser=browser, quiet=True)
 
