@@ -87,8 +87,8 @@ def write_coverage(folder: Path, drawn: bytes) -> None:
 
 def write_map(folder: Path, seen: SeenMap) -> None:
     """Write the current submap; raises `OSError`."""
-    held = io.BytesIO()
-    np.savez(held, **{name: np.asarray(value) for name, value in vars(seen).items()})
+    held, arrays = io.BytesIO(), dict[str, Any](vars(seen))
+    np.savez(held, **arrays)
     _replace(folder / _MAP, held.getvalue())
 
 

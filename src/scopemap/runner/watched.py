@@ -227,7 +227,8 @@ class _Cloud:
 
 def _points(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 3) float32, world mm, and colours (n, 3) uint8 of usable pixels on a coarse grid."""
-    assert frame.depth_mm is not None and frame.T_world_camera is not None
+    assert frame.depth_mm is not None
+    assert frame.T_world_camera is not None
     step_px = max(1, int(np.ceil(np.sqrt(frame.valid.size / _POINTS_OF_A_FRAME))))
     row, column = (
         side.ravel() for side in np.mgrid[: frame.valid.shape[0] : step_px, : frame.valid.shape[1] : step_px]

@@ -6,6 +6,7 @@ command writes one line at its end: "done", or "failed: " and why. What is shown
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import threading
@@ -63,14 +64,30 @@ def window_beside(
         yield
         tell(_DONE)
         say("the window stays until Ctrl-C")
-        with suppress(KeyboardInterrupt):
-            window.wait()
+        _wait(window)
     except BaseException as error:
         tell(f"{_FAILED}{error}")
         raise
     finally:
         window.terminate()
         window.wait()
+
+
+def _wait(window: subprocess.Popen[str]) -> None:
+    """Wait until the window ends, or for Ctrl-C or SIGTERM, after which the caller tidies up."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with suppress(KeyboardInterrupt):
+            window.wait()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def lines_of_input() -> Iterator[str]:
+    """Yield the lines of standard input, for a thread that may still wait for one when the process ends."""
+    # Not `sys.stdin`: Python would want to close it.
+    with open(0, encoding="utf-8", errors="replace", closefd=False) as lines:
+        yield from lines
 
 
 class RunBeside:
@@ -80,6 +97,8 @@ class RunBeside:
 
     def __init__(self) -> None:
         self.status, self.sentence = "running", "the command has ended"
+        self.is_gone = False
+        """Whether the command is no more."""
         threading.Thread(target=self._listen, name="command", daemon=True).start()
 
     def poll(self) -> None:
@@ -96,11 +115,9 @@ class RunBeside:
         self.press("stop")
 
     def _listen(self) -> None:
-        for line in sys.stdin:
+        for line in lines_of_input():
             if line.strip() == _DONE:
                 self.status = "done"
-                return
-            if line.startswith(_FAILED):
+            elif line.startswith(_FAILED):
                 self.sentence, self.status = line.removeprefix(_FAILED).strip(), "failed"
-                return
-        self.status = "failed"
+        self.is_gone = True

@@ -81,7 +81,7 @@ def _beside_a_command(window: Window, view: Path, result: Path | None, *, live: 
     buttons = {name: partial(run.press, button) for name, button in LIVE_BUTTONS.items()} if live else None
     window.show(RunPage(run, view, name, finished, buttons=buttons))
     typer.echo(window.url)
-    serve(window, browser=browser, quiet=True)
+    serve(window, browser=browser, quiet=True, ends=lambda: run.is_gone)
 
 
 def serve(window: Window, *, browser: bool, quiet: bool, ends: Callable[[], bool] = lambda: False) -> None:

@@ -90,8 +90,9 @@ class ComparePage:
         else:
             self._legend.content = words_html(self._of_paths())
         places = ("/page", "/page") if found.surfaces is None else self._pair.nodes
-        for place, poses, colour in zip(places, found.poses, (_FIRST, _SECOND), strict=True):
+        for place, poses, colour, name in zip(places, found.poses, (_FIRST, _SECOND), self._names, strict=True):
             draw_path(window.scene, f"{place}/path {colour}", poses[:, :3, 3], rgb_of(colour))
+            window.scene.add_label(f"{place}/name {colour}", name, position=tuple(poses[0, :3, 3]))
         if found.surfaces is None:
             look_at(window, found.poses[0][0], np.concatenate([poses[:, :3, 3] for poses in found.poses]))
         if not window.anonymous:

@@ -26,7 +26,9 @@ _LOST = (200, 40, 40)
 class WatchedRun(Protocol):
     """What the page needs to know of the process that it shows."""
 
-    status: str
+    @property
+    def status(self) -> str:
+        """Where it is: waiting, running, done, failed or stopped."""
 
     @property
     def printed(self) -> str:
@@ -73,10 +75,10 @@ class RunPage:
         gui.add_markdown(f"### {escaped(self._title)}")
         self._words = gui.add_markdown("starting")
         self._bar = gui.add_progress_bar(0, animated=True)
+        self._facts = gui.add_markdown("", visible=False)
         self._live = [window.on(gui.add_button(name), call) for name, call in self._buttons.items()]
         stop = gui.add_button("Stop" if self._live else "Stop and keep what there is", icon=_icon("PLAYER_STOP"))
         self._stop = window.on(stop, self._stop_run)
-        self._facts = gui.add_markdown("", visible=False)
         self._picture = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Frame: unused parts dark, corners green")
         self._depth = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Depth: blue near, red far")
         self._coverage = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="What was not seen so far")

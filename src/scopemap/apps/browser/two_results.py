@@ -83,8 +83,8 @@ class TwoResults:
         return [
             *found,
             f"The surfaces are {self.length(self.median)} apart (median, where both have one).",
-            f"In one alone: {percent[0]} of the surface of {first}, {percent[1]} of that of {second}. There the other one "
-            f"is farther away than {100 * _ALONE_SHARE:.0f} % of the distance to the camera.",
+            f"In one alone: {percent[0]} of the surface of {first}, {percent[1]} of that of {second}. There the other "
+            f"one is farther away than {100 * _ALONE_SHARE:.0f} % of the distance to the camera.",
             "Where they differ, neither is confirmed.",
         ]
 

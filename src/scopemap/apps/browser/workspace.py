@@ -46,7 +46,7 @@ class Workspace:
         self._session = Path(tempfile.mkdtemp(prefix="scopemap-app-"))
         self.uploads = self.results / _UPLOADS if keep_uploads else self._session / _UPLOADS
         self.keeps_uploads = keep_uploads
-        self.runs = RunQueue(self._session / "logs")
+        self.runs = RunQueue(self.logs)
 
     def __enter__(self) -> Workspace:
         return self
@@ -70,6 +70,11 @@ class Workspace:
         folders = [path for place in inside for path in place.iterdir() if path.is_dir() and not path.is_symlink()]
         done = [path for path in folders if (path / "provenance.json").is_file() and Result(path).is_finished]
         return sorted(done, key=lambda path: -(path / "provenance.json").stat().st_mtime)[:_MOST_LISTED]
+
+    @property
+    def logs(self) -> Path:
+        """Folder for what processes print; it goes with the session."""
+        return self._session / "logs"
 
     def inside(self, name: str) -> Path:
         """Return the path of a name in the folder; raises `InputError` where it leads out of it."""

@@ -109,7 +109,7 @@ def live(
 
             kept = KeptDepth(Path(stack.enter_context(TemporaryDirectory())))
             covered = stack.enter_context(LiveCoverage(kept))
-            shown = None if view is None else ShownSession(view, covered)
+            shown = None if view is None else ShownSession(view, covered, writes=out is not None)
             observers = observe, *sender, *([kept.observe] if folder or shown else [])
             observers += (covered.observe, shown.observe) if shown else ()
             snapshots = (folder or Path("scopemap-live")) / "snapshots"
@@ -168,10 +168,10 @@ def _seen_in(
 
 def _listen(actions: Mapping[str, Callable[[], None]]) -> None:
     """Call the actions whose names come by standard input, and stop where it ends: nobody watches any more."""
-    # Not `sys.stdin`, which Python cannot close at its end while a thread waits for it.
-    with open(0, encoding="utf-8", closefd=False) as lines:
-        for line in lines:
-            actions.get(line.strip(), lambda: None)()
+    from scopemap.apps.browser.beside import lines_of_input
+
+    for line in lines_of_input():
+        actions.get(line.strip(), lambda: None)()
     actions.get("stop", lambda: None)()
 
 

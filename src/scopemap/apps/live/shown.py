@@ -15,17 +15,24 @@ if TYPE_CHECKING:
 
 
 class ShownSession:
-    """Observes a session and shows it in `folder`, with the map of what was not seen so far."""
+    """Observes a session and shows it in `folder`, with the map of what was not seen so far.
 
-    def __init__(self, folder: Path, covered: LiveCoverage) -> None:
-        self._folder, self._covered = folder, covered
+    writes : whether a result is written at the end.
+    """
+
+    def __init__(self, folder: Path, covered: LiveCoverage, *, writes: bool) -> None:
+        self._folder, self._covered, self._writes = folder, covered, writes
         self._watch: RunWatch | None = None
         self._of: Reconstructor | None = None
 
     def watch(self, session: LiveSession) -> RunWatch:
         """Return the context in which the session is shown."""
         covered = self._covered
-        live = lambda: words_and_facts(session.state(), covered.shown.words)  # noqa: E731
+
+        def live() -> tuple[str, dict[str, str]]:
+            words, facts = words_and_facts(session.state(), covered.shown.words)
+            return "writing the result" if words == "ended" and self._writes else words, facts
+
         self._watch = RunWatch(None, folder=self._folder, live=live, drawn=lambda: covered.shown.png)
         return self._watch
 
