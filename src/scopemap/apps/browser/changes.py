@@ -99,4 +99,4 @@ class ShownChanges:
     def _show(self, words: str, pictures: dict[str, np.ndarray]) -> None:
         self._words.content = words
         for handle, (name, picture) in zip(self._pictures, pictures.items(), strict=True):
-            handle.image, handle.label, handle.visible = picture, name.replace("\n", ", "), True
+            handle.image, handle.label, handle.visible = picture, ", ".join(name.split("\n")).removeprefix(", "), True

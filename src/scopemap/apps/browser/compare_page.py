@@ -48,7 +48,7 @@ class ComparePage:
         is_clear = not window.anonymous and given[0] != given[1]
         self._names = (given[0], given[1]) if is_clear else ("the first", "the second")
         if self._workspace is not None:
-            window.on(gui.add_button("Back"), self._back, self._workspace)
+            window.on(gui.add_button("Back to the start", color="gray"), self._back, self._workspace)
         first, second = (escaped(name) for name in self._names)
         gui.add_markdown(f"### {first} and {second}")
         if is_same_input(*self._runs):

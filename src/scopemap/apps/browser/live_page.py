@@ -93,6 +93,7 @@ def open_live(window: Window, workspace: Workspace, source: str) -> None:
     def back() -> None:
         from scopemap.apps.browser.start_page import StartPage
 
+        run.stop()
         window.show(StartPage(workspace))
 
     buttons = {words: partial(run.press, name) for words, name in LIVE_BUTTONS.items()}
