@@ -6,7 +6,6 @@ import html
 import json
 import re
 from collections.abc import Sequence
-from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,7 @@ import numpy as np
 from scopemap.engine.errors import reporting
 from scopemap.report.frame_pictures import FOLDER as PICTURES
 from scopemap.report.measured_surface import MOST_FACES
-from scopemap.report.page_data import MEASUREMENTS, checked_measurements, page_data, read_measurements, shown_meshes
-from scopemap.report.serving import LocalServer
+from scopemap.report.page_data import MEASUREMENTS, checked_measurements, page_data, shown_meshes
 from scopemap.report.shown_mesh import base64_of
 from scopemap.report.summary_picture import summary_picture
 from scopemap.result.checksums import SUMS, write_checksums
@@ -72,17 +70,8 @@ def write_comparison(folders: Sequence[Path], names: Sequence[str], file: Path) 
     return file
 
 
-def full_page(folder: Path | str) -> str:
-    """Return the page of a run with all faces of its surface and all kept pictures, however large that is.
-
-    Raises `InputError` where the folder holds no finished run.
-    """
-    run = Result(folder).checked()
-    return page_html([page_data(run, shown_meshes(run, None), share=float("inf"))], served=True)
-
-
 def keep_measurements(folder: Path | str, sent: bytes) -> None:
-    """Write what was measured by hand on a page, a list as JSON, as `measurements.json` into a run's folder.
+    """Write what was measured by hand, a list as JSON, as `measurements.json` into a run's folder.
 
     Raises `InputError` where it is no such list, or cannot be written.
     """
@@ -93,33 +82,16 @@ def keep_measurements(folder: Path | str, sent: bytes) -> None:
         file.with_suffix(".part").replace(file)
 
 
-def serve_view(folder: Path | str, port: int = 0) -> LocalServer:
-    """Serve the full page of a run, whose measurements it keeps beside the result, until it is closed.
-
-    Raises `InputError` where the folder holds no finished run, or the port is taken.
-    """
-    page = full_page(folder).encode()
-    return LocalServer(
-        {
-            "/": lambda: ("text/html; charset=utf-8", page),
-            f"/{MEASUREMENTS}": lambda: ("application/json", json.dumps(read_measurements(Path(folder))).encode()),
-        },
-        port=port,
-        uploads={f"/{MEASUREMENTS}": partial(keep_measurements, folder)},
-    )
-
-
-def page_html(runs: list[dict[str, Any]], *, served: bool = False) -> str:
-    """Return the page of runs, each from `page_data`; served : by `view`, which takes its measurements."""
+def page_html(runs: list[dict[str, Any]]) -> str:
+    """Return the page of runs, each from `page_data`."""
     levels = np.arange(256, dtype=np.uint8)[:, None]
     maps = {"turbo": cv2.COLORMAP_TURBO, "ramp": cv2.COLORMAP_VIRIDIS}
     colours = {name: base64_of(cv2.applyColorMap(levels, number)[:, 0, ::-1], "u1") for name, number in maps.items()}
-    content = without_nan({"runs": runs, "licences": _LICENCES, "served": served} | colours)
+    content = without_nan({"runs": runs, "licences": _LICENCES} | colours)
     names = ", ".join(run["name"] for run in runs)
     parts = {
         # A file's name may hold bytes that are no UTF-8; in the data JSON escapes them.
         "title": html.escape(names.encode("utf-8", "replace").decode("utf-8"), quote=False),
-        "connect": "; connect-src 'self'" if served else "",
         "style": _asset("page.css"),
         "script": "\n".join(_asset(f"{name}.js") for name in _SCRIPTS),
         # "<" would end the script that holds the data, wherever a name in it contains "</script>".

@@ -58,14 +58,12 @@ class _Picture:
     depth_mm: np.ndarray | None
 
 
-def shown_meshes(run: Result, most_faces: int | None) -> list[trimesh.Trimesh]:
-    """Return the meshes of the maps that the page shows, the result's first, with most faces; None: all of their faces.
+def shown_meshes(run: Result, most_faces: int) -> list[trimesh.Trimesh]:
+    """Return the meshes of the maps that the page shows, the result's first, with most faces.
 
     Others are simplified.
     """
     submaps: Sequence[Result] = run.submaps[:_MOST_MAPS]
-    if most_faces is None:
-        return [submap.mesh for submap in submaps]
     most = [most_faces] + [min(most_faces, FACES_OF_OTHERS)] * (_MOST_MAPS - 1)
     return [simplified(submap.mesh, faces) for submap, faces in zip(submaps, most, strict=False)]
 

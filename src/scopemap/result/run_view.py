@@ -1,6 +1,7 @@
 """What can be seen of a run while it goes on: small files in the folder that it fills, each replaced at once.
 
 DIR/.unfinished/view/  state.json  picture.jpg (usable pixels, corners)  depth.jpg  map.npz (path, points)
+                       coverage.png (of a live stream: what was not seen so far)
 
 Whoever looks reads them when it likes, so that nobody who looks can slow the run down. They go with the folder.
 """
@@ -18,6 +19,7 @@ import numpy as np
 from scopemap.result.result_folder import UNFINISHED, VIEW
 
 _STATE, _PICTURE, _DEPTH, _MAP = "state.json", "picture.jpg", "depth.jpg", "map.npz"
+_COVERAGE = "coverage.png"
 
 
 def view_folder(out: Path) -> Path:
@@ -78,6 +80,11 @@ def write_pictures(folder: Path, picture: bytes, depth: bytes) -> None:
     _replace(folder / _DEPTH, depth)
 
 
+def write_coverage(folder: Path, drawn: bytes) -> None:
+    """Write the map of what was not seen so far, PNG; raises `OSError`."""
+    _replace(folder / _COVERAGE, drawn)
+
+
 def write_map(folder: Path, seen: SeenMap) -> None:
     """Write the current submap; raises `OSError`."""
     held = io.BytesIO()
@@ -99,6 +106,14 @@ def read_pictures(folder: Path) -> tuple[bytes, bytes] | None:
     """Return the last frame's picture and its depth in colours, JPEG; None where there are none."""
     try:
         return (folder / _PICTURE).read_bytes(), (folder / _DEPTH).read_bytes()
+    except OSError:
+        return None
+
+
+def read_coverage(folder: Path) -> bytes | None:
+    """Return the map of what was not seen so far, PNG; None where there is none."""
+    try:
+        return (folder / _COVERAGE).read_bytes()
     except OSError:
         return None
 

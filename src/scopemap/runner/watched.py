@@ -21,7 +21,15 @@ from scopemap.engine.odometry import Step
 from scopemap.report.depth_figures import colour_depth
 from scopemap.report.frame_pictures import shrunk
 from scopemap.report.run_state import RunState
-from scopemap.result.run_view import RunProgressState, SeenMap, view_folder, write_map, write_pictures, write_state
+from scopemap.result.run_view import (
+    RunProgressState,
+    SeenMap,
+    view_folder,
+    write_coverage,
+    write_map,
+    write_pictures,
+    write_state,
+)
 
 _EVERY_S = 0.5
 _POINTS_EVERY_S = 0.25
@@ -39,7 +47,8 @@ class RunWatch:
     """Observes a run that writes to `out`, and shows it; a context that ends with the run.
 
     out : the folder of the result; or, with `folder`, nothing: what is seen is written there. total : frames of the
-    input, None: not known. adjusts : as of `RunState`. facts : what else is shown, by name, asked when it is written.
+    input, None: not known. adjusts : as of `RunState`. Of a live stream, asked when it is written: live : what it does,
+    and what else is shown, by name; drawn : the map of what was not seen so far, PNG, b"": none.
     """
 
     def __init__(
@@ -49,12 +58,14 @@ class RunWatch:
         *,
         adjusts: bool = True,
         folder: Path | None = None,
-        facts: Callable[[], dict[str, str]] = dict,
+        live: Callable[[], tuple[str, dict[str, str]]] | None = None,
+        drawn: Callable[[], bytes] = bytes,
     ) -> None:
         if out is None and folder is None:
             raise ValueError("a folder is needed to show a run in")
-        self._out, self._folder, self._facts = out, folder, facts
-        self._total, self._progress = total, RunState(total, adjusts=adjusts)
+        self._out, self._folder, self._live, self._drawn = out, folder, live, drawn
+        self._total, self._adjusts = total, adjusts
+        self._progress = RunState(total, adjusts=adjusts)
         self._words, self._done, self._frames = "preparing", 0, 0
         self._step: Step | None = None
         self._tracked, self._final = _Cloud(), _Cloud()
@@ -92,6 +103,12 @@ class RunWatch:
             self._pointed_s = now if is_due else self._pointed_s
             self._tracked.put(frame, with_points=is_due, keyframe=track.keyframe)
 
+    def forget(self) -> None:
+        """Begin anew: what was seen so far is no longer shown."""
+        with self._lock:
+            self._progress = RunState(self._total, adjusts=self._adjusts)
+            self._step, self._tracked, self._map_of, self._keyframes = None, _Cloud(), {}, set()
+
     def final(self, frame: Frame) -> None:
         """Take a frame whose depth and pose are final."""
         if frame.T_world_camera is None:
@@ -111,10 +128,11 @@ class RunWatch:
 
     def state(self) -> RunProgressState:
         """Return how far the run is now."""
+        doing, facts = (self._words, {}) if self._live is None else self._live()
         with self._lock:
             step = self._step
             return RunProgressState(
-                doing=self._words,
+                doing=doing,
                 done=self._done,
                 total=self._frames,
                 time_left=self._progress.time_left.rstrip(", ") if self._words == "tracking" else "",
@@ -126,7 +144,7 @@ class RunWatch:
                 submap=0 if step is None else step.track.map,
                 adjusted=bool(self._final.poses) and self._words != "tracking",
                 written=self._written,
-                facts=self._facts(),
+                facts=facts,
             )
 
     def _write_until_ended(self) -> None:
@@ -151,6 +169,8 @@ class RunWatch:
                 write_pictures(folder, *_pictures(step.frame))
                 if seen.poses:
                     write_map(folder, seen.map(step.frame))
+            if drawn := self._drawn():
+                write_coverage(folder, drawn)
             self._written += 1
             write_state(folder, self.state())
         except OSError:

@@ -6,6 +6,7 @@ command writes one line at its end: "done", or "failed: " and why. What is shown
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import threading
@@ -13,9 +14,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from scopemap.apps.browser.serving import NOT_INSTALLED
-from scopemap.engine.errors import InputError
+from scopemap.apps.browser.serving import check_installed
 
+LIVE_BUTTONS = {"Pause or go on": "pause", "Forget all and begin anew": "reset", "Write a snapshot": "snapshot"}
+"""Of a live stream: names of what they do by what is written on them."""
 _DONE, _FAILED = "done", "failed: "
 
 
@@ -29,13 +31,10 @@ def window_beside(
 ) -> Iterator[None]:
     """Context in which a window shows what a run writes to `view`, and its result in `out` afterwards until Ctrl-C.
 
-    actions : called by the names of the window's buttons. arguments : further ones of `scopemap app`. say : is told
-    where the window is. Raises `InputError` where viser is not installed.
+    actions : called by the names of the window's buttons; there may be more of them later. arguments : further ones of
+    `scopemap app`. say : is told where the window is. Raises `InputError` where viser is not installed.
     """
-    import importlib.util
-
-    if importlib.util.find_spec("viser") is None:
-        raise InputError(NOT_INSTALLED)
+    check_installed()
     command = [sys.executable, "-m", "scopemap", "app", "--watch", str(view), *arguments]
     command += [] if out is None else ["--result", str(out)]
     # Ctrl-C is the command's.
@@ -63,14 +62,30 @@ def window_beside(
         yield
         tell(_DONE)
         say("the window stays until Ctrl-C")
-        with suppress(KeyboardInterrupt):
-            window.wait()
+        _wait(window)
     except BaseException as error:
         tell(f"{_FAILED}{error}")
         raise
     finally:
         window.terminate()
         window.wait()
+
+
+def _wait(window: subprocess.Popen[str]) -> None:
+    """Wait until the window ends, or for Ctrl-C or SIGTERM, after which the caller tidies up."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with suppress(KeyboardInterrupt):
+            window.wait()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def lines_of_input() -> Iterator[str]:
+    """Yield the lines of standard input, for a thread that may still wait for one when the process ends."""
+    # Not `sys.stdin`: Python would want to close it.
+    with open(0, encoding="utf-8", errors="replace", closefd=False) as lines:
+        yield from lines
 
 
 class RunBeside:
@@ -80,6 +95,8 @@ class RunBeside:
 
     def __init__(self) -> None:
         self.status, self.sentence = "running", "the command has ended"
+        self.is_gone = False
+        """Whether the command is no more."""
         threading.Thread(target=self._listen, name="command", daemon=True).start()
 
     def poll(self) -> None:
@@ -96,11 +113,9 @@ class RunBeside:
         self.press("stop")
 
     def _listen(self) -> None:
-        for line in sys.stdin:
+        for line in lines_of_input():
             if line.strip() == _DONE:
                 self.status = "done"
-                return
-            if line.startswith(_FAILED):
+            elif line.startswith(_FAILED):
                 self.sentence, self.status = line.removeprefix(_FAILED).strip(), "failed"
-                return
-        self.status = "failed"
+        self.is_gone = True

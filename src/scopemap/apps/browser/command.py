@@ -6,6 +6,7 @@ import signal
 import threading
 import webbrowser
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -42,6 +43,7 @@ def app(
     result: Annotated[
         Path | None, typer.Option("--result", hidden=True, help="Folder of the result of --watch.")
     ] = None,
+    live: Annotated[bool, typer.Option("--live", hidden=True, help="Show that run as a live stream.")] = False,
 ) -> None:
     """Reconstruct, look and measure in a browser window.
 
@@ -54,7 +56,7 @@ def app(
     from scopemap.engine.errors import InputError
 
     if watch is not None:
-        _beside_a_command(Window(port, host, anonymous=anonymous), watch, result, browser=browser)
+        _beside_a_command(Window(port, host, anonymous=anonymous), watch, result, live=live, browser=browser)
         return
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder: name the folder of the videos")
@@ -67,9 +69,9 @@ def app(
         serve(window, browser=browser, quiet=quiet)
 
 
-def _beside_a_command(window: Window, view: Path, result: Path | None, *, browser: bool) -> None:
+def _beside_a_command(window: Window, view: Path, result: Path | None, *, live: bool, browser: bool) -> None:
     """Show the run of another command, and then its result; lines of text go to and fro."""
-    from scopemap.apps.browser.beside import RunBeside
+    from scopemap.apps.browser.beside import LIVE_BUTTONS, RunBeside
     from scopemap.apps.browser.result_page import ResultPage
     from scopemap.apps.browser.run_page import RunPage
 
@@ -79,10 +81,11 @@ def _beside_a_command(window: Window, view: Path, result: Path | None, *, browse
         if result is not None:
             window.show(ResultPage(result))
 
-    name = "" if result is None else result.name
-    window.show(RunPage(run, view, name, finished))
+    name = "Live" if live else "" if result is None else result.name
+    buttons = {name: partial(run.press, button) for name, button in LIVE_BUTTONS.items()} if live else None
+    window.show(RunPage(run, view, name, finished, buttons=buttons))
     typer.echo(window.url)
-    serve(window, browser=browser, quiet=True)
+    serve(window, browser=browser, quiet=True, ends=lambda: run.is_gone)
 
 
 def serve(window: Window, *, browser: bool, quiet: bool, ends: Callable[[], bool] = lambda: False) -> None:

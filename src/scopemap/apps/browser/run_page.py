@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -12,7 +12,7 @@ from PIL import Image
 
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, look_at, quaternion
 from scopemap.apps.browser.window import escaped, fenced
-from scopemap.result.run_view import RunProgressState, SeenMap, read_map, read_pictures, read_state
+from scopemap.result.run_view import RunProgressState, SeenMap, read_coverage, read_map, read_pictures, read_state
 
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import Window
@@ -49,7 +49,8 @@ class WatchedRun(Protocol):
 class RunPage:
     """A run that writes what is seen of it to `folder`.
 
-    finished : called once with the run where it has a result. back : called where the page is left.
+    finished : called once with the run where it has a result. back : called where the page is left. buttons : of a live
+    stream, what they call by what is written on them.
     """
 
     def __init__(
@@ -60,11 +61,13 @@ class RunPage:
         finished: Callable[[], None],
         back: Callable[[], None] | None = None,
         waiting: Callable[[], int] = lambda: 0,
+        buttons: Mapping[str, Callable[[], None]] | None = None,
     ) -> None:
         self._run, self._folder, self._title = run, folder, title
-        self._finished, self._back, self._waiting = finished, back, waiting
-        self._seen = self._ended = False
-        self._written = -1
+        self._finished, self._back, self._waiting, self._buttons = finished, back, waiting, buttons or {}
+        self._frusta = set[str]()
+        self._ended = False
+        self._written = self._first = -1
 
     def open(self, window: Window) -> None:
         """Make the elements."""
@@ -73,11 +76,14 @@ class RunPage:
         gui.add_markdown(f"### {escaped(window.names.hidden(self._title))}")
         self._words, self._size = gui.add_markdown("starting"), ""
         self._bar = gui.add_progress_bar(0, animated=True)
-        self._stop = window.on(gui.add_button("Stop and keep what there is", icon=_icon("PLAYER_STOP")), self._stop_run)
+        self._facts = gui.add_markdown("", visible=False)
+        self._live = [window.on(gui.add_button(name), call) for name, call in self._buttons.items()]
+        stop = gui.add_button("Stop" if self._live else "Stop and keep what there is", icon=_icon("PLAYER_STOP"))
+        self._stop = window.on(stop, self._stop_run)
         self._picture = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Frame: unused parts dark, corners green")
         self._depth = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Depth: blue near, red far")
-        self._facts = gui.add_markdown("", visible=False)
-        self._picture.visible = self._depth.visible = False
+        self._coverage = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="What was not seen so far")
+        self._picture.visible = self._depth.visible = self._coverage.visible = False
         with gui.add_folder("Log", expand_by_default=False):
             self._log = gui.add_markdown("")
         if self._back is not None:
@@ -104,10 +110,15 @@ class RunPage:
     def _stop_run(self) -> None:
         self._run.stop()
         self._stop.label, self._stop.disabled = "stopping after this frame", True
+        for button in self._live:
+            button.disabled = True
 
     def _end(self, status: str) -> None:
         self._ended, self._bar.visible, self._stop.visible = True, False, False
+        for button in self._live:
+            button.visible = False
         if status == "done":
+            self._words.content = "**It has ended.**"
             self._finished()
             return
         if status == "failed":
@@ -120,11 +131,11 @@ class RunPage:
         state = read_state(self._folder)
         if state is None:
             lines = [line for line in self._run.printed.splitlines() if line.strip()]
-            last = self._window.names.hidden(lines[-1]) if lines and not self._seen else "preparing"
+            last = self._window.names.hidden(lines[-1]) if lines and self._first < 0 else "preparing"
             self._words.content = escaped(last)
             return
         self._words.content = words_of(state) + self._size
-        self._bar.value, self._bar.animated = share_of(state), True
+        self._bar.value, self._bar.visible = share_of(state), not self._live
         if state.written == self._written:
             return
         self._written = state.written
@@ -132,7 +143,9 @@ class RunPage:
         self._facts.content = "\n".join(f"- {name}: {escaped(value)}" for name, value in state.facts.items())
         if (pictures := read_pictures(self._folder)) is not None:
             for handle, content in zip((self._picture, self._depth), pictures, strict=True):
-                handle.image, handle.visible = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")), True
+                handle.image, handle.visible = _pixels(content), True
+        if (drawn := read_coverage(self._folder)) is not None:
+            self._coverage.image, self._coverage.visible = _pixels(drawn), True
         if (seen := read_map(self._folder)) is not None:
             self._draw(seen, is_lost=state.status == "lost")
 
@@ -144,7 +157,12 @@ class RunPage:
         positions = seen.T_world_camera[:, :3, 3]
         everything = np.concatenate([positions, seen.points]) if len(seen.points) else positions
         size = float(np.linalg.norm(np.ptp(np.percentile(everything, [5, 95], axis=0), axis=0))) or 1.0
+        is_new = self._first != seen.index[0]  # another submap, or all was forgotten
+        self._first = int(seen.index[0])
         with self._window.server.atomic():
+            if is_new:
+                scene.remove_by_name("/page/points")
+                scene.remove_by_name("/page/path")
             if len(seen.points):
                 scene.add_point_cloud(
                     "/page/points",
@@ -159,6 +177,9 @@ class RunPage:
             chosen = np.flatnonzero(seen.keyframe)[-_MOST_FRUSTA:]
             poses = {f"/page/keyframes/{place}": seen.T_world_camera[row] for place, row in enumerate(chosen)}
             poses["/page/now"] = seen.T_world_camera[-1]
+            for name in self._frusta - poses.keys():
+                scene.remove_by_name(name)
+            self._frusta = set(poses)
             for name, pose in poses.items():
                 now = name == "/page/now"
                 scene.add_camera_frustum(
@@ -174,8 +195,7 @@ class RunPage:
                     wxyz=quaternion(pose),
                     position=pose[:3, 3],
                 )
-        if not self._seen:
-            self._seen = True
+        if is_new:
             look_at(self._window, seen.T_world_camera[0], everything)
 
 
@@ -198,6 +218,10 @@ def words_of(state: RunProgressState) -> str:
 def share_of(state: RunProgressState) -> float:
     """Return how much of its present stage a run has done, percent; of stages that are not counted all."""
     return min(100.0, 100 * state.done / state.total) if state.total else 100.0
+
+
+def _pixels(content: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB"))
 
 
 def _icon(name: str) -> str:

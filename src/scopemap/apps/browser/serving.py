@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http
+import importlib.util
 import io
 import re
 import socket
@@ -33,6 +34,12 @@ _HEADERS = {
 NOT_INSTALLED = "the window in the browser needs viser: pip install 'scopemap[app]'"
 
 
+def check_installed() -> None:
+    """Raise `InputError` where viser is not installed."""
+    if importlib.util.find_spec("viser") is None:
+        raise InputError(NOT_INSTALLED)
+
+
 def start_server(port: int = 0, host: str = LOOPBACK) -> Any:
     """Return viser's server at a port of this machine; 0: any free one.
 
@@ -41,11 +48,10 @@ def start_server(port: int = 0, host: str = LOOPBACK) -> Any:
 
     Raises `InputError` where viser is not installed or the port is taken.
     """
-    try:
-        import viser
-        from viser import _messages
-    except ImportError:
-        raise InputError(NOT_INSTALLED) from None
+    check_installed()
+    import viser
+    from viser import _messages
+
     _refuse_taken(host, port)
     # It prints a banner.
     with _guarded(only_own=host in _OWN_NAMES), contextlib.redirect_stdout(io.StringIO()):

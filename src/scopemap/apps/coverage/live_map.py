@@ -31,7 +31,6 @@ _APART_S = 0.25  # frames that are kept, at first: writing the depth of one take
 _EVERY_S = 5.0  # between maps
 _LONGEST_S = 120.0  # for one map, and its priority: idle time on a busy machine, but not none
 _NICE = 10
-_FETCHED_S = 1.0  # until the page has fetched the last one
 
 
 class KeptDepth:
@@ -128,23 +127,14 @@ class LiveCoverage:
         if len(frames) < LEAST_FRAMES:
             return
         self._next_s, so_far = time.monotonic() + _EVERY_S, reconstructor.so_far(frames)
-        self._ask(_Task(self._kept.folder, f"map {step.track.map + 1} until {step.frame.time_s:.0f} s", so_far))
+        self._task = _Task(self._kept.folder, f"map {step.track.map + 1} until {step.frame.time_s:.0f} s", so_far)
+        self._idle.clear()
+        self._tasks.put(self._task)
 
     def settle(self) -> None:
         """Wait for the map that is being made."""
         while self._thread.is_alive() and not self._idle.wait(1):
             pass
-
-    def finish(self, folder: Path) -> None:
-        """Make the map of the result in a folder, and wait for it and for the page."""
-        self._ask(_Task(folder, "the result"))
-        self.settle()
-        time.sleep(_FETCHED_S)
-
-    def _ask(self, task: _Task) -> None:
-        self._idle.clear()
-        self._task = task
-        self._tasks.put(task)
 
     def _make(self) -> None:
         """Have the maps made that are asked for, in the order of asking: the thread's work."""
@@ -160,22 +150,21 @@ class LiveCoverage:
 
 
 class _Task(NamedTuple):
-    """A map to be made of a result's folder; `so_far` is written to it before. `of` : what that is, in words."""
+    """A map to be made in a folder of depth, to which `so_far` is written before. `of` : what that is, in words."""
 
     folder: Path
     of: str
-    so_far: tuple[Result, TsdfVolume | None] | None = None
+    so_far: tuple[Result, TsdfVolume | None]
 
 
 def _made(task: _Task) -> ShownMap:
     """Return the map of a task."""
     with suppress(AttributeError, OSError):  # Windows knows no priorities of this kind
         os.nice(max(0, _NICE - os.nice(0)))
-    if task.so_far is not None:
-        result, volume = task.so_far
-        if volume is not None:
-            result.mesh = finished(volume.extract_mesh(), result.config.fusion)
-        result.save(task.folder)
+    result, volume = task.so_far
+    if volume is not None:
+        result.mesh = finished(volume.extract_mesh(), result.config.fusion)
+    result.save(task.folder)
     found = coverage(task.folder)
     with TemporaryDirectory() as folder:
         file = Path(folder) / "map.png"

@@ -13,10 +13,11 @@ from scopemap.report.coverage_picture import OUTSIDE
 from scopemap.report.sheet import rgb_of
 from scopemap.result.result import Result
 
-_COMPARED = {"not compared": OUTSIDE, "as it was": "#2a9d8f", "changed": "#9b2226"}
+COMPARED = {"not compared": OUTSIDE, "as it was": "#2a9d8f", "changed": "#9b2226"}
+"""Colours of what `ExamComparison.compared` counts, in its order."""
 
 
 def change_painting(first: Path, found: ExamComparison) -> Painting:
     """Return the surface of the first of two examinations by where the second differs from it."""
-    colours = np.array([rgb_of(colour) for colour in _COMPARED.values()], np.uint8)
-    return Painting(painted(Result(first).mesh, colours[found.compared]), _COMPARED)
+    colours = np.array([rgb_of(colour) for colour in COMPARED.values()], np.uint8)
+    return Painting(painted(Result(first).mesh, colours[found.compared]), COMPARED)

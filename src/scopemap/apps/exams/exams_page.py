@@ -65,12 +65,9 @@ def write_comparison(found: ExamComparison, first: Path, second: Path, out: Path
         out.mkdir(parents=True, exist_ok=True)
         (out / TABLE).write_text(json.dumps(facts_of(found, unit), indent=2) + "\n", encoding="utf-8")
         found.second.export(out / "second.ply")
-        changes = [_both(runs, found, change, number) for number, change in enumerate(found.changes[:_MOST], 1)]
+        changes = [pictures_of(runs, found, change, number) for number, change in enumerate(found.changes[:_MOST], 1)]
         picture_grid(changes, _CELL_PX).save(out / CHANGES)
-        views = [
-            {f"first, frame {one}": _picture(runs[0], one), f"second, frame {other}": _picture(runs[1], other)}
-            for one, other in found.views
-        ]
+        views = [pictures_of_view(runs, view) for view in found.views]
         picture_grid(views, _CELL_PX).save(out / VIEWS)
     rows = "".join(_row(change, number, unit) for number, change in enumerate(found.changes, 1))
     head = f"<tr>{_HEADS.format(unit)}</tr>"
@@ -102,8 +99,16 @@ def _row(change: Change, number: int, unit: str) -> str:
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in (*cells, f"{change.sigmas:.0f}")) + "</tr>"
 
 
-def _both(runs: tuple[Result, Result], found: ExamComparison, change: Change, number: int) -> dict[str, np.ndarray]:
-    """Return the pictures of both that show a change, with a ring around it."""
+def pictures_of_view(runs: tuple[Result, Result], view: tuple[int, int]) -> dict[str, np.ndarray]:
+    """Return the small pictures of two frames of both, (h, w, 3) uint8, by what they are."""
+    one, other = view
+    return {f"first, frame {one}": _picture(runs[0], one), f"second, frame {other}": _picture(runs[1], other)}
+
+
+def pictures_of(
+    runs: tuple[Result, Result], found: ExamComparison, change: Change, number: int
+) -> dict[str, np.ndarray]:
+    """Return the small pictures of both that show a change, with a ring around it, by what they are."""
     places = change.place_mm, found.S_first_second.inverse().transform_points(change.place_mm)
     names = (f"{number}: {change.what}\nfirst, frame", "\nsecond, frame")
     return {

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,7 +20,6 @@ from scopemap.terminal.interruption import Interruption
 from scopemap.terminal.terminal_keys import terminal_keys
 
 if TYPE_CHECKING:
-    from scopemap.apps.coverage.live_map import LiveCoverage
     from scopemap.apps.live.live import LiveSession
     from scopemap.engine.odometry import Step
     from scopemap.runner.reconstructor import Reconstructor
@@ -42,9 +41,12 @@ def live(
     out: Annotated[
         Path | None, typer.Option(help="Folder for the result, written at the end; default: none is written.")
     ] = None,
-    serve: Annotated[
+    in_app: Annotated[
+        bool, typer.Option("--app", help="Show the session in a browser while it goes on, and its result (extra app).")
+    ] = False,
+    port: Annotated[
         int | None,
-        typer.Option(min=0, max=65535, metavar="PORT", help="Serve a page at http://localhost:PORT; 0: any free port."),
+        typer.Option(min=0, max=65535, metavar="PORT", help="Port of the page of --app; default: any free one."),
     ] = None,
     igtl: Annotated[
         int | None,
@@ -62,6 +64,7 @@ def live(
     size: options.Size = None,
     settings: options.SetPairs = None,
     overwrite: options.Overwrite = False,
+    watched: Annotated[bool, typer.Option("--watched", hidden=True)] = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -70,16 +73,19 @@ def live(
     Keys: p pauses, r discards everything and starts again, s writes a snapshot, q stops. Ctrl-C also stops and writes
     the result; a second Ctrl-C writes nothing.
     """
-    from scopemap.apps.coverage.live_map import KeptDepth, LiveCoverage
     from scopemap.engine.config import Config
 
+    if port is not None and not in_app:
+        raise typer.BadParameter("it is that of --app", param_hint="--port")
     chosen: dict[str, Any] = {"depth.near_far_mm": options.parse_near_far(near_far)} if near_far else {}
     chosen |= {"input.scope": scope} if scope else {}
     config = Config.load(
         "realtime", settings=chosen | {"input.focal": "assume"} | options.parse_settings(settings or [])
     )
 
+    from scopemap.apps.coverage.live_map import KeptDepth, LiveCoverage
     from scopemap.apps.live.live import LiveSession, finished
+    from scopemap.apps.live.shown import ShownSession
     from scopemap.input.live_source import LiveSource
     from scopemap.input.opening import sequence_of
     from scopemap.report.frame_pictures import FramePictures
@@ -87,47 +93,86 @@ def live(
     from scopemap.result.checksums import write_checksums
     from scopemap.result.result_folder import NOT_OF_THE_RESULT, result_folder
 
-    silent = quiet or as_json
-    pictures = FramePictures()
-    with ExitStack() as stack:
-        sender = stack.enter_context(_sender(igtl, silent=silent))
-        folder = stack.enter_context(result_folder(out, overwrite=overwrite))
-        reading = LiveSource(source)
-        working = options.parse_size(size) if size else None
-        sequence = sequence_of(reading, camera=camera, fov_deg=fov, size=working, settings=config.input)
-        interruption = stack.enter_context(Interruption(reading.stop))
+    silent, pictures, actions = quiet or as_json, FramePictures(), dict[str, Callable[[], None]]()
+    reading, working = LiveSource(source), options.parse_size(size) if size else None
+    sequence = sequence_of(reading, camera=camera, fov_deg=fov, size=working, settings=config.input)
+    with _seen_in(out, actions, port or 0, in_app=in_app, watched=watched) as view:
+        with ExitStack() as stack:
+            sender = stack.enter_context(_sender(igtl, silent=silent))
+            folder = stack.enter_context(result_folder(out, overwrite=overwrite))
+            interruption = stack.enter_context(Interruption(reading.stop))
 
-        def observe(step: Step, _: Reconstructor) -> None:
-            interruption.observe(step)
+            def observe(step: Step, _: Reconstructor) -> None:
+                interruption.observe(step)
+                if folder is not None:
+                    pictures(step)
+
+            kept = KeptDepth(Path(stack.enter_context(TemporaryDirectory())))
+            covered = stack.enter_context(LiveCoverage(kept))
+            shown = None if view is None else ShownSession(view, covered, writes=out is not None)
+            observers = observe, *sender, *([kept.observe] if folder or shown else [])
+            observers += (covered.observe, shown.observe) if shown else ()
+            snapshots = (folder or Path("scopemap-live")) / "snapshots"
+            session = LiveSession(reading, sequence, config, observers=observers, snapshots=snapshots)
+            actions |= {
+                "pause": session.pause,
+                "reset": session.reset,
+                "snapshot": session.snapshot,
+                "stop": session.stop,
+            }
+            if shown is not None:
+                stack.enter_context(shown.watch(session))
+            stack.enter_context(_controls(session, seconds, silent=silent))
+            reconstructor = session.run()
+            result = finished(reconstructor, reading)
+            covered.settle()
             if folder is not None:
-                pictures(step)
-
-        kept = KeptDepth(Path(stack.enter_context(TemporaryDirectory())))
-        covered = stack.enter_context(LiveCoverage(kept))
-        observers = observe, *sender, *([] if out is None and serve is None else [kept.observe])
-        observers += () if serve is None else (covered.observe,)
-        snapshots = (folder or Path("scopemap-live")) / "snapshots"
-        session = LiveSession(reading, sequence, config, observers=observers, snapshots=snapshots)
-        stack.enter_context(_controls(session, covered, serve, seconds, silent=silent))
-        reconstructor = session.run()
-        result = finished(reconstructor, reading)
-        covered.settle()
-        if folder is not None:
-            result.save(folder)
-            pictures.save(folder)
-            kept.move_to(folder)
-            write_checksums(folder, without=NOT_OF_THE_RESULT)
-            if serve is not None:
-                covered.finish(folder)
-    state = session.state()
-    if out is not None:
-        write_report(out)
-    if as_json:
-        print_json(result.provenance | {"live": state | {"path": len(state["path"])}})
-    elif not quiet:
-        _print(result.provenance, state, out)
+                result.save(folder)
+                pictures.save(folder)
+                kept.move_to(folder)
+                write_checksums(folder, without=NOT_OF_THE_RESULT)
+        state = session.state()
+        if out is not None:
+            write_report(out)
+        if as_json:
+            print_json(result.provenance | {"live": state})
+        elif not quiet:
+            _print(result.provenance, state, out)
     if interruption.exit_code:
         raise typer.Exit(interruption.exit_code)
+
+
+@contextmanager
+def _seen_in(
+    out: Path | None, actions: Mapping[str, Callable[[], None]], port: int, *, in_app: bool, watched: bool
+) -> Iterator[Path | None]:
+    """Context in which the session is seen in the yielded folder, and lines from there call actions; None: it is not.
+
+    in_app : in a window that this command opens. watched : in one that has started this command, and writes to it.
+    """
+    if watched and out is not None:
+        from scopemap.result.run_view import view_folder
+
+        threading.Thread(target=_listen, args=(actions,), name="lines", daemon=True).start()
+        yield view_folder(out)
+    elif in_app:
+        from scopemap.apps.browser.beside import window_beside
+
+        with TemporaryDirectory(prefix="scopemap-live-") as folder:
+            arguments = ("--live", "--port", str(port))
+            with window_beside(out, Path(folder), actions, arguments, partial(typer.echo, err=True)):
+                yield Path(folder)
+    else:
+        yield None
+
+
+def _listen(actions: Mapping[str, Callable[[], None]]) -> None:
+    """Call the actions whose names come by standard input, and stop where it ends: nobody watches any more."""
+    from scopemap.apps.browser.beside import lines_of_input
+
+    for line in lines_of_input():
+        actions.get(line.strip(), lambda: None)()
+    actions.get("stop", lambda: None)()
 
 
 @contextmanager
@@ -159,15 +204,11 @@ def _sender(port: int | None, *, silent: bool) -> Iterator[tuple[Callable[[Step,
 
 
 @contextmanager
-def _controls(
-    session: LiveSession, covered: LiveCoverage, port: int | None, seconds: float | None, *, silent: bool
-) -> Iterator[None]:
-    """Context in which a session is shown, served, controlled by keys, and ended after some seconds."""
+def _controls(session: LiveSession, seconds: float | None, *, silent: bool) -> Iterator[None]:
+    """Context in which a session is shown, controlled by keys, and ended after some seconds."""
     keys = {"p": session.pause, "r": session.reset, "s": session.snapshot, "q": session.stop}
     ended = threading.Event()
     with ExitStack() as stack:
-        if port is not None:
-            stack.callback(_served(session, covered, port, silent=silent))
         if seconds is not None:
             timer = threading.Timer(seconds, session.stop)
             timer.start()
@@ -181,27 +222,6 @@ def _controls(
             stack.callback(thread.join)
         stack.callback(ended.set)
         yield
-
-
-def _served(session: LiveSession, covered: LiveCoverage, port: int, *, silent: bool) -> Callable[[], None]:
-    """Serve the session's page, and return what ends that."""
-    from scopemap.report.serving import LocalServer, live_page
-
-    def state() -> dict[str, Any]:
-        shown = {"count": covered.count, "drawn": bool(covered.shown.png), "words": covered.shown.words}
-        return session.state() | {"coverage": shown}
-
-    pages = {
-        "/": live_page,
-        "/state": lambda: ("application/json", json.dumps(state()).encode()),
-        "/coverage.png": lambda: ("image/png", png) if (png := covered.shown.png) else None,
-        "/picture.jpg": lambda: ("image/jpeg", jpeg) if (jpeg := session.picture()) else None,
-    }
-    actions = {"/pause": session.pause, "/reset": session.reset, "/snapshot": session.snapshot}
-    server = LocalServer(pages, actions, port)
-    if not silent:
-        typer.echo(f"look at {server.url} in a browser of this machine", err=True)
-    return server.close
 
 
 def _show(session: LiveSession, ended: threading.Event) -> None:

@@ -28,7 +28,6 @@ from scopemap.runner.run import Progress
 LIMITS = Limits(frames=50_000, maps=8, blocks=80_000)
 """Of a session: about 60 MB of rows and 1 GB of surfaces."""
 _REMEMBERED = 300  # latencies
-_MOST_POSITIONS = 500
 _AHEAD = 1
 _LOST = "lost: move back slowly"
 
@@ -96,12 +95,10 @@ class LiveSession:
         state : "starting", "tracking", "lost", "paused" or "ended"; words : the same for people, reason : why it is
         lost. frame, frames_per_s, latency_ms, latency_p50_ms, latency_p95_ms : of the last 300 frames, from a frame's
         time to its pose. read, dropped : frames of the source. tracked, lost : frames since the last reset. map :
-        number of the map. path : up to 500 positions of the camera in this map, mm, (x, y, z). scale_known. snapshot :
-        the last one's file. full : whether the surface takes no more.
+        number of the map. scale_known. snapshot : the last one's file. full : whether the surface takes no more.
         """
         with self._lock:
             latencies, times_s, step = list(self._latencies_ms), list(self._times_s), self._step
-            path = list(self._path)
         span_s = times_s[-1] - times_s[0] if len(times_s) > 1 else 0.0
         median, slowest = np.percentile(latencies, [50, 95]) if latencies else (0.0, 0.0)
         state = self._state_word()
@@ -120,19 +117,10 @@ class LiveSession:
             "tracked": self._tracked,
             "lost": self._lost,
             "map": 0 if step is None else step.track.map,
-            "path": [[round(float(value), 2) for value in position] for position in path],
             "scale_known": self._scale_known,
             "snapshot": self._last_snapshot,
             "full": self._full,
         }
-
-    def picture(self) -> bytes:
-        """Return the last frame's picture as JPEG, b"" before the first."""
-        with self._lock:
-            step = self._step
-        if step is None:
-            return b""
-        return cv2.imencode(".jpg", step.frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
 
     def _state_word(self) -> str:
         step = self._step
@@ -147,8 +135,6 @@ class LiveSession:
     def _forget(self) -> None:
         self._latencies_ms: deque[float] = deque(maxlen=_REMEMBERED)
         self._times_s: deque[float] = deque(maxlen=_REMEMBERED)
-        self._path: list[np.ndarray] = []
-        self._path_every = 1
         self._step: Step | None = None
         self._tracked = self._lost = 0
         self._scale_known = self._full = False
@@ -160,16 +146,10 @@ class LiveSession:
     def _take(self, step: Step, reconstructor: Reconstructor) -> None:
         now_s = self._source.now_s()
         with self._lock:
-            if self._step is not None and self._step.track.map != step.track.map:
-                self._path, self._path_every = [], 1  # another world
             self._step, is_lost = step, step.track.status == "lost"
             self._tracked, self._lost = self._tracked + (not is_lost), self._lost + is_lost
             self._latencies_ms.append(1000 * (now_s - step.frame.time_s))
             self._times_s.append(now_s)
-            if step.frame.T_world_camera is not None and self._tracked % self._path_every == 0:
-                self._path.append(step.frame.T_world_camera[:3, 3])
-                if len(self._path) > _MOST_POSITIONS:
-                    self._path, self._path_every = self._path[::2], 2 * self._path_every
             self._scale_known, self._full = reconstructor.scale_known, reconstructor.surface_is_full
         if self._wants_snapshot:
             self._wants_snapshot = False

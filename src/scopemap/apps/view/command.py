@@ -1,9 +1,7 @@
-"""`scopemap view`: a run's page with its full surface, in the browser of this machine."""
+"""`scopemap view`: a result in a window of the browser, alone or beside another one; or films of it."""
 
 from __future__ import annotations
 
-import time
-import webbrowser
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,14 +18,15 @@ def view(
     turntable: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Write a film of the turning surface (.mp4, .mkv, .webm) instead of opening the page."
+            metavar="FILE",
+            help="Write a film of the turning surface (.mp4, .mkv, .webm) instead of opening the window.",
         ),
     ] = None,
     video: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write a film of the video beside the surface (.mp4, .mkv, .webm) instead of opening the page.",
+            help="Write a film of the video beside the surface (.mp4, .mkv, .webm) instead of opening the window.",
         ),
     ] = None,
     colours: Annotated[
@@ -36,17 +35,27 @@ def view(
     ] = None,
     source: InputNow = None,
     overwrite: Overwrite = False,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OTHER",
+            help="Compare with another result, of the same video or of another examination of the same place.",
+        ),
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
-    """Show a run's page with its full surface in a browser.
+    """Show a result in a browser window: its surface, its frames, measurements (extra app).
 
-    The page is served at localhost until Ctrl-C. It writes only measurements.json, when you measure and save.
+    The window is at localhost until Ctrl-C. Films need neither the window nor the extra.
     """
     if colours is not None and video is None:
         raise typer.BadParameter("they are those of --video", param_hint="--colours")
     for film in filter(None, (turntable, video)):
         check_output(film, (".mp4", ".mkv", ".webm"), overwrite)
-    warn_of_damage(run)
+    if compare is not None and (turntable is not None or video is not None):
+        raise typer.BadParameter("it is of the window, not of films", param_hint="--compare")
+    for folder in filter(None, (run, compare)):
+        warn_of_damage(folder)
     if turntable is not None or video is not None:
         from scopemap.apps.view.fly_through import write_fly_through
         from scopemap.apps.view.paintings import confidence_painting, coverage_painting
@@ -60,16 +69,14 @@ def view(
         for film in filter(None, (turntable, video)):
             typer.echo(f"{film}: {film.stat().st_size / 1e6:.1f} MB")
         return
-    from scopemap.report.page import serve_view
+    from scopemap.apps.browser.command import serve
+    from scopemap.apps.browser.compare_page import ComparePage
+    from scopemap.apps.browser.result_page import ResultPage
+    from scopemap.apps.browser.serving import check_installed
+    from scopemap.apps.browser.window import Window
 
-    server = serve_view(run, port)
-    typer.echo(f"{run}: {server.url} until Ctrl-C")
-    if browser:
-        webbrowser.open(server.url)
-    try:
-        while True:
-            time.sleep(3600)
-    except KeyboardInterrupt:
-        typer.echo("ended", err=True)
-    finally:
-        server.close()
+    check_installed()
+    page = ResultPage(run) if compare is None else ComparePage(run, compare)
+    window = Window(port)
+    window.show(page)
+    serve(window, browser=browser, quiet=False)

@@ -157,20 +157,14 @@ function writeMeasures() {
   setRow(row);
 }
 
-async function saveMeasures() {
-  const text = JSON.stringify(hand.list, null, 1);
-  if (data.served) {
-    const answer = await fetch("measurements.json", { method: "POST", body: text }).catch(() => ({ ok: false }));
-    return tell(answer.ok ? "Saved as measurements.json beside the result." : "measurements.json could not be written: has scopemap view ended?");
-  }
-  const link = document.createElement("a");
+function saveMeasures() {
+  const text = JSON.stringify(hand.list, null, 1), link = document.createElement("a");
   Object.assign(link, { href: URL.createObjectURL(new Blob([text], { type: "application/json" })), download: "measurements.json" });
   link.click();
   tell("Put measurements.json beside report.html: then `scopemap report` and `view` show it again.");
 }
 
-async function openMeasures() {
-  if (data.served) run.measurements = await fetch("measurements.json").then((answer) => answer.json()).catch(() => []);
+function openMeasures() {
   Object.assign(hand, { mode: "", picks: [], reference: null, list: run.measurements || [] });
   element("by-hand").hidden = !run.measuring || !run.pictures.length;
   writeMeasures();
@@ -191,7 +185,6 @@ function listenToHand() {
   element("scene").addEventListener("click", (event) => hand.mode && down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 4 && pickOnSurface(event));
   element("close-area").addEventListener("click", finishPicks);
   element("save-json").addEventListener("click", saveMeasures);
-  put("save-json", data.served ? "Save beside the result" : "Download JSON");
   element("copy-csv").addEventListener("click", () => (element("csv").select(), document.execCommand("copy"), tell("Copied.")));
   document.addEventListener("keydown", (event) => {
     if (!hand.mode || event.target.matches("input:not([type=range]), textarea, select, button")) return;

@@ -242,7 +242,7 @@ function open(number) {
   writeCoverage();
   element("truth-key").hidden = !run.truth;
   writeScales();
-  if (data.runs.length === 1 && !data.served) document.querySelectorAll("a[data-file]").forEach((link) => (link.href = link.textContent));
+  if (data.runs.length === 1) document.querySelectorAll("a[data-file]").forEach((link) => (link.href = link.textContent));
   else element("beside").hidden = true;
   element("curves").replaceChildren();
   curves = curvesOf(run).map((curve) => new Curve(element("curves"), run, curve, setRow));

@@ -1,0 +1,102 @@
+"""What changed between two examinations: a list that flies to each change, with the frames of both that show it."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+
+from scopemap.apps.browser.legends import words_html
+from scopemap.apps.browser.scene import draw_path, look_from
+from scopemap.apps.browser.surface_pair import SurfacePair
+from scopemap.apps.browser.window import escaped
+from scopemap.apps.exams.change_painting import COMPARED
+from scopemap.apps.exams.compare_exams import Change, ExamComparison
+from scopemap.apps.exams.exams_page import pictures_of, pictures_of_view, summary
+from scopemap.engine.geometry.rendering import vertex_colours
+from scopemap.report.sheet import rgb_of
+from scopemap.result.result import Result
+
+if TYPE_CHECKING:
+    from scopemap.apps.browser.window import Window
+
+_MOST = 12
+_MARK_SHARE = 0.02
+_MARK = (255, 208, 0)
+_CHANGED, _PICTURE = "what changed", "picture"
+_COMPARED = "compared"
+"""Attribute of a vertex, as in `ExamComparison`."""
+
+_NO_FRAME = "Choose a change, or a place that both examinations show."
+
+
+class ShownChanges:
+    """The part of the page that shows two examinations."""
+
+    def __init__(
+        self, window: Window, found: ExamComparison, runs: tuple[Result, Result], folders: tuple[Path, Path]
+    ) -> None:
+        self._window, self._found, self._runs, self._folders = window, found, runs, folders
+        self._poses = runs[0].frames["T_world_camera"][runs[0].frames.tracked]
+
+    def open(self) -> None:
+        """Make the elements."""
+        window, gui, found, first = self._window, self._window.gui, self._found, self._runs[0]
+        gui.add_markdown("\n".join(f"- {escaped(line)}" for line in summary(found, first.scale)))
+        mesh = trimesh.Trimesh(
+            first.mesh.vertices, first.mesh.faces, vertex_colors=vertex_colours(first.mesh), process=False
+        )
+        mesh.vertex_attributes[_COMPARED] = found.compared.astype(float)
+        self._pair = SurfacePair(window, (mesh, found.second), self._poses[0])
+        draw_path(window.scene, f"{self._pair.nodes[0]}/path", self._poses[:, :3, 3])
+        unit = "mm" if first.scale_known else "units"
+        for number, change in enumerate(found.changes[:_MOST], 1):
+            label = f"{number}: {change.what}, {change.area_mm2:.1f} {unit}²"
+            window.on(gui.add_button(label), self._fly, number, change)
+        if found.views:
+            names = [f"frames {one} and {other}" for one, other in found.views]
+            window.on(gui.add_dropdown("The same place", names), self._show_view, names)
+        self._words = gui.add_markdown(_NO_FRAME)
+        self._pictures = [gui.add_image(np.zeros((8, 10, 3), np.uint8), visible=False) for _ in range(2)]
+        window.on(gui.add_dropdown("Colours", (_CHANGED, _PICTURE)), self._colour)
+        self._legend = gui.add_html("")
+        window.on(gui.add_checkbox("One over the other", initial_value=False), self._pair.place)
+        if not window.anonymous:
+            command = shlex.join(["scopemap", "compare-exams", *map(str, self._folders), "--out", "comparison"])
+            gui.add_markdown(f"The same as a page:\n```\n{command}\n```")
+        self._colour(_CHANGED)
+
+    def _colour(self, chosen: str) -> None:
+        colours = [np.asarray(vertex_colours(surface)[:, :3]) for surface in self._pair.shown]
+        if chosen == _CHANGED:
+            table = np.array([rgb_of(colour) for colour in COMPARED.values()], np.uint8)
+            compared: Any = self._pair.shown[0].vertex_attributes[_COMPARED]
+            colours[0] = table[np.round(compared).astype(int)]
+        self._pair.draw(colours)
+        self._legend.content = words_html(COMPARED) if chosen == _CHANGED else ""
+
+    def _fly(self, number: int, change: Change) -> None:
+        """Look at a change from where the first camera saw it best, and show the frames of both."""
+        place, index = change.place_mm, self._runs[0].frames["index"][self._runs[0].frames.tracked]
+        row = np.flatnonzero(index == change.frames[0])
+        nearest = np.linalg.norm(self._poses[:, :3, 3] - place, axis=1).argmin()
+        pose = self._poses[row[0] if len(row) else nearest]
+        radius = _MARK_SHARE * float(np.linalg.norm(pose[:3, 3] - place))
+        scene, (node, _) = self._window.scene, self._pair.nodes
+        scene.add_icosphere(f"{node}/change", radius, _MARK, position=tuple(place), cast_shadow=False)
+        look_from(self._window, pose[:3, 3], place, -pose[:3, 1])
+        nearer = f"{abs(change.rise_mm):.2f} {'mm' if self._runs[0].scale_known else 'units'}"
+        nearer += f" {'nearer to' if change.rise_mm > 0 else 'farther from'} the camera in the second"
+        words = f"**{number}: {change.what}**, {nearer}; {change.sigmas:.0f} sigmas, in {change.views} views"
+        self._show(words, pictures_of(self._runs, self._found, change, number))
+
+    def _show_view(self, chosen: str, names: list[str]) -> None:
+        self._show(f"**{chosen}**", pictures_of_view(self._runs, self._found.views[names.index(chosen)]))
+
+    def _show(self, words: str, pictures: dict[str, np.ndarray]) -> None:
+        self._words.content = words
+        for handle, (name, picture) in zip(self._pictures, pictures.items(), strict=True):
+            handle.image, handle.label, handle.visible = picture, ", ".join(name.split("\n")).removeprefix(", "), True
