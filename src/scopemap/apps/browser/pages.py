@@ -1,4 +1,4 @@
-"""The pages that a page leads to: they lead to each other, so that modules which import each other would be a circle."""
+"""The pages that a page leads to. They lead to each other: modules that import each other would be a circle."""
 
 from __future__ import annotations
 
