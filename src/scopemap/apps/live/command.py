@@ -126,13 +126,12 @@ def live(
                 pictures.save(folder)
                 kept.move_to(folder)
                 write_checksums(folder, without=NOT_OF_THE_RESULT)
-        state = session.state()
         if out is not None:
             write_report(out)
         if not silent:
-            _print(result.provenance, state, out)
+            _print(result.provenance, session.state(), out)
         elif as_json:
-            print_json(result.provenance | {"live": state})
+            print_json(result.provenance | {"live": session.state()})
     if interruption.exit_code:
         raise typer.Exit(interruption.exit_code)
 
