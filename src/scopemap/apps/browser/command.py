@@ -37,9 +37,11 @@ def app(
         float, typer.Option(min=0.001, metavar="GB", help="Largest video that the page takes, GB.")
     ] = 4.0,
     quiet: Quiet = False,
-    watch: Annotated[Path | None, typer.Option("--watch", hidden=True)] = None,
-    result: Annotated[Path | None, typer.Option("--result", hidden=True)] = None,
-    live: Annotated[bool, typer.Option("--live", hidden=True)] = False,
+    watch: Annotated[
+        Path | None, typer.Option("--watch", hidden=True, help="Show what a command writes there.")
+    ] = None,
+    result: Annotated[Path | None, typer.Option("--result", hidden=True, help="Show this result afterwards.")] = None,
+    live: Annotated[bool, typer.Option("--live", hidden=True, help="Show the buttons of a stream.")] = False,
 ) -> None:
     """Reconstruct, look and measure in a browser window.
 

@@ -65,7 +65,7 @@ def live(
     size: options.Size = None,
     settings: options.SetPairs = None,
     overwrite: options.Overwrite = False,
-    watched: Annotated[bool, typer.Option("--watched", hidden=True)] = False,
+    watched: Annotated[bool, typer.Option("--watched", hidden=True, help="Write what the window shows.")] = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:

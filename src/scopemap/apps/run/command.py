@@ -125,7 +125,7 @@ def run(
     in_app: Annotated[
         bool, typer.Option("--app", help="Show the run in a browser while it goes on, and its result (extra app).")
     ] = False,
-    watched: Annotated[bool, typer.Option("--watched", hidden=True)] = False,
+    watched: Annotated[bool, typer.Option("--watched", hidden=True, help="Write what the window shows.")] = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
