@@ -13,7 +13,6 @@ import trimesh
 from tiny_phantom import FRAMES, only_images, write_tiny
 
 from scopemap import open_sequence, reconstruct
-from scopemap.apps.run.command import summary_lines
 from scopemap.engine.config import Config
 from scopemap.engine.frame import Frame
 from scopemap.engine.notices import scale_words
@@ -21,6 +20,7 @@ from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import MASKED_GREY, DepthPreviews
 from scopemap.result.depth_maps import DepthReader, DepthWriter
 from scopemap.result.result import Result
+from scopemap.result.summary import summary_lines
 
 UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
 

@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 
 from scopemap import open_sequence, reconstruct
 from scopemap.apps.evaluate.against_video import RunFrames
-from scopemap.apps.run.command import summary_lines
 from scopemap.cli.app import app
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.depth.perceptual import StructureDistance
@@ -33,6 +32,7 @@ from scopemap.engine.fusion.agreement import (
     vertex_sigmas,
 )
 from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.result.summary import summary_lines
 from scopemap.terminal.figures import show
 from scopemap_bench.evaluation.surface import distances_mm
 

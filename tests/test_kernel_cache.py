@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from numba import njit
 
-from scopemap.apps.run.command import compiling_words
+from scopemap.result.summary import compiling_words
 from scopemap.runner.run import compiling_s
 
 _READ_ONLY = """

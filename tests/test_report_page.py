@@ -15,13 +15,13 @@ import pytest
 import trimesh
 from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, changed, draw_run, drawn_result, pose_of, tube
 
-from scopemap.apps.run.command import time_words
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.notebook import in_one_line
 from scopemap.report.page import page_html, write_comparison, write_report
 from scopemap.report.page_data import page_data, shown_meshes
 from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
 from scopemap.result.result import Result
+from scopemap.result.summary import time_words
 from scopemap.result.verdict import frames_per_s
 
 

@@ -52,8 +52,8 @@ _GROUPS = {
 """Commands in the groups of --help, those of scopemap-bench among them; others stand in a group of their own."""
 _MEASURES = [one for _, added in plugins("scopemap.measures") for one in added]
 _OWN = (
-    window_app, run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure, coverage,
-    locate, compare_exams, verify, calibrate, models.app,
+    window_app, run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure,
+    coverage, locate, compare_exams, verify, calibrate, models.app,
 )  # fmt: skip
 
 

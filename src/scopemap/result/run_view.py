@@ -87,8 +87,8 @@ def write_coverage(folder: Path, drawn: bytes) -> None:
 
 def write_map(folder: Path, seen: SeenMap) -> None:
     """Write the current submap; raises `OSError`."""
-    held, arrays = io.BytesIO(), dict[str, Any](vars(seen))
-    np.savez(held, **arrays)
+    held = io.BytesIO()
+    np.savez(held, allow_pickle=False, **{name: np.asarray(value) for name, value in vars(seen).items()})
     _replace(folder / _MAP, held.getvalue())
 
 

@@ -38,12 +38,10 @@ def window_beside(
     command = [sys.executable, "-m", "scopemap", "app", "--watch", str(view), *arguments]
     command += [] if out is None else ["--result", str(out)]
     # Ctrl-C is the command's.
-    window = subprocess.Popen(  # noqa: S603
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
-    assert window.stdin is not None
-    assert window.stdout is not None
-    lines = window.stdout
+    window = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    to_window, lines = window.stdin, window.stdout
+    assert to_window is not None
+    assert lines is not None
 
     def listen() -> None:
         for line in lines:
@@ -57,8 +55,8 @@ def window_beside(
 
     def tell(line: str) -> None:
         with suppress(OSError):  # the window was closed
-            window.stdin.write(f"{line}\n")  # type: ignore[union-attr]
-            window.stdin.flush()  # type: ignore[union-attr]
+            to_window.write(f"{line}\n")
+            to_window.flush()
 
     try:
         yield

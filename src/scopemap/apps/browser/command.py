@@ -38,10 +38,12 @@ def app(
     ] = 4.0,
     quiet: Quiet = False,
     watch: Annotated[
-        Path | None, typer.Option("--watch", hidden=True, help="Show what a command writes there.")
+        Path | None, typer.Option("--watch", hidden=True, help="Show the run that writes to this folder.")
     ] = None,
-    result: Annotated[Path | None, typer.Option("--result", hidden=True, help="Show this result afterwards.")] = None,
-    live: Annotated[bool, typer.Option("--live", hidden=True, help="Show the buttons of a stream.")] = False,
+    result: Annotated[
+        Path | None, typer.Option("--result", hidden=True, help="Folder of the result of --watch.")
+    ] = None,
+    live: Annotated[bool, typer.Option("--live", hidden=True, help="Show that run as a live stream.")] = False,
 ) -> None:
     """Reconstruct, look and measure in a browser window.
 

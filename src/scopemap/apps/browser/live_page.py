@@ -35,7 +35,7 @@ class LiveRun:
         command = [sys.executable, "-m", "scopemap", "live", "--watched", "--out", str(out), "--", source]
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("wb") as printed:
-            self._process = subprocess.Popen(  # noqa: S603
+            self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.PIPE,
                 stdout=printed,

@@ -1,31 +1,130 @@
-"""The page of a result."""
+"""The page of a result: whether it can be trusted, its surface, its frames, sizes, what was not seen, and its files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scopemap.apps.browser.workspace import Workspace
+import numpy as np
+
+from scopemap.apps.browser.files_part import FilesPart
+from scopemap.apps.browser.frame_part import FramePart
+from scopemap.apps.browser.measure_part import MeasurePart
+from scopemap.apps.browser.next_steps import NextRun, arguments_again
+from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.run_page import RunPage
+from scopemap.apps.browser.surface_part import SurfacePart
+from scopemap.apps.browser.unseen_part import UnseenPart
+from scopemap.apps.browser.verdict_part import VerdictPart, headline
 from scopemap.result.result import Result
-from scopemap.result.verdict import verdict
+from scopemap.result.run_input import find_input
+from scopemap.result.run_view import view_folder
 
 if TYPE_CHECKING:
+    from viser import SceneClickEvent
+
     from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.workspace import Workspace
 
 
 class ResultPage:
-    """A result; workspace : where runs are started from here, None: nowhere."""
+    """A finished result; workspace : where runs are started from here, None: nowhere."""
 
     def __init__(self, folder: Path, workspace: Workspace | None = None) -> None:
         self._run, self._workspace = Result(folder).checked(), workspace
+        self._frames: FramePart | None = None
 
     def open(self, window: Window) -> None:
         """Make the elements."""
-        found = verdict(self._run)
-        window.gui.add_markdown(f"### {found.word.capitalize()}\n\n{found.advice}")
+        self._window, gui = window, window.gui
+        self._view = view = ResultView(window, self._run, self._workspace)
+        gui.add_markdown(headline(view))
+        view.add_note()
+        list_place = gui.add_folder(None)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Verdict"):
+            VerdictPart(view, self._run_again)
+            self._add_ways_on()
+        with tabs.add_tab("Surface"):
+            SurfacePart(view)
+            gui.add_divider()
+            UnseenPart(view)
+        with tabs.add_tab("Frames"):
+            self._frames = frames = FramePart(view)
+        with list_place:
+            frames.add_list()
+        with tabs.add_tab("Measure"):
+            self._measure = MeasurePart(view)
+        with tabs.add_tab("Files"):
+            FilesPart(view)
+        window.scene.on_click()(self._clicked)
+        view.show_row(view.row)
+        view.look_at_all()
 
     def tick(self) -> None:
         """Nothing changes by itself."""
 
     def close(self) -> None:
-        """Nothing was begun."""
+        """End what plays, and what takes clicks."""
+        self._window.scene.remove_click_callback(self._clicked)
+        if self._frames is not None:
+            self._frames.close()
+
+    def _clicked(self, event: SceneClickEvent) -> None:
+        """Take a click in the scene; called by a thread of the server."""
+        self._window.do(self.click, np.array(event.ray_origin), np.array(event.ray_direction))
+
+    def click(self, origin: np.ndarray, direction: np.ndarray) -> None:
+        """Take a click by its ray, (3,) each, in the world of the submap that is shown, mm."""
+        pick, frames = self._view.surface.pick(origin, direction, self._view.state), self._frames
+        assert frames is not None
+        if pick is None:
+            self._view.note("There is no surface there.")
+        elif self._measure.mode == "Look":
+            frames.list_that_saw(pick)
+        else:
+            frames.hide_list()
+            self._measure.add(pick)
+
+    def _add_ways_on(self) -> None:
+        """Make the buttons that lead to other pages."""
+        workspace, gui, window = self._workspace, self._window.gui, self._window
+        if workspace is None:
+            return
+        here = self._run.folder.resolve()
+        others = {path.name: path for path in workspace.finished if path.resolve() != here}
+        if others:
+            names = list(others)
+            shown = [f"result {n}" for n in range(1, len(names) + 1)] if window.anonymous else names
+            chosen = gui.add_dropdown("Other result", shown)
+            button = gui.add_button("Compare with it")
+            window.on(button, lambda: self._compare(others[names[shown.index(chosen.value)]]))
+        window.on(gui.add_button("Back to the start"), self._start)
+
+    def _compare(self, other: Path) -> None:
+        from scopemap.apps.browser.compare_page import ComparePage
+
+        self._window.show(ComparePage(self._run.folder, other, self._workspace))
+
+    def _start(self) -> None:
+        from scopemap.apps.browser.start_page import StartPage
+
+        assert self._workspace is not None
+        self._window.show(StartPage(self._workspace))
+
+    def _run_again(self, again: NextRun, value: str) -> None:
+        """Start this run with one more option, and show it."""
+        workspace, window = self._workspace, self._window
+        assert workspace is not None
+        source = find_input(self._run.folder)
+        arguments = [*arguments_again(self._run, again.option), *again.arguments(value)]
+        run = workspace.reconstruct(source, arguments)
+        page = RunPage(
+            run,
+            view_folder(run.out),
+            again.label(value) if window.anonymous else f"{source.name}, {again.label(value).lower()}",
+            lambda: window.show(ResultPage(run.out, workspace)),
+            lambda: window.show(ResultPage(self._run.folder, workspace)),
+            lambda: workspace.runs.place(run),
+        )
+        window.show(page)

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, look_at, quaternion
-from scopemap.apps.browser.window import escaped
+from scopemap.apps.browser.window import escaped, fenced
 from scopemap.result.run_view import RunProgressState, SeenMap, read_coverage, read_map, read_pictures, read_state
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ _MOST_FRUSTA = 60
 _FRUSTUM_SHARE = 0.05
 _POINT_SHARE = 0.006
 _LOST = (200, 40, 40)
+_MOST_LOG = 4000
 
 
 class WatchedRun(Protocol):
@@ -72,8 +73,8 @@ class RunPage:
         """Make the elements."""
         gui = window.gui
         self._window = window
-        gui.add_markdown(f"### {escaped(self._title)}")
-        self._words = gui.add_markdown("starting")
+        gui.add_markdown(f"### {escaped(window.names.hidden(self._title))}")
+        self._words, self._size = gui.add_markdown("starting"), ""
         self._bar = gui.add_progress_bar(0, animated=True)
         self._facts = gui.add_markdown("", visible=False)
         self._live = [window.on(gui.add_button(name), call) for name, call in self._buttons.items()]
@@ -85,9 +86,8 @@ class RunPage:
         self._picture.visible = self._depth.visible = self._coverage.visible = False
         with gui.add_folder("Log", expand_by_default=False):
             self._log = gui.add_markdown("")
-        self._back_button = None
         if self._back is not None:
-            self._back_button = window.on(gui.add_button("Back", visible=False), self._back)
+            window.on(gui.add_button("Back to the start", hint="The run goes on.", color="gray"), self._back)
         self.tick()
 
     def close(self) -> None:
@@ -98,10 +98,10 @@ class RunPage:
         if self._ended:
             return
         self._run.poll()
-        self._log.content = f"```\n{self._run.printed[-4000:]}\n```"
+        self._log.content = fenced(self._window.names.hidden(self._run.printed[-_MOST_LOG:]))
         status = self._run.status
         if status == "waiting":
-            self._words.content = f"waiting: {self._waiting()} run(s) come first"
+            self._words.content = f"It waits in the queue: runs before it: {self._waiting()}"
         elif status == "running":
             self._show_state()
         else:
@@ -122,20 +122,19 @@ class RunPage:
             self._finished()
             return
         if status == "failed":
-            self._window.fail(self._run.sentence, self._run.printed[-4000:])
+            self._window.fail(self._run.sentence, self._run.printed[-_MOST_LOG:])
             self._words.content = "**The run has failed.**"
         else:
             self._words.content = "**Stopped.** Nothing was written."
-        if self._back_button is not None:
-            self._back_button.visible = True
 
     def _show_state(self) -> None:
         state = read_state(self._folder)
         if state is None:
             lines = [line for line in self._run.printed.splitlines() if line.strip()]
-            self._words.content = escaped(lines[-1]) if lines and self._first < 0 else "preparing"
+            last = self._window.names.hidden(lines[-1]) if lines and self._first < 0 else "preparing"
+            self._words.content = escaped(last)
             return
-        self._words.content = words_of(state)
+        self._words.content = words_of(state) + self._size
         self._bar.value, self._bar.visible = share_of(state), not self._live
         if state.written == self._written:
             return
@@ -154,6 +153,7 @@ class RunPage:
         scene = self._window.scene
         if not len(seen.index):
             return
+        self._size = f"\n\nThe surface so far: {len(seen.points):,} points from {len(seen.index):,} frames."
         positions = seen.T_world_camera[:, :3, 3]
         everything = np.concatenate([positions, seen.points]) if len(seen.points) else positions
         size = float(np.linalg.norm(np.ptp(np.percentile(everything, [5, 95], axis=0), axis=0))) or 1.0

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -21,7 +22,7 @@ _STOPPED = (130, 143)
 """Exit codes of a run that was stopped, and wrote what it had."""
 
 
-@dataclass
+@dataclass(eq=False)
 class BrowserRun:
     """A run of `scopemap run INPUT --out OUT` with further arguments.
 
@@ -85,22 +86,24 @@ class BrowserRun:
                 self.status = "stopped" if self.stopping else "failed"
 
     def stop(self) -> None:
-        """Ask it to end after its frame and write what it has; a second time: end at once."""
+        """Ask it to end after its frame and write what it has; asked again it only goes on with that."""
         if self._process is not None and self._process.poll() is None:
-            self._process.send_signal(signal.SIGINT)
+            if not self.stopping:  # a second signal would end it with nothing written
+                self._process.send_signal(signal.SIGINT)
             self.stopping = True
         elif self.status == "waiting":
             self.status = "stopped"
 
     def kill(self) -> None:
-        """End it at once; the same run goes on from its last checkpoint."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-            try:
+        """End it at once; the same run goes on from its last checkpoint. One that is stopping may write what it has."""
+        if self._process is None or self._process.poll() is not None:
+            return
+        if self.stopping:
+            with suppress(subprocess.TimeoutExpired):
                 self._process.wait(_PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
+        # No gentler signal: it would write a result of the frames so far, which nothing can go on from.
+        self._process.kill()
+        self._process.wait()
 
 
 class RunQueue:
@@ -127,7 +130,8 @@ class RunQueue:
 
     def place(self, run: BrowserRun) -> int:
         """Return how many runs come before one that waits."""
-        return list(self._waiting).index(run) + 1 if run in self._waiting else 0
+        waiting = [other for other in self._waiting if other.status == "waiting"]
+        return waiting.index(run) + (self.running is not None) if run in waiting else 0
 
     def tick(self) -> None:
         """Look at the one that is running, and start the next."""

@@ -16,6 +16,7 @@ from scopemap.engine.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 _OWN_NAMES = {LOOPBACK, "localhost", "[::1]", "::1"}
+_ALL = ("0.0.0.0", "::")  # noqa: S104
 _TITLE = "scopemap"
 # What the page may load: itself, what it makes in memory, and its own connection.
 _POLICY = (
@@ -55,8 +56,16 @@ def start_server(port: int = 0, host: str = LOOPBACK) -> Any:
     # It prints a banner.
     with _guarded(only_own=host in _OWN_NAMES), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host, port, verbose=False)
-    server._websock_server.unregister_handler(_messages.ShareUrlRequest)
+    # viser keeps all of a file that is sent in memory, however large: `uploads.py` takes files instead.
+    for refused in (_messages.ShareUrlRequest, _messages.FileTransferStartUpload, _messages.FileTransferPart):
+        server._websock_server.unregister_handler(refused)
     return server
+
+
+def url_of(host: str, port: int) -> str:
+    """Return where a browser of this machine finds what is served at a host's port."""
+    name = "localhost" if host in (LOOPBACK, *_ALL) else host
+    return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
 
 
 def stop_server(server: Any) -> None:
@@ -68,7 +77,7 @@ def stop_server(server: Any) -> None:
 def _refuse_taken(host: str, port: int) -> None:
     """Raise `InputError` where nothing can be served there: viser would take the next port."""
     try:
-        with socket.socket() as tried:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as tried:
             tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             tried.bind((host, port))
     except (OSError, OverflowError) as error:
@@ -96,11 +105,7 @@ def _checked(answer: Callable[..., Any], *, only_own: bool) -> Callable[..., Any
     """Return what answers a request as `answer` does, where it may be answered."""
 
     def checked(connection: Any, request: Any) -> Any:
-        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        is_own = (not only_own or (urlsplit(f"//{host}").hostname or "") in _OWN_NAMES) and (
-            origin is None or urlsplit(origin).netloc == host
-        )
-        if not is_own:
+        if not _is_own(request.headers.get_all("Host"), request.headers.get_all("Origin"), only_own=only_own):
             return connection.respond(http.HTTPStatus.FORBIDDEN, "only for pages of this machine\n")
         # Compressed it could not be given a title.
         if "Accept-Encoding" in request.headers:
@@ -116,3 +121,14 @@ def _checked(answer: Callable[..., Any], *, only_own: bool) -> Callable[..., Any
         return response
 
     return checked
+
+
+def _is_own(hosts: list[str], origins: list[str], *, only_own: bool) -> bool:
+    """Return whether a request that names these hosts and origins is one of this machine's own page."""
+    if len(hosts) != 1 or len(origins) > 1:
+        return False
+    try:
+        named = urlsplit(f"//{hosts[0]}").hostname or ""
+        return (not only_own or named in _OWN_NAMES) and all(urlsplit(one).netloc == hosts[0] for one in origins)
+    except ValueError:  # brackets that do not close
+        return False

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import queue
+import re
 import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, Protocol
 
-from scopemap.apps.browser.serving import LOOPBACK, start_server, stop_server
+from scopemap.apps.browser.names import Names
+from scopemap.apps.browser.serving import LOOPBACK, start_server, stop_server, url_of
 from scopemap.engine.errors import ScopemapError
 
 _TICK_S = 0.5
 _PANEL_PX = 400
+_LAST = 1e9
+"""Order of what stands below all pages."""
 
 
 class Page(Protocol):
@@ -33,13 +38,14 @@ class Window:
     """The panel and the scene of viser's server, shared by all browsers that look.
 
     gui, scene : viser's. Elements that a page makes in `open`, or in a call of `do`, are removed with it; nodes of the
-    scene are below "/page". anonymous : names of files are not shown.
+    scene are below "/page". anonymous : names of files are not shown; `names` says what is shown instead.
     """
 
     def __init__(self, port: int = 0, host: str = LOOPBACK, *, anonymous: bool = False) -> None:
         self.server, self.anonymous = start_server(port, host), anonymous
+        self.names = Names(anonymous=anonymous)
         self.gui, self.scene = self.server.gui, self.server.scene
-        self.url = f"http://{'localhost' if host == LOOPBACK else host}:{self.server.get_port()}/"
+        self.url = url_of(host, self.server.get_port())
         """Where it is."""
         self._calls: queue.Queue[Callable[[], None]] = queue.Queue()
         self._worker = ThreadPoolExecutor(1, "job")
@@ -55,6 +61,9 @@ class Window:
         self._error = self.gui.add_markdown("", visible=False)
         self._log = self.gui.add_markdown("", visible=False)
         self._place = self.gui.add_folder(None)
+        self.dark = self.gui.add_checkbox("Dark", False, order=_LAST)
+        """The switch between light and dark, below every page."""
+        self.on(self.dark, lambda dark: self.theme(dark=dark))
 
     # What pages call, in the window's thread.
 
@@ -110,13 +119,13 @@ class Window:
 
     def say(self, words: str) -> None:
         """Show a sentence above the page."""
-        self._error.content, self._error.visible = words, True
+        self._error.content, self._error.visible = escaped(self.names.hidden(words)), True
         self._log.visible = False
 
     def fail(self, words: str, log: str = "") -> None:
         """Show what went wrong above the page, with a log to copy."""
-        self._error.content, self._error.visible = f"**{escaped(words)}**", True
-        self._log.content, self._log.visible = f"```\n{log}\n```", bool(log)
+        self._error.content, self._error.visible = f"**{escaped(self.names.hidden(words))}**", True
+        self._log.content, self._log.visible = fenced(self.names.hidden(log)), bool(log)
 
     def theme(self, *, dark: bool) -> None:
         """Show everything dark, or light."""
@@ -132,10 +141,8 @@ class Window:
         """Do what is to be done until `stop`, or until `ends`."""
         ticked_s = 0.0
         while not (self._ended or ends()):
-            try:
+            with suppress(queue.Empty):
                 self._guarded(self._calls.get(timeout=_TICK_S / 5))
-            except queue.Empty:
-                pass
             if time.monotonic() - ticked_s > _TICK_S:
                 ticked_s = time.monotonic()
                 for call in (*self._ticking, *([self._page.tick] if self._page is not None else [])):
@@ -175,5 +182,13 @@ class Window:
 
 
 def escaped(text: str) -> str:
-    """Return a text as it is, for Markdown: names of files hold what has a meaning there."""
-    return "".join(f"\\{letter}" if letter in r"\`*_{}[]()<>#+-!|~" else letter for letter in text)
+    """Return a text as it is, in one line, for Markdown: names of files hold what has a meaning there."""
+    line = " ".join(text.split())
+    return "".join(f"\\{letter}" if letter in r"\`*_{}[]()<>#+-!|~&$" else letter for letter in line)
+
+
+def fenced(text: str) -> str:
+    """Return a text of several lines as it is, for Markdown: a box from which it can be copied."""
+    longest = max((len(run) for run in re.findall("`+", text)), default=0)
+    fence = "`" * max(3, longest + 1)
+    return f"{fence}\n{text}\n{fence}"

@@ -8,30 +8,29 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from scopemap.apps.browser.runs import BrowserRun, RunQueue
-from scopemap.engine.errors import InputError
+from scopemap.apps.browser.uploads import Receiver
+from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.input.opening import VIDEO_ENDINGS
 from scopemap.result.result import Result
+from scopemap.result.result_folder import UNFINISHED
 
 _RESULTS = "scopemap"
 _UPLOADS = "uploads"
-_VIDEOS = {
-    ".mp4",
-    ".mkv",
-    ".avi",
-    ".mov",
-    ".mpg",
-    ".mpeg",
-    ".m4v",
-    ".webm",
-    ".wmv",
-    ".ts",
-    ".mts",
-    ".m2ts",
-    ".dcm",
-    ".bag",
-}
+_MASKS = "masks"
+DEMONSTRATION = "demonstration"
+"""Folder in FOLDER/scopemap that holds the clip of the demonstration."""
+
+_UPLOADED = re.compile(r"video_(\d+)\.[a-z0-9]+")
+_MARK = "provenance.json"
+_MOST_NAMED = 80
+_VIDEOS = {*VIDEO_ENDINGS, ".dcm", ".bag"}
+_IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 _MOST_LISTED = 200
+VIDEO_KINDS = ",".join(("video/*", *sorted(_VIDEOS)))
+"""Kinds of files that are taken for videos, as browsers have them."""
 
 
 class Workspace:
@@ -42,7 +41,10 @@ class Workspace:
     """
 
     def __init__(self, folder: Path, *, keep_uploads: bool = False, most_bytes: int = 4_000_000_000) -> None:
-        self.folder, self.results, self.most_bytes = folder, folder / _RESULTS, most_bytes
+        self._receiver: Receiver | None = None
+        # Absolute: a name that begins with "-" would be an option of the run's command.
+        self.folder, self.most_bytes = folder.absolute(), most_bytes
+        self.results = self.folder / _RESULTS
         self._session = Path(tempfile.mkdtemp(prefix="scopemap-app-"))
         self.uploads = self.results / _UPLOADS if keep_uploads else self._session / _UPLOADS
         self.keeps_uploads = keep_uploads
@@ -55,32 +57,54 @@ class Workspace:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.runs.close()
+        if self._receiver is not None:
+            self._receiver.close()
         shutil.rmtree(self._session, ignore_errors=True)
 
     @property
     def videos(self) -> list[Path]:
         """Videos of the folder, and folders of it that hold images, by name; the first 200."""
-        found = [path for path in sorted(self.folder.iterdir()) if path.name != _RESULTS and not path.is_symlink()]
+        found = [path for path in _inside(self.folder) if path.name != _RESULTS]
         return [path for path in found if _may_be_input(path)][:_MOST_LISTED]
+
+    @property
+    def sent(self) -> list[Path]:
+        """Videos that were sent to the page, the latest first."""
+        return [path for path in reversed(_inside(self.uploads)) if _UPLOADED.fullmatch(path.name)][:_MOST_LISTED]
 
     @property
     def finished(self) -> list[Path]:
         """Folders of finished results, those beside the videos and those in FOLDER/scopemap, the latest first."""
-        inside = [self.folder, self.results] if self.results.is_dir() else [self.folder]
-        folders = [path for place in inside for path in place.iterdir() if path.is_dir() and not path.is_symlink()]
-        done = [path for path in folders if (path / "provenance.json").is_file() and Result(path).is_finished]
-        return sorted(done, key=lambda path: -(path / "provenance.json").stat().st_mtime)[:_MOST_LISTED]
+        done = [path for path in (*_inside(self.folder), *_inside(self.results)) if _is_result(path)]
+        return sorted(done, key=lambda path: -(path / _MARK).stat().st_mtime)[:_MOST_LISTED]
+
+    @property
+    def interrupted(self) -> list[Path]:
+        """Folders in FOLDER/scopemap of runs that were killed, and that no run of this session writes to."""
+        writing = {run.out for run in self.runs.runs if run.status in ("waiting", "running")}
+        return [path for path in _inside(self.results) if path not in writing and _is_left(path)][:_MOST_LISTED]
 
     @property
     def logs(self) -> Path:
         """Folder for what processes print; it goes with the session."""
         return self._session / "logs"
 
+    def receiver(self, server: Any) -> Receiver:
+        """Return what takes videos that are sent to the page of viser's server."""
+        if self._receiver is None:
+            self._receiver = Receiver(server, self.new_upload, self.most_bytes)
+        return self._receiver
+
     def inside(self, name: str) -> Path:
-        """Return the path of a name in the folder; raises `InputError` where it leads out of it."""
-        path = (self.folder / name).resolve()
-        if not path.is_relative_to(self.folder.resolve()):
-            raise InputError(f"{name} is not in {self.folder}")
+        """Return the path of a name in the folder; raises `InputError` where it leads out of it, or to nothing."""
+        try:
+            path = (self.folder / name).resolve()
+            if not path.is_relative_to(self.folder.resolve()):
+                raise InputError(f"{name} is not in {self.folder}: move it there, or start scopemap app in its folder")
+            if not path.exists():
+                raise InputError(f"there is no {name} in {self.folder}")
+        except (OSError, ValueError) as error:  # names that are too long, or that hold a zero
+            raise InputError(f"cannot look for {name[:_MOST_NAMED]!r} in {self.folder}: {error}") from None
         return self.folder / name
 
     def new_upload(self, name: str) -> Path:
@@ -88,25 +112,31 @@ class Workspace:
         self.uploads.mkdir(parents=True, exist_ok=True)
         ending = Path(name).suffix.lower()
         ending = ending if ending in _VIDEOS else ".video"
-        number = 1 + max(
-            [int(found[1]) for file in self.uploads.iterdir() if (found := re.match(r"video_(\d+)", file.name))],
-            default=0,
-        )
+        taken = [int(found[1]) for file in self.uploads.iterdir() if (found := _UPLOADED.match(file.name))]
+        number = max(taken, default=0) + 1
         return self.uploads / f"video_{number:03d}{ending}"
+
+    def masks_of(self, source: Path) -> Path:
+        """Return the folder for masks of an input's inset pictures; the same each time, so that a run resumes."""
+        return self.results / _MASKS / self._stem(source)
 
     def new_result(self, source: Path) -> Path:
         """Return a folder for a result of an input: FOLDER/scopemap/NAME, numbered where that is taken.
 
         A folder that holds only what a killed run left is taken again: the same run goes on there.
         """
-        stem = re.sub(r"[^\w.-]+", "_", source.stem if source.is_file() else source.name) or "video"
-        number = 1
+        stem, number = self._stem(source), 1
         while True:
             out = self.results / (stem if number == 1 else f"{stem}_{number}")
-            if not out.exists() or {path.name for path in out.iterdir()} <= {".unfinished"}:
-                if all(run.out != out or run.status in ("failed", "stopped") for run in self.runs.runs):
-                    return out
+            is_taken = any(run.out == out and run.status not in ("failed", "stopped") for run in self.runs.runs)
+            if not is_taken and (not out.exists() or _is_left(out)):
+                return out
             number += 1
+
+    @staticmethod
+    def _stem(source: Path) -> str:
+        stem = re.sub(r"[^\w.-]+", "_", source.name if source.is_dir() else source.stem).strip(".") or "video"
+        return f"{stem}_" if stem in (_UPLOADS, _MASKS, DEMONSTRATION) else stem
 
     def reconstruct(self, source: Path, arguments: Sequence[str], out: Path | None = None) -> BrowserRun:
         """Put a run of an input at the end of the queue, and return it."""
@@ -114,11 +144,27 @@ class Workspace:
         return self.runs.ask(source, self.new_result(source) if out is None else out, arguments)
 
 
+def _inside(folder: Path) -> list[Path]:
+    """Return what is in a folder, by name, but for links: they may lead out of it; [] where it cannot be read."""
+    try:
+        return [path for path in sorted(folder.iterdir()) if not path.is_symlink()]
+    except OSError:
+        return []
+
+
+def _is_result(path: Path) -> bool:
+    try:
+        return (path / _MARK).is_file() and Result(path).is_finished
+    except (OSError, ScopemapError):  # a damaged one
+        return False
+
+
+def _is_left(path: Path) -> bool:
+    """Return whether a folder holds nothing, or what a killed run left."""
+    return path.is_dir() and {file.name for file in path.iterdir()} <= {UNFINISHED}
+
+
 def _may_be_input(path: Path) -> bool:
     if path.is_file():
         return path.suffix.lower() in _VIDEOS
-    if (path / "provenance.json").is_file():
-        return False
-    return path.is_dir() and any(
-        file.suffix.lower() in {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"} for file in path.iterdir()
-    )
+    return not (path / _MARK).is_file() and any(file.suffix.lower() in _IMAGES for file in _inside(path))

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -21,10 +21,6 @@ from scopemap.terminal.progress import both, run_progress
 if TYPE_CHECKING:
     from scopemap.engine.config import Config
     from scopemap.result.result import Result
-
-_SKIPPED = {"repeated": "skipped as repeats", "thinned": "skipped by --fps", "size": "skipped: of another size"}
-_MOST_REASONS = 6
-"""Notes are left to the report where there are more cautions and notes."""
 
 
 def run(
@@ -125,7 +121,9 @@ def run(
     in_app: Annotated[
         bool, typer.Option("--app", help="Show the run in a browser while it goes on, and its result (extra app).")
     ] = False,
-    watched: Annotated[bool, typer.Option("--watched", hidden=True, help="Write what the window shows.")] = False,
+    watched: Annotated[
+        bool, typer.Option("--watched", hidden=True, help="Write what can be seen of the run for a window.")
+    ] = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -207,6 +205,8 @@ def run(
 
 
 def _report(result: Result, resolved: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
+    from scopemap.result.summary import summary_lines
+
     provenance = result.provenance
     if as_json:
         if not quiet:
@@ -216,61 +216,3 @@ def _report(result: Result, resolved: Config, out: Path, *, as_json: bool, quiet
         for line in summary_lines(result):
             typer.echo(line)
         typer.echo(f"Open {out / 'report.html'} in a browser. All files of the result are in {out}.")
-
-
-def summary_lines(result: Result) -> list[str]:
-    """Return the summary of a run: the verdict, five facts, and what speaks against it with what to do."""
-    from scopemap.engine.notices import scale_words
-    from scopemap.result.input_part import part_of_input
-    from scopemap.result.verdict import verdict
-
-    facts, found = result.provenance, verdict(result)
-    unit = " mm" if facts["scale"]["known"] else " (scale unknown)"
-    part = part_of_input(facts)
-    five = {
-        "frames": f"{_frames(facts)}{f' ({part})' if part else ''}; path {result.trajectory.path_length_mm:.1f}{unit}",
-        "scale": scale_words(facts["scale"]).removeprefix("scale").lstrip(": "),
-        "camera": facts["camera"]["source"].partition("; ")[0],
-        "surface": f"{len(result.mesh.faces):,} triangles{_surface(facts['surface'])}",
-        "time": time_words(result) + compiling_words(facts["seconds"].get("compile kernels", 0.0)),
-    }
-    cautions = [reason for reason in found.reasons if reason.level in ("bad", "doubtful")]
-    notes = [reason for reason in found.reasons if reason.level == "note"]
-    shown = notes[: max(_MOST_REASONS - len(cautions), 0)]
-    lines = [f"{found.word.capitalize()}. {found.advice}"] + [f"  {name:8s} {fact}" for name, fact in five.items()]
-    lines += [f"Caution: {reason}" for reason in cautions] + [f"Note: {reason}" for reason in shown]
-    left = len(notes) - len(shown)
-    return lines + [f"{left} more notes are in the report."] * bool(left)
-
-
-def _frames(facts: dict[str, Any]) -> str:
-    """Return how many frames were tracked, and what became of the others."""
-    others = [(facts["lost"], "lost"), (facts["in_other_maps"], "in other submaps")]
-    others += [(count, _SKIPPED[kind]) for kind, count in facts["skipped"].items()]
-    return ", ".join([f"{facts['tracked']} of {facts['frames']} tracked"] + [f"{n} {how}" for n, how in others if n])
-
-
-def time_words(result: Result) -> str:
-    """Return how long the run took and its frames per second; of a resumed one since then."""
-    from scopemap.result.verdict import frames_per_s
-
-    seconds, after = result.provenance["seconds"]["total"], result.provenance["resumed_after_frame"]
-    since = "" if after is None else f" since it was resumed after frame {after}"
-    return f"{seconds:.1f} s{since}, {frames_per_s(result) or 0.0:.1f} frames/s"
-
-
-def compiling_words(seconds: float) -> str:
-    """Return what compiling the kernels took, and that it was for this process alone where they cannot be cached."""
-    if seconds < 0.1:
-        return ""
-    is_cached = os.environ.get("NUMBA_CACHE_DIR") != ""
-    how = "once" if is_cached else "in every run: set NUMBA_CACHE_DIR to a folder to keep them"
-    return f" (without {seconds:.1f} s of compiling kernels, {how})"
-
-
-def _surface(figures: dict[str, float]) -> str:
-    """Return how well the surface agrees with the frames that it was made of, "" where that is not known."""
-    if "depth_error" not in figures:
-        return ""
-    covered = f", covers {int(100 * figures['coverage_mean'])} % of what its frames see"
-    return f"{covered}, depth differs by {100 * figures['depth_error']:.1f} %"

@@ -1,0 +1,225 @@
+"""The time line: which frame is shown, what it shows, why it is lost, and which frames saw a place."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+
+from scopemap.apps.browser.frame_images import FrameImages
+from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.scene import quaternion
+from scopemap.apps.browser.seen_by import frames_that_saw
+from scopemap.apps.browser.shown_surface import SurfacePick
+from scopemap.apps.browser.window import escaped
+from scopemap.engine.tracking.causes import ADVICE, LossCause
+from scopemap.result.frame_table import ELSEWHERE, LOST, ROTATED
+from scopemap.result.run_input import places_of_input
+from scopemap.runner.reread_frames import reread_frames
+
+_FRUSTUM = "/page/frame"
+_FRUSTUM_SHARE = 0.045
+_COLOUR = (30, 160, 70)
+_STEP_S = 0.2
+_MOST_STEPS = 150
+"""Of a film of the time line: of longer videos frames are left out."""
+_MOST_LISTED = 30
+_PLACES = {
+    LOST: "**lost**",
+    ROTATED: "**lost**, only its rotation is known",
+    ELSEWHERE: "in a submap too small to be kept",
+}
+
+
+class FramePart:
+    """Controls of the time line; `list_that_saw` lists frames for a place on the surface."""
+
+    def __init__(self, view: ResultView) -> None:
+        self._view, window, gui = view, view.window, view.window.gui
+        self._images, self._player = FrameImages(view), threading.Event()
+        last = max(len(view.rows) - 1, 0)
+        self._slider = window.on(gui.add_slider("Frame", 0, last, 1, 0), self._slide)
+        self._slider.hint = "Arrow keys when it is chosen; N and P: next and previous frame"
+        moves = gui.add_button_group("Go", ["Previous", "Next", "Play"])
+        moves.on_click(lambda event: window.do(self._move, moves.value))
+        self._words = gui.add_markdown("")
+        self._image = gui.add_image(np.zeros((8, 640, 3), np.uint8))
+        self._shown = gui.add_markdown("")
+        window.on(gui.add_button("Look from here"), view.look_from_frame)
+        self._with_camera = window.on(gui.add_checkbox("Fly along", initial_value=False), self._go_with)
+        self._with_camera.hint = "Look from each frame that is chosen or played"
+        self._reread = window.on(gui.add_button("Read its own picture from the video", visible=False), self._read_again)
+        self._has_input = bool(places_of_input(view.whole.folder))
+        self._commands = [
+            self._command("Next frame", "N", "Next"),
+            self._command("Previous frame", "P", "Previous"),
+        ]
+        view.follow(frame=self._follow, camera=self._draw)
+
+    def add_list(self) -> None:
+        """Make the list of the frames that saw a place."""
+        gui = self._view.window.gui
+        self._list = self._view.window.on(gui.add_dropdown("Frames that saw it", [""], visible=False), self._choose)
+
+    def hide_list(self) -> None:
+        """Show no list."""
+        self._list.visible = False
+
+    def list_that_saw(self, pick: SurfacePick) -> None:
+        """List the frames that saw a place on the surface, the best first."""
+        seen = frames_that_saw(self._view.surface, [pick])
+        self._list.visible = bool(seen)
+        if not seen:
+            self._view.note("No frame saw this place clearly.")
+            return
+        times = dict(zip(self._view.whole.frames["index"].tolist(), self._view.whole.frames["time_s"], strict=True))
+        shown = seen[:_MOST_LISTED]
+        self._listed = {f"frame {sight.frame}, {times[sight.frame]:.2f} s": sight.frame for sight in shown}
+        count = "1 frame" if len(seen) == 1 else f"{len(seen)} frames"
+        self._list.options = [f"{count}: choose one", *self._listed]
+        self._list.value = self._list.options[0]
+        self._view.note(f"{count} saw this place, frame {seen[0].frame} best. Choose one to see it.")
+
+    def close(self) -> None:
+        """End what plays, and the keys."""
+        self._player.set()
+        for command in self._commands:
+            command.remove()
+
+    def _command(self, label: str, key: Any, move: str) -> Any:
+        command = self._view.window.gui.add_command(label, hotkey=key)
+        command.on_trigger(lambda event: self._view.window.do(self._move, move))
+        return command
+
+    def _slide(self, value: float) -> None:
+        # Of a drag only the last place counts.
+        if value == self._slider.value:
+            self._view.show_row(self._view.rows[int(value)])
+
+    def _choose(self, name: str) -> None:
+        if name in self._listed:
+            self._view.show_frame(self._listed[name])
+
+    def _move(self, move: str) -> None:
+        if move == "Play":
+            self._play()
+            return
+        self._player.set()
+        self._go(1 if move == "Next" else -1)
+
+    def _go(self, step: int) -> None:
+        place = int(np.clip(int(self._slider.value) + step, 0, len(self._view.rows) - 1))
+        self._view.show_row(self._view.rows[place])
+
+    def _play(self) -> None:
+        """Begin to play from this frame, or from the first at the end; or stop."""
+        if getattr(self, "_playing", None) and not self._player.is_set():
+            self._player.set()
+            return
+        self._player, ended = threading.Event(), threading.Event()
+        last = len(self._view.rows) - 1
+        if self._slider.value >= last:
+            self._view.show_row(self._view.rows[0])
+        step, stop = max(1, last // _MOST_STEPS), self._player
+
+        def advance() -> None:
+            if not stop.is_set():
+                self._go(step)
+            if self._slider.value >= last:
+                stop.set()
+            ended.set()
+
+        def play() -> None:
+            # The next step waits for the one before: a slow page is not flooded.
+            while not stop.wait(_STEP_S):
+                ended.clear()
+                self._view.window.do(advance)
+                while not (ended.wait(_STEP_S) or stop.is_set()):
+                    pass
+
+        self._playing = threading.Thread(target=play, name="player", daemon=True)
+        self._playing.start()
+
+    def _go_with(self, on: bool) -> None:
+        if on:
+            self._view.look_from_frame()
+        else:
+            self._view.look_at_all()
+
+    def _follow(self) -> None:
+        view = self._view
+        if view.row in view.rows:
+            self._slider.value = view.rows.index(view.row)
+        self._words.content = frame_words(view)
+        if self._with_camera.value and view.pose is not None:
+            view.look_from_frame()
+        else:
+            self._draw()
+        # After what is quick; of many frames only for the last.
+        view.window.do(self._show_images, view.index)
+
+    def _show_images(self, index: int) -> None:
+        if index != self._view.index:
+            return
+        image, words = self._images.all_of(index)
+        self._image.image, self._shown.content = image, escaped(words)
+        found = self._images.picture(index)
+        self._reread.visible = self._has_input and (found is None or found[0] != index)
+
+    def _draw(self) -> None:
+        """Draw the camera of the frame in the scene."""
+        view = self._view
+        if (pose := view.pose) is None:
+            view.window.scene.remove_by_name(_FRUSTUM)
+            return
+        camera, found = view.whole.camera, self._images.picture(view.index) if view.shows_picture else None
+        view.window.scene.add_camera_frustum(
+            _FRUSTUM,
+            view.vertical_fov,
+            camera.width / camera.height,
+            scale=_FRUSTUM_SHARE * view.surface.size_mm,
+            color=_COLOUR,
+            thickness=2.5,
+            thickness_units="screen",
+            image=None if found is None else found[1],
+            cast_shadow=False,
+            receive_shadow=False,
+            wxyz=quaternion(pose),
+            position=pose[:3, 3],
+        )
+
+    def _read_again(self) -> None:
+        index, folder = self._view.index, self._view.whole.folder
+
+        def read() -> np.ndarray | None:
+            return next((frame.rgb for frame in reread_frames(folder, {index})), None)
+
+        def keep(rgb: np.ndarray | None) -> None:
+            if rgb is None:
+                self._view.note(f"The video has no frame {index} any more.")
+                return
+            self._images.keep(index, rgb)
+            self._draw()
+            self._show_images(index)
+
+        self._view.window.job("reading the video", read, keep)
+
+
+def frame_words(view: ResultView) -> str:
+    """Return number, time and status of the frame that is shown, and why it is lost, as Markdown."""
+    frames, row = view.whole.frames, view.row
+    place, time_s = int(frames.place[row]), float(frames["time_s"][row])
+    words = f"Frame {view.index}, {time_s:.2f} s: "
+    if place >= 0:
+        here = "" if place == view.number else f" in submap {place + 1}, not the one that is shown"
+        return f"{words}tracked{here}"
+    status = {
+        LOST: "**lost**",
+        ROTATED: "**lost**, only its rotation is known",
+        ELSEWHERE: "in a submap that is too small",
+    }
+    words += status.get(place, "not used")
+    reason, cause = str(frames["reason"][row]), LossCause(str(frames["cause"][row]))
+    advice = ADVICE.get(cause, "")
+    return words + (f": {escaped(reason)}." if reason else ".") + (f" {advice}" if advice else "")

@@ -1,0 +1,132 @@
+"""What is measured by hand in the window: places on the surface become pixels of a frame, as `measure` takes them."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scopemap.apps.browser.seen_by import frames_that_saw
+from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
+from scopemap.apps.measure.measure import Measure, measure
+from scopemap.engine.errors import InputError
+from scopemap.report.page import keep_measurements
+from scopemap.report.page_data import checked_measurements, read_measurements
+from scopemap.result.json_numbers import without_nan
+from scopemap.result.result import Result
+
+_MOST_TRIED = 4
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Two places whose straight distance is known, mm, or is the unit (None)."""
+
+    picks: tuple[SurfacePick, SurfacePick]
+    length_mm: float | None
+
+
+@dataclass(frozen=True)
+class HandMeasure:
+    """What was measured, where, and by which pixels (N, 2) of which frame; world: the places (N, 3), mm.
+
+    folder : of the result, or of its submap, in the whole result's folder: "." or "maps/1".
+    """
+
+    folder: str
+    frame: int
+    pixels: np.ndarray
+    reference: np.ndarray | None
+    reference_mm: float | None
+    found: list[Measure]
+    world: np.ndarray
+
+    def command(self, folder: str) -> str:
+        """Return the command that gives the same numbers; folder : of the whole result."""
+        words = ["scopemap", "measure", shlex.quote(str(Path(folder) / self.folder)), "--frame", str(self.frame)]
+        words += ["--points", f'"{pixels_in_words(self.pixels)}"']
+        return " ".join([*words, *reference_words(self.reference, self.reference_mm)])
+
+    @property
+    def as_json(self) -> dict[str, Any]:
+        """As the report keeps it in measurements.json."""
+        return {
+            "folder": self.folder,
+            "frame": self.frame,
+            "points": self.pixels.tolist(),
+            "reference": None if self.reference is None else self.reference.tolist(),
+            "reference_mm": self.reference_mm,
+            "found": [without_nan(vars(one)) for one in self.found],
+            "command": self.command("."),
+            "world": self.world.tolist(),
+        }
+
+
+def measure_by_hand(
+    surface: ShownSurface, picks: Sequence[SurfacePick], reference: Reference | None = None
+) -> HandMeasure:
+    """Return the distance of two places on a surface, or the area between more, as `scopemap measure` finds it.
+
+    It is measured in the frame that saw all of the places, and those of the reference, best. Raises `InputError` where
+    no frame did, and as `measure`.
+    """
+    ends = [] if reference is None else list(reference.picks)
+    seen = frames_that_saw(surface, [*picks, *ends])
+    if not seen:
+        also = " and the reference" if ends else ""
+        raise InputError(f"no frame saw all of these points{also}: choose points that are nearer to each other")
+    length_mm = None if reference is None else reference.length_mm
+    fault: InputError | None = None
+    for sight in seen[:_MOST_TRIED]:
+        pixels = rounded(sight.pixels)
+        own, known = pixels[: len(picks)], pixels[len(picks) :] if ends else None
+        try:
+            found = measure(surface.run.folder, sight.frame, own, known, length_mm)
+        except InputError as error:
+            fault = fault or error
+            continue
+        world = np.array([surface.position(pick) for pick in picks])
+        return HandMeasure(folder_in_whole(surface.run), sight.frame, own, known, length_mm, found, world)
+    raise fault or InputError("these points cannot be measured")
+
+
+def rounded(pixels: np.ndarray) -> np.ndarray:
+    """Return pixels as a command states them: tenths."""
+    return np.round(np.asarray(pixels, float), 1) + 0.0
+
+
+def pixels_in_words(pixels: np.ndarray) -> str:
+    """Return pixels as the options of `measure` take them, "x,y x,y"."""
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in np.asarray(pixels).tolist())
+
+
+def reference_words(reference: np.ndarray | None, length_mm: float | None) -> list[str]:
+    """Return the options of `measure` for a reference."""
+    if reference is None:
+        return []
+    length = [] if length_mm is None else ["--reference-mm", f"{length_mm:g}"]
+    return ["--reference", f'"{pixels_in_words(reference)}"', *length]
+
+
+def broken(command: str) -> str:
+    """Return a command in lines, each with an option, as a terminal takes them."""
+    return command.replace(" --", " \\\n  --")
+
+
+def folder_in_whole(run: Result) -> str:
+    """Return where a submap is in the whole result: "maps/1", or "." for the result itself."""
+    return f"maps/{run.folder.resolve().name}" if run.is_submap else "."
+
+
+def add_measurements(folder: Path, measured: Sequence[HandMeasure]) -> int:
+    """Put measurements to those kept in a result's folder, each once; return how many are kept then."""
+    kept = read_measurements(folder)
+    new = checked_measurements(json.dumps([one.as_json for one in measured]).encode())
+    kept += [one for one in new if one not in kept]
+    keep_measurements(folder, json.dumps(kept).encode())
+    return len(kept)

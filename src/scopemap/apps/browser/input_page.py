@@ -1,0 +1,254 @@
+"""The page of an input that was chosen: what it is, what is wrong, the options that mend it, and the start of a run."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scopemap.apps.browser.looking import LeftEarlier, Look, look, measured_rates, time_in_words
+from scopemap.apps.browser.run_choice import LAYOUTS, LEAST_FOV_DEG, MOST_FOV_DEG, PRESETS, RunChoice, boxes_of
+from scopemap.apps.browser.runs import BrowserRun
+from scopemap.apps.browser.window import escaped, fenced
+from scopemap.apps.browser.workspace import Workspace
+from scopemap.engine.errors import ScopemapError, SettingsError
+from scopemap.input.scopes import SCOPES
+from scopemap.report.frame_pictures import shrunk
+
+if TYPE_CHECKING:
+    from scopemap.apps.browser.window import Window
+
+_UNKNOWN = "not known"
+_ESTIMATED, _BY_FOV = "estimated from the video", "by its field of view"
+_PRESETS = {"default: best quality": PRESETS[0], "realtime: about twice as fast": PRESETS[1]}
+_LAYOUTS = {"found by itself": LAYOUTS[0], "one view": LAYOUTS[1], "left and right": LAYOUTS[2], "above": LAYOUTS[3]}
+_NEXT_LINE = " \\\n  "
+_PICTURE_PX = 240
+_PICTURES = 3
+_MOST_MEASURED = 5
+_MOST_FINDINGS = 8
+_USUAL_FOV_DEG = 70.0
+_SET_BELOW = {"scope", "stereo", "interlaced", "rate-high", "black", "one-colour", "not-tissue", "inset"}
+"""Codes of findings that a switch of this page answers."""
+_WORDS = {"error": "Error", "warning": "Caution", "info": "Note"}
+
+
+class InputPage:
+    """An input; started : called with the run that is started. back : called where the page is left."""
+
+    def __init__(
+        self, workspace: Workspace, source: Path, started: Callable[[BrowserRun], None], back: Callable[[], None]
+    ) -> None:
+        self._workspace, self._source, self._started, self._back = workspace, source, started, back
+        self._looked: Look | None = None
+        self._done, self._all, self._left = 0, 1, False
+        self.choice = RunChoice()
+        """The options as they are set."""
+
+    def open(self, window: Window) -> None:
+        """Make the elements, and look at the input."""
+        self._window, gui = window, window.gui
+        self._name = window.names.of(self._source, "video")
+        gui.add_markdown(f"### {escaped(self._name)}")
+        self._bar = gui.add_progress_bar(0, animated=True)
+        self._place = gui.add_folder(None)
+        window.on(gui.add_button("Back to the start", color="gray"), self._back)
+        window.job("looking at the video", self._look, self._show)
+
+    def tick(self) -> None:
+        """Show how far the look is."""
+        if self._looked is None:
+            self._bar.value = min(100.0, 100 * self._done / self._all)
+
+    def close(self) -> None:
+        """End the look."""
+        self._left = True
+
+    def _heard(self, done: int, all_: int) -> None:
+        if self._left:
+            raise LeftEarlier
+        self._done, self._all = done, max(all_, 1)
+
+    def _look(self) -> Look | ScopemapError:
+        try:
+            return look(self._source, self._heard)
+        except ScopemapError as error:
+            return error
+
+    def _show(self, found: Look | ScopemapError) -> None:
+        self._bar.visible = False
+        if isinstance(found, ScopemapError):
+            raise found
+        self._looked = found
+        self.choice = found.suggested
+        results = self._workspace.finished[:_MOST_MEASURED]
+        self._rates = {preset: measured_rates(results, preset) for preset in PRESETS}
+        with self._place:
+            gui = self._window.gui
+            gui.add_image(_strip(found), format="jpeg")
+            gui.add_markdown(words_of(found, self._window.names.hidden))
+            self._time = gui.add_markdown("")
+            self._add_switches(found)
+            self._start = self._window.on(gui.add_button("Reconstruct", color="green"), self._reconstruct)
+            self._command = gui.add_markdown("")
+        self._show_choice()
+
+    def _add_switches(self, found: Look) -> None:
+        """Add what the findings advise, and what is usually asked, in sight; the rest in a folder."""
+        self._add_list("Endoscope", {_UNKNOWN: "", **{scope: scope for scope in SCOPES}}, "scope")
+        self._add_camera(found)
+        self._add_list("Quality", _PRESETS, "preset")
+        overlays = found.spread.overlays
+        for inside, label in ((False, "Blacken burned-in text"), (True, "Blacken what rests in the field of view")):
+            boxes = boxes_of(found.spread, [one for one in overlays if one.in_field is inside])
+            if boxes:
+                self._add_boxes(f"{label} ({len(boxes)})", boxes)
+        if found.spread.insets:
+            self._add_mask()
+        seen, rest = list[Callable[[], None]](), list[Callable[[], None]]()
+        for add, is_advised in (
+            (self._add_layout, self.choice.stereo != LAYOUTS[0]),
+            (self._add_fields, self.choice.deinterlace),
+            (self._add_rate, bool(self.choice.fps)),
+            (self._add_frames, bool(self.choice.frames)),
+        ):
+            (seen if is_advised else rest).append(add)
+        for add in seen:
+            add()
+        with self._window.gui.add_folder("More options", expand_by_default=False):
+            for add in rest:
+                add()
+            self._add_range()
+
+    def _add_list(self, label: str, values: dict[str, str], name: str) -> None:
+        shown = next((label for label, value in values.items() if value == getattr(self.choice, name)), None)
+        handle = self._window.gui.add_dropdown(label, tuple(values), initial_value=shown)
+        # What a browser sends need not be of the list.
+        self._window.on(handle, lambda chosen: self._set({name: _of_list(values, chosen)}))
+
+    def _add_camera(self, found: Look) -> None:
+        files: dict[str, Path] = {}
+        for file in found.calibrations:
+            files[self._window.names.of(file, "calibration")] = file
+        shown = next((label for label, file in files.items() if file == self.choice.camera), _ESTIMATED)
+        camera = self._window.gui.add_dropdown("Camera", (_ESTIMATED, _BY_FOV, *files), initial_value=shown)
+        fov = self._window.gui.add_number(
+            "Field of view, degrees", _USUAL_FOV_DEG, min=LEAST_FOV_DEG, max=MOST_FOV_DEG, step=0.1, visible=False
+        )
+
+        def chosen(label: str) -> None:
+            fov.visible = label == _BY_FOV
+            file = None if label in (_ESTIMATED, _BY_FOV) else _of_list(files, label)
+            self._set({"camera": file, "fov_deg": float(fov.value) if fov.visible else 0.0})
+
+        self._window.on(camera, chosen)
+        self._window.on(fov, lambda value: self._set({"fov_deg": float(value)}) if fov.visible else None)
+
+    def _add_boxes(self, label: str, boxes: tuple[tuple[int, int, int, int], ...]) -> None:
+        are_set = set(boxes) <= set(self.choice.redact)
+        handle = self._window.gui.add_checkbox(label, are_set, hint="It is black in everything that the run writes.")
+
+        def changed(is_on: bool) -> None:
+            rest = [box for box in self.choice.redact if box not in boxes]
+            self._set({"redact": tuple(sorted([*rest, *(boxes if is_on else ())]))})
+
+        self._window.on(handle, changed)
+
+    def _add_mask(self) -> None:
+        folder = self._workspace.masks_of(self._source)
+        self.choice = replace(self.choice, masks=folder)
+        handle = self._window.gui.add_checkbox("Leave out the picture in the picture", True)
+        self._window.on(handle, lambda is_on: self._set({"masks": folder if is_on else None}))
+
+    def _add_layout(self) -> None:
+        self._add_list("Two views in a picture", _LAYOUTS, "stereo")
+
+    def _add_fields(self) -> None:
+        handle = self._window.gui.add_checkbox("Interlaced: use one field", self.choice.deinterlace)
+        self._window.on(handle, lambda is_on: self._set({"deinterlace": bool(is_on)}))
+
+    def _add_rate(self) -> None:
+        hint = "Leave out frames beyond this rate; 0: use all."
+        handle = self._window.gui.add_number("Most frames per second", self.choice.fps, min=0.0, step=0.1, hint=hint)
+        self._window.on(handle, lambda value: self._set({"fps": float(value)}))
+
+    def _add_frames(self) -> None:
+        hint = "From the first to before the last, such as 50:900; with a step: ::2. Empty: all."
+        handle = self._window.gui.add_text("Frames", self.choice.frames, hint=hint)
+        self._window.on(handle, lambda text: self._set({"frames": str(text).strip()}))
+
+    def _add_range(self) -> None:
+        hint = "In the first frame, mm; both set the scale. 0: not known."
+        for label, name in (("Nearest tissue, mm", "near_mm"), ("Farthest tissue, mm", "far_mm")):
+            handle = self._window.gui.add_number(label, 0.0, min=0.0, step=0.1, hint=hint)
+            self._window.on(handle, lambda value, name=name: self._set({name: float(value)}))
+
+    def _set(self, changes: dict[str, Any]) -> None:
+        self.choice = replace(self.choice, **changes)
+        self._show_choice()
+
+    def _show_choice(self) -> None:
+        """Show the command, and how long it takes; or what is wrong with it."""
+        assert self._looked is not None
+        try:
+            choice = self.choice.checked()
+            frames = self._looked.used(choice)
+        except ScopemapError as error:
+            self._start.disabled = True
+            self._window.fail(str(error))
+            return
+        self._window.clear_error()
+        self._start.disabled = False
+        self._time.content = f"**Time:** {escaped(time_in_words(frames, choice.preset, self._rates[choice.preset]))}"
+        out = self._workspace.new_result(self._source)
+        words = [f"scopemap run {shlex.quote(str(self._source))}", f"--out {shlex.quote(str(out))}"]
+        command = _NEXT_LINE.join([*words, *map(shlex.quote, choice.arguments())])
+        self._command.content = f"The same in a terminal:\n\n{fenced(self._window.names.hidden(command))}"
+
+    def _reconstruct(self) -> None:
+        from scopemap.apps.inspect.inspection_sheet import write_mask
+
+        assert self._looked is not None
+        choice = self.choice.checked()
+        if choice.masks is not None:
+            write_mask(self._looked.spread, choice.masks)
+        self._start.disabled = True
+        self._started(self._workspace.reconstruct(self._source, choice.arguments()))
+
+
+def words_of(found: Look, hidden: Callable[[str], str] = str) -> str:
+    """Return what was seen of an input, in Markdown; hidden : returns a text without names that are not to be read."""
+    lines = [
+        escaped(found.facts),
+        f"**Kind of endoscope:** {escaped(found.kind)}",
+        f"**Tracking:** {escaped(found.trackable)}",
+    ]
+    findings = [one for one in found.findings if one.code != "scope"]
+    items = []
+    for one in findings[:_MOST_FINDINGS]:
+        advice = "it is set below" if one.code in _SET_BELOW else one.advice
+        more = f" *{escaped(hidden(advice))}*" if advice else ""
+        items.append(f"- **{_WORDS[one.severity]}:** {escaped(hidden(one.message))}.{more}")
+    if len(findings) > _MOST_FINDINGS:
+        items.append(f"- and {len(findings) - _MOST_FINDINGS} more: `scopemap inspect` lists all")
+    lines.append("\n".join(items) if items else "No problem was found.")
+    if found.part:
+        lines.append(f"To be quick, {escaped(found.part)}.")
+    return "\n\n".join(lines)
+
+
+def _strip(found: Look) -> np.ndarray:
+    """Return pictures from its beginning to its end, beside each other, (h, w, 3) uint8."""
+    samples = found.spread.samples
+    places = np.linspace(0, len(samples) - 1, min(_PICTURES, len(samples))).round().astype(int)
+    return np.hstack([shrunk(samples[place].rgb, _PICTURE_PX) for place in places])
+
+
+def _of_list(values: dict[str, Any], label: str) -> Any:
+    if label not in values:
+        raise SettingsError("choose one of the list")
+    return values[label]

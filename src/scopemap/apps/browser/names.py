@@ -1,0 +1,47 @@
+"""Names of files as the page shows them: as they are, or "video 1" where nobody is to read them (`--anonymous`)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+_PLACES = ("the folder", "folder")
+"""What stands for the folder of the videos, with and without its own name."""
+
+
+class Names:
+    """Names of files, and what stands for them; anonymous : whether they are hidden."""
+
+    def __init__(self, *, anonymous: bool = False) -> None:
+        self.anonymous = anonymous
+        self._of: dict[tuple[str, Path], str] = {}
+        self._instead: dict[str, str] = {}
+        self._counts: dict[str, int] = {}
+
+    def hide_folder(self, folder: Path) -> None:
+        """Show no part of where a folder is."""
+        for path in {str(folder.resolve()), str(folder)} - {"."}:
+            self._instead[path] = _PLACES[0]
+        if folder.resolve().name:
+            self._instead[folder.resolve().name] = _PLACES[1]
+
+    def of(self, path: Path, kind: str) -> str:
+        """Return the name of a file or folder; hidden: its kind and a number, the same each time."""
+        if not self.anonymous:
+            return path.name
+        key = kind, path.absolute()
+        if key not in self._of:
+            self._counts[kind] = self._counts.get(kind, 0) + 1
+            self._of[key] = alias = f"{kind} {self._counts[kind]}"
+            for name in (path.name, path.stem):
+                self._instead.setdefault(name, alias)
+        return self._of[key]
+
+    def hidden(self, text: str) -> str:
+        """Return a text in which names that are known here are hidden, if they are to be."""
+        if not (self.anonymous and self._instead):
+            return text
+        # The longest first: a folder's path before its name, "a_2" before "a".
+        names = "|".join(re.escape(name) for name in sorted(self._instead, key=len, reverse=True) if name)
+        # "colon" in "colon_2.mp4", too, but not in "colonoscope".
+        return re.sub(rf"(?<![^\W_])(?:{names})(?![^\W_])", lambda found: self._instead[found[0]], text)

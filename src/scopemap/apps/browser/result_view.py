@@ -1,0 +1,180 @@
+"""What the parts of a result's page share: the result, the submap and frame that are shown, and who follows them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scopemap.apps.browser.scene import look_at, look_from
+from scopemap.apps.browser.shown_surface import ShownSurface
+from scopemap.apps.browser.window import escaped
+from scopemap.result.frame_table import NOT_USED
+from scopemap.result.result import Result
+
+if TYPE_CHECKING:
+    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.workspace import Workspace
+    from scopemap.apps.coverage.coverage import Coverage
+
+_WHOLE_FOV = 0.9
+"""Vertical field of view from outside, rad."""
+
+
+class ResultView:
+    """A result as it is looked at; `whole` is all of it, `run` the submap whose surface is shown.
+
+    rows : of the frames that were used, in the table of the whole result. row : of the frame that is shown.
+    """
+
+    def __init__(self, window: Window, whole: Result, workspace: Workspace | None) -> None:
+        self.window, self.whole, self.workspace = window, whole, workspace
+        self.rows = np.flatnonzero(whole.frames.place != NOT_USED).tolist()
+        self.row = self.rows[0] if self.rows else 0
+        self.number, self.surface = 0, ShownSurface(whole)
+        self.in_state = self.surface.moves
+        self._inside = self._measuring = False
+        self._of_frame: list[Callable[[], None]] = []
+        self._of_camera: list[Callable[[], None]] = []
+        self._of_submap: list[Callable[[], None]] = []
+        self._coverage: dict[int, Coverage] = {}
+
+    @property
+    def run(self) -> Result:
+        """The result, or the submap, whose surface is shown."""
+        return self.surface.run
+
+    @property
+    def index(self) -> int:
+        """The number of the frame that is shown."""
+        return int(self.whole.frames["index"][self.row]) if len(self.whole.frames) else -1
+
+    @property
+    def state(self) -> int | None:
+        """The frame in whose state tissue is shown; None: in that of the result."""
+        return self.index if self.in_state and self.surface.moves else None
+
+    @property
+    def pose(self) -> np.ndarray | None:
+        """The pose (4, 4) of the frame that is shown; None where it is not tracked in this submap."""
+        frames = self.run.frames
+        row = np.flatnonzero(frames["index"] == self.index)
+        if not len(row) or not frames.tracked[row[0]]:
+            return None
+        return np.asarray(frames["T_world_camera"][row[0]])
+
+    @property
+    def folder_words(self) -> str:
+        """The folder of the whole result as commands name it; no name where names are not shown."""
+        return "RESULT" if self.window.anonymous else str(self.whole.folder)
+
+    @cached_property
+    def vertical_fov(self) -> float:
+        """Of the frames, rad."""
+        return float(2 * np.arctan(self.whole.camera.height / 2 / self.whole.camera.fy))
+
+    @property
+    def shows_picture(self) -> bool:
+        """Whether the frame's picture is in the scene: not where it would hide the surface."""
+        return not (self._inside or self._measuring)
+
+    def follow(
+        self,
+        *,
+        frame: Callable[[], None] | None = None,
+        submap: Callable[[], None] | None = None,
+        camera: Callable[[], None] | None = None,
+    ) -> None:
+        """Call where another frame or submap is shown, or where `shows_picture` may have changed."""
+        self._of_frame += [frame] if frame else []
+        self._of_submap += [submap] if submap else []
+        self._of_camera += [camera] if camera else []
+
+    def measure_by_clicks(self, *, on: bool) -> None:
+        """State whether clicks are points to be measured."""
+        self._measuring = on
+        self._see()
+
+    def show_row(self, row: int) -> None:
+        """Show the frame of a row."""
+        self.row = row
+        for call in self._of_frame:
+            call()
+
+    def show_frame(self, index: int) -> None:
+        """Show the frame with this number."""
+        self.show_row(int(np.flatnonzero(self.whole.frames["index"] == index)[0]))
+
+    def show_submap(self, number: int) -> None:
+        """Show the surface of another submap, and its first frame."""
+        self.number, self.surface = number, ShownSurface(self.whole.submaps[number])
+        self.in_state = self.surface.moves
+        for call in self._of_submap:
+            call()
+        inside = np.flatnonzero(self.whole.frames.place == number)
+        self.show_row(int(inside[0]) if len(inside) else self.row)
+        self.look_at_all()
+
+    def look_at_all(self) -> None:
+        """Look at the whole surface from behind its first camera."""
+        poses = self.run.tracked["T_world_camera"]
+        points = np.asarray(self.surface.mesh.vertices)
+        points = points if len(points) else poses[:, :3, 3]
+        self._inside = False
+        if len(poses):
+            self._see_with(_WHOLE_FOV)
+            look_at(self.window, poses[0], points)
+        self._see()
+
+    def look_from_frame(self) -> None:
+        """Look from the camera of the frame that is shown."""
+        if (pose := self.pose) is None:
+            self.note("This frame has no pose in this submap: nothing can be seen from it.")
+            return
+        ahead, self._inside = max(0.2 * self.surface.size_mm, 1e-3), True
+        self._see_with(self.vertical_fov)
+        look_from(self.window, pose[:3, 3], pose[:3, 3] + ahead * pose[:3, 2], -pose[:3, 1])
+        self._see()
+
+    def look_from_spot(self, place: np.ndarray) -> None:
+        """Look from the camera of the frame that is shown at a place (3,)."""
+        if (pose := self.pose) is not None:
+            self._inside = True
+            self._see_with(_WHOLE_FOV)
+            look_from(self.window, pose[:3, 3], place, -pose[:3, 1])
+            self._see()
+
+    def note(self, words: str) -> None:
+        """Show a sentence that is always seen; "": none."""
+        self._note.content, self._note.visible = escaped(words), bool(words)
+
+    def add_note(self) -> None:
+        """Make the place of the sentence."""
+        self._note = self.window.gui.add_markdown("", visible=False)
+
+    def coverage(self, then: Callable[[Coverage], None]) -> None:
+        """Call with what was not seen of the submap, which is found in a job, once."""
+        number, folder = self.number, self.run.folder
+
+        def found(result: Coverage) -> None:
+            self._coverage[number] = result
+            if number == self.number:
+                then(result)
+
+        if number in self._coverage:
+            then(self._coverage[number])
+            return
+        from scopemap.apps.coverage.coverage import coverage
+
+        self.window.job("looking for what was not seen", lambda: coverage(folder), found)
+
+    def _see(self) -> None:
+        for call in self._of_camera:
+            call()
+
+    def _see_with(self, fov: float) -> None:
+        server = self.window.server
+        for camera in (server.initial_camera, *(client.camera for client in server.get_clients().values())):
+            camera.fov = fov

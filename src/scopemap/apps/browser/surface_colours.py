@@ -1,0 +1,143 @@
+"""Colours of a surface that mean something, and what they mean: how sure it is, how often it was seen, how far off."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from scopemap.apps.browser.shown_surface import ShownSurface
+from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.report.shown_mesh import SeenFrame, times_seen
+from scopemap.result.result import Result
+
+_LOOKED_AT = 25
+_SAME_SURFACE = 0.1
+"""Relative difference of depth up to which a frame sees a vertex, as for `times_seen`."""
+_WORST_PERCENTILE = 95
+_UNKNOWN = (150, 150, 150)
+_AMBIENT = 0.55
+"""Of the light in relief, from everywhere; the rest is that of a lamp at the camera."""
+
+
+@dataclass(frozen=True)
+class Colouring:
+    """Colours (V, 3) uint8 of a surface's vertices, what they mean in words, and those from low to high (256, 3)."""
+
+    colours: np.ndarray
+    words: str
+    ramp: np.ndarray | None = None
+
+
+def colourings(surface: ShownSurface) -> dict[str, Callable[[], Colouring]]:
+    """Return what a surface can be coloured by, by name; none is computed before it is called."""
+    found = {"picture": lambda: Colouring(surface.colours, _picture_words(surface.run))}
+    if surface.is_empty:
+        return found
+    if "confidence" in surface.mesh.vertex_attributes:
+        found["confidence"] = lambda: _confidence(surface)
+    if any(map(surface.run.depth.has, surface.run.tracked["index"].tolist())):
+        found["times seen"] = lambda: _times_seen(surface)
+    if "sigma_mm" in surface.mesh.vertex_attributes:
+        found["depth deviation"] = lambda: _sigma(surface)
+    elif "times seen" in found:
+        found["depth deviation"] = lambda: _disagreement(surface)
+    return found
+
+
+def looking_frames(run: Result, most: int = _LOOKED_AT) -> list[SeenFrame]:
+    """Return tracked frames of a run that have a depth map, at most so many, evenly spread."""
+    tracked = run.tracked
+    rows = [row for row, index in enumerate(tracked["index"].tolist()) if run.depth.has(index)]
+    found = []
+    for row in rows[:: -(-len(rows) // most) or 1]:
+        depth_mm = run.depth.read(int(tracked["index"][row]))
+        if depth_mm is not None:
+            found.append(SeenFrame(tracked["T_world_camera"][row], depth_mm))
+    return found
+
+
+def in_relief(surface: ShownSurface, colours: np.ndarray) -> np.ndarray:
+    """Return colours (V, 3) uint8 of vertices, darker where they do not face the nearest camera."""
+    light = _AMBIENT + (1 - _AMBIENT) * surface.facing
+    return np.asarray(np.round(colours * light[:, None]), np.uint8)
+
+
+def legend_picture(ramp: np.ndarray, width: int = 360, height: int = 14) -> np.ndarray:
+    """Return colours (256, 3) from left to right, (height, width, 3) uint8."""
+    return np.asarray(np.repeat(ramp[np.linspace(0, len(ramp) - 1, width).astype(int)][None], height, axis=0))
+
+
+def _picture_words(run: Result) -> str:
+    return "As in the video, without the fall-off of the light." if is_albedo(run) else "As in the video."
+
+
+def is_albedo(run: Result) -> bool:
+    """Return whether the colours of a surface are those of the tissue, without the light."""
+    return bool(tomllib.loads(run.config_text).get("fusion", {}).get("colours") != "raw")
+
+
+def _ramp(colour_map: int) -> np.ndarray:
+    return np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], colour_map)[:, 0, ::-1])
+
+
+def _coloured(values: np.ndarray, low: float, high: float, words: str, colour_map: int) -> Colouring:
+    """Return the colouring of values (V,), NaN = unknown, by a colour map from `low` to `high`."""
+    ramp, known = _ramp(colour_map), np.isfinite(values)
+    share = (np.where(known, values, low) - low) / max(high - low, 1e-9)
+    colours = ramp[np.round(255 * np.clip(share, 0, 1)).astype(int)]
+    colours[~known] = _UNKNOWN
+    return Colouring(colours, words, ramp)
+
+
+def _confidence(surface: ShownSurface) -> Colouring:
+    values = np.asarray(surface.mesh.vertex_attributes["confidence"], float).ravel()
+    words = "Confidence: 0 (dark blue) to 1 (yellow)."
+    return _coloured(values, 0.0, 1.0, words, cv2.COLORMAP_VIRIDIS)
+
+
+def _times_seen(surface: ShownSurface) -> Colouring:
+    frames = looking_frames(surface.run)
+    count = times_seen(surface.mesh, frames, surface.run.camera)
+    words = f"Seen by 0 (dark blue) to {len(frames)} (yellow) of {len(frames)} frames that are spread over the video."
+    return _coloured(count, 0.0, float(len(frames)), words, cv2.COLORMAP_VIRIDIS)
+
+
+def _sigma(surface: ShownSurface) -> Colouring:
+    values = np.asarray(surface.mesh.vertex_attributes["sigma_mm"], float).ravel()
+    high, unit = _high(values), "mm" if surface.run.scale_known else "units (scale unknown)"
+    words = f"Standard deviation of depth: 0 (dark) to {high:.2g} {unit} and more (yellow)."
+    return _coloured(values, 0.0, high, words, cv2.COLORMAP_INFERNO)
+
+
+def _disagreement(surface: ShownSurface) -> Colouring:
+    values = 100 * depth_differences(surface)
+    high = _high(values)
+    words = f"Depth of frames differs from the surface by 0 (dark) to {high:.2g} % and more (yellow); grey: not known."
+    return _coloured(values, 0.0, high, words, cv2.COLORMAP_INFERNO)
+
+
+def _high(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.percentile(known, _WORST_PERCENTILE)) if len(known) else 1.0
+
+
+def depth_differences(surface: ShownSurface) -> np.ndarray:
+    """Return by how much of the depth frames and a surface differ at its vertices on average, (V,), NaN: not seen."""
+    vertices, camera = np.asarray(surface.mesh.vertices), surface.run.camera
+    total, count = np.zeros(len(vertices)), np.zeros(len(vertices))
+    for frame in looking_frames(surface.run):
+        points = transform(inverse(frame.T_world_camera), vertices)
+        ahead = np.flatnonzero(points[:, 2] > 0)
+        height, width = frame.depth_mm.shape
+        pixels = np.round(camera.project(points[ahead]) * [width / camera.width, height / camera.height]).astype(int)
+        inside = ((pixels >= 0) & (pixels < [width, height])).all(axis=1)
+        ahead, (column, row) = ahead[inside], pixels[inside].T
+        apart = np.abs(frame.depth_mm[row, column] / points[ahead, 2] - 1)
+        seen = apart < _SAME_SURFACE
+        total[ahead[seen]] += apart[seen]
+        count[ahead[seen]] += 1
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

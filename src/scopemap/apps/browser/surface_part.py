@@ -1,0 +1,160 @@
+"""The surface in the scene: what colours it, the camera's path, keyframes, and which submap is shown."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import trimesh
+
+from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
+from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, legend_picture
+from scopemap.apps.browser.unlit_mesh import unlit_glb
+from scopemap.engine.geometry.rendering import vertex_colours
+from scopemap.report.coverage_picture import COLOURS
+from scopemap.report.sheet import Sheet
+from scopemap.report.shown_mesh import simplified
+from scopemap.report.video_parts import video_parts
+from scopemap.result.verdict import WORDS, level_of_submap
+
+if TYPE_CHECKING:
+    from scopemap.apps.coverage.coverage import Coverage
+
+_SURFACE = "/page/surface"
+_PATH = "/page/path"
+_KEYFRAMES = "/page/keyframes"
+_MOST_FRUSTA = 60
+_FRUSTUM_SHARE = 0.03
+_COVERAGE = "coverage"
+_MOST_FACES = 200_000
+_MOST_SUBMAPS = 100
+_LEGEND_PX = (360, 26)
+
+
+class SurfacePart:
+    """Controls of the surface; it is drawn when they change, and when the shown frame's tissue is in another state."""
+
+    def __init__(self, view: ResultView) -> None:
+        self._view, window, gui = view, view.window, view.window.gui
+        self._shown: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        if len(view.whole.submaps) > 1:
+            self._names = [_submap_words(view, number) for number in range(len(view.whole.submaps[:_MOST_SUBMAPS]))]
+            window.on(gui.add_dropdown("Submap", self._names), self._choose_submap)
+            gui.add_markdown(strip_words(view))
+        self._by = window.on(gui.add_dropdown("Colour by", self._options()), self._colour)
+        self._legend = gui.add_image(np.zeros((14, 360, 3), np.uint8), visible=False)
+        self._words = gui.add_markdown("")
+        self._relief = window.on(gui.add_checkbox("Relief", initial_value=True), lambda value: self._draw())
+        self._relief.hint = "Darker where the surface does not face the camera; off: the colours as they are"
+        self._path = window.on(gui.add_checkbox("Camera path", initial_value=True), lambda value: self._draw_path())
+        self._frusta = window.on(gui.add_checkbox("Keyframes", initial_value=False), lambda value: self._draw_path())
+        if view.surface.moves:
+            self._state = window.on(gui.add_checkbox("Moving tissue", initial_value=True), self._choose_state)
+            self._state.hint = "In the state of the frame; play the frames to see it move"
+        window.on(gui.add_button("Look at the whole surface"), view.look_at_all)
+        view.follow(frame=self._follow_frame, submap=self._follow_submap)
+        self._follow_submap()
+
+    def _options(self) -> list[str]:
+        found = list(colourings(self._view.surface))
+        return found if self._view.surface.is_empty else [*found, _COVERAGE]
+
+    def _choose_submap(self, name: str) -> None:
+        self._view.show_submap(self._names.index(name))
+
+    def _choose_state(self, value: bool) -> None:
+        self._view.in_state = value
+        self._draw()
+
+    def _follow_submap(self) -> None:
+        self._by.options = self._options()
+        self._by.value = self._by.options[0]
+        self._colour(self._by.value)
+        self._draw_path()
+
+    def _follow_frame(self) -> None:
+        if self._view.state is not None:
+            self._draw()
+
+    def _colour(self, name: str) -> None:
+        if name == _COVERAGE:
+            self._view.coverage(self._paint_coverage)
+            return
+        found = colourings(self._view.surface)[name]()
+        self._explain(found)
+        self._shown, self._colours = None, found.colours
+        self._draw()
+
+    def _explain(self, found: Colouring) -> None:
+        self._words.content, self._legend.visible = found.words, found.ramp is not None
+        if found.ramp is not None:
+            self._legend.image = legend_picture(found.ramp)
+
+    def _paint_coverage(self, found: Coverage) -> None:
+        # What was not examined would close the view into it.
+        part = found.painted.submesh([np.flatnonzero(np.isfinite(found.unseen))], append=True, repair=False)
+        assert isinstance(part, trimesh.Trimesh)
+        painted = simplified(part, _MOST_FACES)
+        seen, _, hidden = COLOURS
+        colours = {name: COLOURS[name] for name in (seen, hidden)}
+        sheet = Sheet(*_LEGEND_PX)
+        sheet.legend((6, 6), colours, _LEGEND_PX[0] / len(colours), 12)
+        self._legend.image, self._legend.visible = sheet.rgb, True
+        self._words.content = f"The surface is closed where it has gaps. {found.sentence}"
+        self._shown = np.asarray(painted.vertices), np.asarray(painted.faces), vertex_colours(painted)[:, :3]
+        self._draw()
+
+    def _draw(self) -> None:
+        surface, scene = self._view.surface, self._view.window.scene
+        if surface.is_empty:
+            scene.remove_by_name(_SURFACE)
+            self._words.content = "There is no surface."
+            return
+        if self._shown is not None:
+            vertices, faces, colours = self._shown
+        else:
+            vertices, faces, colours = surface.vertices_at(self._view.state), surface.faces, self._colours
+            colours = in_relief(surface, colours) if self._relief.value else colours
+        content = unlit_glb(vertices, faces, colours)
+        scene.add_glb(_SURFACE, content, cast_shadow=False, receive_shadow=False)
+
+    def _draw_path(self) -> None:
+        view, scene = self._view, self._view.window.scene
+        tracked = view.run.tracked
+        poses = tracked["T_world_camera"]
+        scene.remove_by_name(_PATH)
+        scene.remove_by_name(_KEYFRAMES)
+        if self._path.value:
+            draw_path(scene, _PATH, poses[:, :3, 3])
+        if self._frusta.value:
+            keyframes = np.flatnonzero(np.isin(tracked["index"], tracked["keyframe"]))
+            for row in keyframes[:: -(-len(keyframes) // _MOST_FRUSTA) or 1]:
+                scene.add_camera_frustum(
+                    f"{_KEYFRAMES}/{row}",
+                    view.vertical_fov,
+                    view.whole.camera.width / view.whole.camera.height,
+                    scale=_FRUSTUM_SHARE * view.surface.size_mm,
+                    color=PATH_COLOUR,
+                    thickness=1.5,
+                    thickness_units="screen",
+                    cast_shadow=False,
+                    receive_shadow=False,
+                    wxyz=quaternion(poses[row]),
+                    position=poses[row, :3, 3],
+                )
+
+
+def strip_words(view: ResultView) -> str:
+    """Return in words which part of the video is in which submap."""
+    times_s = view.whole.frames["time_s"]
+    parts = [
+        f"{times_s[part.first]:.1f} to {times_s[part.last]:.1f} s: submap {part.submap + 1}"
+        for part in video_parts(view.whole)
+    ]
+    return "Parts of the video: " + "; ".join(parts) + ". The submaps' relative poses are unknown."
+
+
+def _submap_words(view: ResultView, number: int) -> str:
+    count, submap = int((view.whole.frames.place == number).sum()), view.whole.submaps[number]
+    return f"{number + 1}: {count} frames, {WORDS[level_of_submap(submap)]}"

@@ -1,0 +1,63 @@
+"""The verdict on a result and its reasons, with the runs that would mend them as buttons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from scopemap.apps.browser.next_steps import NextRun, next_runs, source_of
+from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.window import escaped
+from scopemap.result.summary import summary_facts
+from scopemap.result.verdict import Level, Reason, verdict
+
+_NAMES: dict[Level, str] = {"bad": "Not usable", "doubtful": "Caution", "note": "Note"}
+_MOST_BUTTONS = 3
+
+
+def headline(view: ResultView) -> str:
+    """Return the verdict in a word, and what the result may be used for, as Markdown."""
+    found = verdict(view.whole)
+    return f"### {found.word.capitalize()}\n{escaped(found.advice)}"
+
+
+class VerdictPart:
+    """The facts, the cautions and the notes; `again` is called with an option and its value where one is chosen."""
+
+    def __init__(self, view: ResultView, again: Callable[[NextRun, str], None]) -> None:
+        self._view, self._again = view, again
+        gui, found = view.window.gui, verdict(view.whole)
+        self._can_run = view.workspace is not None and source_of(view.whole) is not None
+        facts = "\n".join(f"- **{name}**: {escaped(fact)}" for name, fact in summary_facts(view.whole).items())
+        gui.add_markdown(facts)
+        for reason in found.reasons:
+            if reason.level in ("bad", "doubtful"):
+                self._add(reason)
+        notes = [reason for reason in found.reasons if reason.level == "note"]
+        if notes:
+            with gui.add_folder("Notes", expand_by_default=False):
+                for reason in notes:
+                    self._add(reason)
+        good = [reason for reason in found.reasons if reason.level == "good"]
+        if good:
+            gui.add_markdown("\n".join(f"- {escaped(reason.text)}" for reason in good))
+
+    def _add(self, reason: Reason) -> None:
+        step = f" {escaped(reason.next_step)}" if reason.next_step else ""
+        self._view.window.gui.add_markdown(f"**{_NAMES[reason.level]}.** {escaped(reason.text)}{step}")
+        if self._can_run:
+            for run in next_runs(reason.next_step, self._view.whole):
+                self._offer(run)
+
+    def _offer(self, run: NextRun) -> None:
+        gui, window = self._view.window.gui, self._view.window
+        if run.number is not None:
+            first, low, high = run.number
+            number = gui.add_number(f"--{run.option}", first, min=low, max=high, step=0.01)
+            button = gui.add_button(run.label())
+            window.on(button, lambda: self._again(run, f"{number.value:g}"))
+        elif len(run.choices) > _MOST_BUTTONS:
+            choice = gui.add_dropdown(f"--{run.option}", run.choices)
+            window.on(gui.add_button(run.label()), lambda: self._again(run, choice.value))
+        else:
+            for value in run.choices or ("",):
+                window.on(gui.add_button(run.label(value)), self._again, run, value)

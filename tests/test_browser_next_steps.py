@@ -1,0 +1,113 @@
+"""Next steps of a verdict as runs: which options they name, and the arguments that repeat the run with one more."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from drawn_run import CAMERA, changed, draw_run, drawn_result
+from front_door import call
+
+from scopemap.apps.browser.next_steps import NextRun, arguments_again, next_runs, source_of
+from scopemap.apps.run.command import run as run_command
+from scopemap.engine.config.config import Config
+from scopemap.engine.notices import KINDS
+from scopemap.input.opening import open_sequence
+from scopemap.result.result import Result
+
+# Options that need a file, a box or a choice that nobody can make for the user.
+NOT_OFFERED = {"camera", "redact", "memory"}
+FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+
+
+def result_by(origin: str, **settings: Any) -> Result:
+    """A result in memory whose camera is known in a way."""
+    result = drawn_result(camera=FACTS | {"source": origin, "origin": origin})
+    return changed(result, config=Config.load(settings=settings), source_camera=CAMERA)
+
+
+def test_every_next_step_that_names_an_option_is_offered() -> None:
+    known = {name.replace("_", "-") for name in inspect.signature(run_command).parameters} | {"set"}
+    for code, kind in KINDS.items():
+        named = set(re.findall(r"--([a-z][a-z-]+)", kind.next_step))
+        assert named <= known, code
+        assert {run.option for run in next_runs(kind.next_step, result_by("assumed"))} == named - NOT_OFFERED, code
+
+
+def test_choices_and_values() -> None:
+    result = result_by("assumed")
+    assert next_runs("Run again with --scope laparoscope.", result) == [NextRun("scope", ("laparoscope",))]
+    assert next_runs("Try --scope sinus|capsule.", result) == [NextRun("scope", ("sinus", "capsule"))]
+    (scopes,) = next_runs("Run again with --scope.", result)
+    assert "colonoscope" in scopes.choices
+    (one,) = next_runs("Run again with --set mapping.method=local.", result)
+    assert one.label(*one.choices) == "Run again with --set mapping.method=local"
+    assert one.arguments(*one.choices) == ["--set", "mapping.method=local"]
+    (flag,) = next_runs("Run again with --deinterlace.", result)
+    assert (flag.label(), flag.arguments()) == ("Run again with --deinterlace", ["--deinterlace"])
+    (moment,) = next_runs("Run again with --surface-at SECONDS for it.", result)
+    assert moment.number is not None
+    assert moment.number[1] <= moment.number[0] <= moment.number[2]
+    assert next_runs("Look at the 2 submaps in maps/.", result) == next_runs("", result) == []
+
+
+def test_a_calibrated_lens_is_not_guessed_again() -> None:
+    assert next_runs("Check the calibration (--camera, --fov or --scope).", result_by("calibrated")) == []
+
+
+def test_the_run_is_repeated_with_what_its_settings_lack(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path / "run", camera=FACTS | {"source": "camera.yaml", "origin": "calibrated"})
+    changed(drawn_result(), source_camera=CAMERA, others=[]).save(tmp_path / "kept")
+    (tmp_path / "kept" / "source_camera.yaml").rename(folder / "source_camera.yaml")
+    words = arguments_again(Result(folder))
+    assert words[:2] == ["--config", str(folder / "config.toml")]
+    assert words[words.index("--size") + 1] == "80x64"
+    assert words[words.index("--dataset") + 1] == "video"
+    assert words[words.index("--camera") + 1] == str(folder / "source_camera.yaml")
+    assert words[words.index("--camera-fit") + 1] == "exact"
+    # Another lens comes instead of this one.
+    assert "--camera" not in arguments_again(Result(folder), "scope")
+
+
+@pytest.mark.parametrize("origin", ["assumed", "estimated"])
+def test_a_lens_that_was_not_given_is_not_given(tmp_path: Path, origin: str) -> None:
+    result = result_by(origin)
+    result.path = tmp_path
+    assert not {"--camera", "--fov"} & set(arguments_again(result))
+
+
+def test_a_stated_field_of_view_is_stated_again(tmp_path: Path) -> None:
+    result = result_by("stated")
+    result.path = tmp_path
+    words = arguments_again(result)
+    fov_deg = float(words[words.index("--fov") + 1])
+    assert fov_deg == pytest.approx(2 * np.degrees(np.arctan(40 / 60)))
+    assert "--fov" not in arguments_again(result, "fov")
+
+
+def test_a_result_whose_input_is_gone_or_was_live_has_no_source(tmp_path: Path) -> None:
+    folder, video = tmp_path / "run", tmp_path / "video.mp4"
+    draw_run(folder, name=str(video))
+    assert source_of(Result(folder)) is None
+    video.write_bytes(b"")
+    assert source_of(Result(folder)) == video
+    draw_run(tmp_path / "live", name=str(video), dataset="live")
+    assert source_of(Result(tmp_path / "live")) is None
+
+
+@pytest.mark.slow
+def test_the_repeated_run_has_the_same_camera_and_bytes(tmp_path: Path) -> None:
+    from importlib.resources import as_file, files
+
+    with as_file(files("scopemap.apps.demo") / "clip") as clip:
+        first, camera = tmp_path / "first", clip / "camera.yaml"
+        assert call("run", clip / "colon.mp4", "--out", first, "--camera", camera, "--frames", "0:14", "--quiet") == 0
+        again = tmp_path / "again"
+        assert call("run", clip / "colon.mp4", "--out", again, "--quiet", *arguments_again(Result(first))) == 0
+        assert open_sequence(clip / "colon.mp4", camera=camera).camera == Result(again).camera
+    for name in ("trajectory.tum", "mesh.ply", "frames.csv"):
+        assert (first / name).read_bytes() == (again / name).read_bytes(), name

@@ -1,0 +1,269 @@
+"""The window from the choice of a video to the verdict: its pages without a browser, and in Chromium."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from window_without_browser import element, elements, press, settle, until, words
+
+from scopemap.apps.browser import command
+from scopemap.apps.browser.input_page import InputPage
+from scopemap.apps.browser.looking import measured_rates
+from scopemap.apps.browser.result_page import ResultPage
+from scopemap.apps.browser.run_page import RunPage
+from scopemap.apps.browser.start_page import StartPage
+from scopemap.apps.browser.window import Window
+from scopemap.apps.browser.workspace import Workspace
+from scopemap.result.result import Result
+from scopemap.result.run_view import read_map, view_folder
+from scopemap.result.verdict import verdict
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+# Without a graphics card: WebGL on the processor.
+ARGUMENTS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
+CLIP = Path(command.__file__).parents[1] / "demo" / "clip" / "colon.mp4"
+LIMIT_BYTES = 1_000_000
+PATIENCE_S = 240.0
+SIZE_SO_FAR = re.compile(r"The surface so far: ([\d,]+) points")
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[tuple[Window, Workspace]]:
+    with Workspace(tmp_path) as workspace:
+        window = Window()
+        window.always(workspace.runs.tick)
+        window.show(StartPage(workspace))
+        settle(window)
+        yield window, workspace
+        window.close()
+
+
+def test_a_video_that_cannot_be_read_is_a_sentence(opened: tuple[Window, Workspace]) -> None:
+    window, workspace = opened
+    (workspace.folder / "broken.mp4").write_bytes(b"no video at all")
+    window.show(StartPage(workspace))
+    settle(window)
+    press(window, "Video", "broken.mp4")
+    until(window, lambda: "reading the video" in words(window))
+    assert "Invalid data found" in words(window)
+    assert "Traceback" not in words(window)
+    assert "Reconstruct" not in words(window)
+    press(window, "Back to the start")
+    assert isinstance(window._page, StartPage)
+    assert "reading the video" not in words(window)
+
+
+def test_paths_out_of_the_folder_are_refused_in_the_page(opened: tuple[Window, Workspace]) -> None:
+    window, workspace = opened
+    for typed, said in (("../x.mp4", "is not in"), ("/etc/passwd", "is not in"), ("no.mp4", "there is no no.mp4")):
+        element(window, "Other path")._impl.value = typed
+        press(window, "Choose this path")
+        assert said in words(window)
+        assert isinstance(window._page, StartPage)
+    (workspace.folder / "deep").mkdir()
+    shutil.copyfile(CLIP, workspace.folder / "deep" / "clip.mp4")
+    element(window, "Other path")._impl.value = "deep/clip.mp4"
+    press(window, "Choose this path")
+    assert isinstance(window._page, InputPage)
+
+
+def test_switches_make_the_command(opened: tuple[Window, Workspace]) -> None:
+    window, workspace = opened
+    for name in ("colon.mp4", "camera.yaml"):
+        shutil.copyfile(CLIP.with_name(name), workspace.folder / name)
+    window.show(StartPage(workspace))
+    settle(window)
+    press(window, "Video", "colon.mp4")
+    until(window, lambda: "in a terminal" in words(window))
+    assert f"--camera={workspace.folder / 'camera.yaml'}" in words(window)
+    assert "good: motion, sharpness and texture" in words(window)
+    press(window, "Camera", "by its field of view")
+    press(window, "Field of view, degrees", 100.0)
+    press(window, "Endoscope", "colonoscope")
+    press(window, "Frames", "0:30")
+    press(window, "Nearest tissue, mm", 5.0)
+    assert "both be given" in words(window)
+    assert element(window, "Reconstruct").disabled
+    press(window, "Farthest tissue, mm", 80.0)
+    assert not element(window, "Reconstruct").disabled
+    said = " ".join(words(window).split())
+    assert "--scope=colonoscope --fov=100 --frames=0:30 --near-far=5:80" in said
+    press(window, "Camera", "/etc/passwd")  # what is not of the list
+    assert "choose one of the list" in words(window)
+    assert "--fov=100" in words(window)
+    page: Any = window._page
+    assert page.choice.arguments() == ["--scope=colonoscope", "--fov=100", "--frames=0:30", "--near-far=5:80"]
+
+
+def test_a_run_that_dies_is_told_and_goes_on_when_it_is_asked_again(opened: tuple[Window, Workspace]) -> None:
+    window, workspace = opened
+    press(window, "Try the demonstration")
+    page: Any = window._page
+    assert isinstance(page, RunPage)
+    run = workspace.runs.runs[0]
+    sizes, kept = list[str](), list[int]()
+
+    def grows() -> bool:
+        if (found := SIZE_SO_FAR.search(words(window))) and found[1] not in sizes:
+            sizes.append(found[1])
+            seen = read_map(view_folder(run.out))
+            kept.append(0 if seen is None else len(seen.points))
+        return len(sizes) >= 3 or run.status != "running"
+
+    until(window, grows, PATIENCE_S)
+    shown = [int(size.replace(",", "")) for size in sizes]
+    assert len(shown) >= 3, words(window)
+    assert shown == sorted(shown), "the surface grows"
+    assert kept == sorted(kept)
+    # Another run waits meanwhile, and the start page lists both.
+    press(window, "Back to the start")
+    later = workspace.reconstruct(CLIP, ["--frames=0:4"])
+    until(window, lambda: "colon_2 waits: 1 before it" in words(window))
+    assert "colon runs: " in words(window)
+    window._page.show_run(run)  # type: ignore[union-attr]
+    settle(window)
+    assert run._process is not None
+    os.kill(run._process.pid, signal.SIGKILL)
+    until(window, lambda: "The run has failed" in words(window))
+    assert "exit code -9" in words(window)
+    assert "start it again: it goes on where it was" in words(window)
+    later.stop()
+    until(window, lambda: workspace.runs.running is None, PATIENCE_S)
+    press(window, "Back to the start")
+    assert "has failed" in words(window)
+    assert "colon was interrupted" in words(window)
+    press(window, "Try the demonstration")
+    again = workspace.runs.runs[-1]
+    assert (again.out, again.arguments) == (run.out, run.arguments)
+    until(window, lambda: isinstance(window._page, ResultPage), PATIENCE_S)
+    assert verdict(Result(run.out)).word.capitalize() in words(window)
+    # What it took tells how long the next one takes.
+    assert len(measured_rates(workspace.finished, "default")) >= 1
+    assert measured_rates(workspace.finished, "realtime") == []
+    window.show(StartPage(workspace))
+    settle(window)
+    assert run.out.name in element(window, "Result").options
+    assert not any(getattr(one, "options", ()) == ("Look at it", "Stop") for one in elements(window))
+
+
+# In Chromium.
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[str, Path]]:
+    """Where a window on an empty folder is, and the folder."""
+    folder = tmp_path / "videos"
+    folder.mkdir()
+    arguments = [str(folder), "--no-browser", "--upload-limit", str(LIMIT_BYTES / 1e9)]
+    program = [sys.executable, "-m", "scopemap", "app", *arguments]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield process.stdout.readline().split()[0], folder
+        process.terminate()
+        process.wait(60)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+        yield started
+        started.close()
+
+
+class Opened:
+    """A page that was opened, and what it asked for."""
+
+    def __init__(self, browser: Any, url: str, size: tuple[int, int] = (1280, 800)) -> None:
+        self.page = browser.new_context(viewport={"width": size[0], "height": size[1]}).new_page()
+        self.requests: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("websocket", lambda socket: self.requests.append(socket.url))
+        self.page.goto(url)
+        self.until(lambda: "Dark" in self.text())
+
+    def text(self) -> str:
+        return str(self.page.inner_text("body"))
+
+    def until(self, is_so: Callable[[], object]) -> None:
+        # Polled from here: the page's own policy forbids what `wait_for_function` does.
+        end = time.monotonic() + PATIENCE_S
+        while not is_so():
+            assert time.monotonic() < end, self.text()
+            self.page.wait_for_timeout(100)
+
+    def press(self, name: str) -> None:
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def points(self) -> int:
+        found = SIZE_SO_FAR.search(self.text())
+        return int(found[1].replace(",", "")) if found else 0
+
+
+def test_the_demonstration_from_the_button_to_the_verdict(browser: Any, served: tuple[str, Path]) -> None:
+    url, folder = served
+    first = Opened(browser, url)
+    assert "Everything stays on this machine" in first.text()
+    first.press("Try the demonstration")
+    sizes = list[int]()
+
+    def grows() -> bool:
+        points = first.points()
+        if points > (sizes[-1] if sizes else 0):
+            sizes.append(points)
+        return len(sizes) >= 3
+
+    first.until(grows)
+    # Another browser, narrower, and the same one reloaded show the run, too.
+    second = Opened(browser, url, (800, 700))
+    assert second.page.evaluate("document.documentElement.scrollWidth") <= 800
+    first.page.reload()
+    out = folder / "scopemap" / "colon"
+    for one in (first, second):
+        one.until(lambda one=one: one.points() >= sizes[-1] or (out / "provenance.json").exists())
+    first.until(lambda: (out / "provenance.json").exists())
+    word = verdict(Result(out)).word.capitalize()
+    for one in (first, second):
+        one.until(lambda one=one: word in one.text())
+    hosts = {re.sub(r"^(\w+://[^/]+).*", r"\1", asked) for asked in first.requests + second.requests}
+    own = url.rstrip("/")
+    local = {one for one in hosts if not one.startswith(("data:", "blob:"))}
+    assert local == {own, own.replace("http", "ws")}
+
+
+def test_a_video_is_sent_looked_at_run_and_stopped(browser: Any, served: tuple[str, Path], tmp_path: Path) -> None:
+    url, folder = served
+    opened = Opened(browser, url)
+    large = tmp_path / "large.mp4"
+    large.write_bytes(bytes(2 * LIMIT_BYTES))
+    chooser = opened.page.locator("input[type=file]")
+    chooser.set_input_files(large)
+    opened.until(lambda: "at most 1.0 MB are taken" in opened.text())
+    # Nothing says that it was taken, and the button takes the next one.
+    opened.page.wait_for_timeout(500)
+    assert "uploaded successfully" not in opened.text()
+    assert "large.mp4" not in opened.text()
+    chooser.set_input_files(CLIP)
+    opened.until(lambda: "The same in a terminal" in opened.text())
+    assert "video_001.mp4" in opened.text()
+    assert "good: motion, sharpness and texture" in opened.text()
+    opened.press("Reconstruct")
+    opened.until(lambda: opened.points() > 0)
+    opened.press("Stop and keep what there is")
+    out = folder / "scopemap" / "video_001"
+    opened.until(lambda: (out / "provenance.json").exists())
+    word = verdict(Result(out)).word.capitalize()
+    opened.until(lambda: word in opened.text())

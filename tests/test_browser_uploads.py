@@ -1,0 +1,119 @@
+"""Videos that are sent to the window's page: streamed to disk, limited, and gone with the session unless kept."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from window_without_browser import Client, element, settle, until, words
+
+from scopemap.apps.browser.input_page import InputPage
+from scopemap.apps.browser.start_page import StartPage
+from scopemap.apps.browser.window import Window
+from scopemap.apps.browser.workspace import Workspace
+
+LIMIT = 100_000
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[tuple[Window, Workspace, Client]]:
+    with Workspace(tmp_path, most_bytes=LIMIT) as workspace:
+        window = Window()
+        window.show(StartPage(workspace))
+        settle(window)
+        client = Client(window)
+        yield window, workspace, client
+        client.close()
+        window.close()
+
+
+def files(workspace: Workspace) -> list[str]:
+    return sorted(path.name for path in workspace.uploads.iterdir()) if workspace.uploads.is_dir() else []
+
+
+def button(window: Window) -> Any:
+    return element(window, "Send a video")
+
+
+def test_a_file_is_written_as_it_comes_under_a_name_of_ours(opened: tuple[Window, Workspace, Client]) -> None:
+    window, workspace, client = opened
+    client.start(button(window), "../../Müller 1970.MP4", 10)
+    client.part(button(window), 0, b"01234")
+    until(window, lambda: workspace.receiver(window.server).progress == 50)
+    assert files(workspace) == ["video_001.mp4.part"]
+    assert workspace.sent == []
+    client.part(button(window), 1, b"56789")
+    until(window, lambda: isinstance(window._page, InputPage))
+    assert (workspace.uploads / "video_001.mp4").read_bytes() == b"0123456789"
+    assert workspace.sent == [workspace.uploads / "video_001.mp4"]
+    assert "Müller" not in words(window)
+
+
+@pytest.mark.parametrize(
+    ("size", "parts", "sentence"),
+    [
+        (2 * LIMIT, [], "the video has 200.0 kB, at most 100.0 kB are taken"),
+        (0, [], "is empty"),
+        (6, [(1, b"abc")], "its parts do not make up the file"),
+        (6, [(0, b"abc"), (0, b"abc")], "its parts do not make up the file"),
+        (2, [(0, b"abc")], "its parts do not make up the file"),
+    ],
+)
+def test_what_is_refused_is_refused_in_a_sentence(
+    opened: tuple[Window, Workspace, Client], size: int, parts: list[tuple[int, bytes]], sentence: str
+) -> None:
+    window, workspace, client = opened
+    client.start(button(window), "a.mp4", size)
+    for index, content in parts:
+        client.part(button(window), index, content)
+    until(window, lambda: sentence in words(window))
+    assert files(workspace) == []
+    # What is still sent of it is dropped, and the next one is taken.
+    client.part(button(window), 5, b"more")
+    client.start(button(window), "b.mkv", 1, "2")
+    client.part(button(window), 0, b"x", "2")
+    until(window, lambda: files(workspace) == ["video_001.mkv"])
+
+
+def test_a_full_disk_and_other_buttons_take_nothing(
+    opened: tuple[Window, Workspace, Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    window, workspace, client = opened
+    # viser's own would keep it in memory, for any element.
+    client.start(element(window, "Try the demonstration"), "a.mp4", 5, "0")
+    client.part(element(window, "Try the demonstration"), 0, b"12345", "0")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=500_000_001))
+    client.start(button(window), "a.mp4", 5)
+    until(window, lambda: "make room first" in words(window))
+    assert files(workspace) == []
+    assert not window.gui._current_file_upload_states
+
+
+def test_what_came_in_part_goes_with_its_browser_and_with_the_window(opened: tuple[Window, Workspace, Client]) -> None:
+    window, workspace, client = opened
+    other = Client(window)
+    for number, sender in (("1", client), ("2", other)):
+        sender.start(button(window), "a.mp4", 10, number)
+        sender.part(button(window), 0, b"0", number)
+    until(window, lambda: len(files(workspace)) == 2)
+    other.part(button(window), 1, b"123456789", "1")  # of another's file
+    other.close()
+    until(window, lambda: files(workspace) == ["video_001.mp4.part"])
+    until(window, lambda: "the connection to the page was lost" in words(window))
+    workspace.receiver(window.server).close()
+    assert files(workspace) == []
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_uploads_go_with_the_session_unless_they_are_kept(tmp_path: Path, keep: bool) -> None:
+    with Workspace(tmp_path, keep_uploads=keep) as workspace:
+        file = workspace.new_upload("a.mp4")
+        file.write_bytes(b"x")
+        assert workspace.new_upload("no ending").name == "video_002.video"
+    assert file.exists() == keep
+    assert file.is_relative_to(tmp_path / "scopemap" / "uploads") == keep
+    assert workspace.uploads.parent.exists() == keep
