@@ -90,7 +90,7 @@ def test_a_stream_is_read_as_it_comes(clip: Path, tmp_path: Path) -> None:
                 sent.mux(packet)
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Silent, directory=str(tmp_path))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        source = LiveSource(f"http://127.0.0.1:{server.server_port}/clip.ts")
+        source = LiveSource(f"http://localhost:{server.server_port}/clip.ts")
         indices = [frame.index for frame in source.frames(slice(None))]
         server.shutdown()
     assert (source.width, source.height) == (160, 128)

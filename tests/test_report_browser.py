@@ -21,7 +21,7 @@ from front_door import call
 from scopemap.apps.measure.measure import measure
 from scopemap.engine.errors import InputError
 from scopemap.engine.mapping.tissue_states import TissueStates
-from scopemap.report.page import keep_measurements, serve_view, write_comparison, write_report
+from scopemap.report.page import keep_measurements, write_comparison, write_report
 from scopemap.result.result import Result
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -365,34 +365,30 @@ def test_blind_spots_are_listed_and_shown(browser: Any, tmp_path: Path) -> None:
 
 def test_without_a_scale_a_reference_is_the_unit(browser: Any, tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
-    # The full page, served, keeps what was measured beside the result.
-    server = serve_view(folder)
-    try:
-        opened = Opened(browser, server.url)
-        opened.slide(FRAMES - 1)  # in maps/1
-        opened.page.locator("#pick-distance").click()
-        assert opened.text("#hand-note").startswith("Sizes are unknown: first choose Reference")
-        opened.page.locator("#pick-reference").click()
-        click(opened, "#video", (0.3, 0.7), (0.36, 0.64))
-        assert re.search(r"reference is \d\.\d px long: 10 px are needed", opened.text("#hand-note"))
-        click(opened, "#video", (0.3, 0.7), (0.4, 0.6))
-        opened.page.locator("#pick-distance").click()
-        click(opened, "#video", (0.3, 0.4), (0.62, 0.7))
-        opened.wait("measures", "1")
-        words, ratios = measured_in_both(opened, folder, 0)
-        # What was found is said where it is seen without scrolling.
-        assert words.startswith(opened.text("#hand-note"))
-        note = opened.page.locator("#hand-note").bounding_box()
-        assert 0 < note["y"] < note["y"] + note["height"] < DESKTOP[1]
-        assert "scopemap measure maps/1" in words
-        assert "times the reference" in words
-        np.testing.assert_allclose(list(ratios.values()), 1, rtol=1e-9)
+    opened = Opened(browser, write_report(folder)[0])
+    opened.slide(FRAMES - 1)  # in maps/1
+    opened.page.locator("#pick-distance").click()
+    assert opened.text("#hand-note").startswith("Sizes are unknown: first choose Reference")
+    opened.page.locator("#pick-reference").click()
+    click(opened, "#video", (0.3, 0.7), (0.36, 0.64))
+    assert re.search(r"reference is \d\.\d px long: 10 px are needed", opened.text("#hand-note"))
+    click(opened, "#video", (0.3, 0.7), (0.4, 0.6))
+    opened.page.locator("#pick-distance").click()
+    click(opened, "#video", (0.3, 0.4), (0.62, 0.7))
+    opened.wait("measures", "1")
+    words, ratios = measured_in_both(opened, folder, 0)
+    # What was found is said where it is seen without scrolling.
+    assert words.startswith(opened.text("#hand-note"))
+    note = opened.page.locator("#hand-note").bounding_box()
+    assert 0 < note["y"] < note["y"] + note["height"] < DESKTOP[1]
+    assert "scopemap measure maps/1" in words
+    assert "times the reference" in words
+    np.testing.assert_allclose(list(ratios.values()), 1, rtol=1e-9)
+    with opened.page.expect_download() as download:
         opened.page.locator("#save-json").click()
-        opened.page.wait_for_timeout(300)
-        assert opened.text("#hand-note") == "Saved as measurements.json beside the result."
-        assert json.loads((folder / "measurements.json").read_text())[0]["folder"] == "maps/1"
-        assert Opened(browser, server.url).page.locator("#measures li").all_inner_texts() == [words]
-        with pytest.raises(InputError, match="no list of measurements"):
-            keep_measurements(folder, b"{}")
-    finally:
-        server.close()
+    keep_measurements(folder, Path(download.value.path()).read_bytes())
+    assert json.loads((folder / "measurements.json").read_text())[0]["folder"] == "maps/1"
+    again = Opened(browser, write_report(folder)[0])
+    assert again.page.locator("#measures li").all_inner_texts() == [words]
+    with pytest.raises(InputError, match="no list of measurements"):
+        keep_measurements(folder, b"{}")

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from scopemap.apps.browser.serving import check_installed
 
-LIVE_BUTTONS = {"Pause or go on": "pause", "Forget all and begin anew": "reset", "Write a snapshot": "snapshot"}
+LIVE_BUTTONS = {"Pause or go on": "pause", "Forget all and start again": "reset", "Write a snapshot": "snapshot"}
 """Of a live stream: names of what they do by what is written on them."""
 _DONE, _FAILED = "done", "failed: "
 

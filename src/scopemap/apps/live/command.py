@@ -21,6 +21,7 @@ from scopemap.terminal.terminal_keys import terminal_keys
 
 if TYPE_CHECKING:
     from scopemap.apps.live.live import LiveSession
+    from scopemap.engine.config import Config
     from scopemap.engine.odometry import Step
     from scopemap.runner.reconstructor import Reconstructor
 
@@ -64,7 +65,7 @@ def live(
     size: options.Size = None,
     settings: options.SetPairs = None,
     overwrite: options.Overwrite = False,
-    watched: Annotated[bool, typer.Option("--watched", hidden=True)] = False,
+    watched: Annotated[bool, typer.Option("--watched", hidden=True, help="Write what the window shows.")] = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
@@ -73,15 +74,9 @@ def live(
     Keys: p pauses, r discards everything and starts again, s writes a snapshot, q stops. Ctrl-C also stops and writes
     the result; a second Ctrl-C writes nothing.
     """
-    from scopemap.engine.config import Config
-
     if port is not None and not in_app:
         raise typer.BadParameter("it is that of --app", param_hint="--port")
-    chosen: dict[str, Any] = {"depth.near_far_mm": options.parse_near_far(near_far)} if near_far else {}
-    chosen |= {"input.scope": scope} if scope else {}
-    config = Config.load(
-        "realtime", settings=chosen | {"input.focal": "assume"} | options.parse_settings(settings or [])
-    )
+    config = _config(near_far, scope, settings or [])
 
     from scopemap.apps.coverage.live_map import KeptDepth, LiveCoverage
     from scopemap.apps.live.live import LiveSession, finished
@@ -131,15 +126,22 @@ def live(
                 pictures.save(folder)
                 kept.move_to(folder)
                 write_checksums(folder, without=NOT_OF_THE_RESULT)
-        state = session.state()
         if out is not None:
             write_report(out)
-        if as_json:
-            print_json(result.provenance | {"live": state})
-        elif not quiet:
-            _print(result.provenance, state, out)
+        if not silent:
+            _print(result.provenance, session.state(), out)
+        elif as_json:
+            print_json(result.provenance | {"live": session.state()})
     if interruption.exit_code:
         raise typer.Exit(interruption.exit_code)
+
+
+def _config(near_far: str | None, scope: str | None, settings: list[str]) -> Config:
+    from scopemap.engine.config import Config
+
+    chosen: dict[str, Any] = {"depth.near_far_mm": options.parse_near_far(near_far)} if near_far else {}
+    chosen |= {"input.scope": scope} if scope else {}
+    return Config.load("realtime", settings=chosen | {"input.focal": "assume"} | options.parse_settings(settings))
 
 
 @contextmanager

@@ -54,7 +54,7 @@ def words_and_facts(state: dict[str, Any], coverage: str) -> tuple[str, dict[str
         "frames": f"{state['frames_per_s']} per second; {state['dropped']} of {state['read']} dropped",
         "tracked": f"{state['tracked']}, lost {state['lost']}, submap {state['map'] + 1}",
         "scale": "known" if state["scale_known"] else "unknown: compare shapes, not sizes",
-        "surface": "full: no more tissue is added; forget all to begin a new one" if state["full"] else "",
+        "surface": "full: no more tissue is added; forget all to start a new one" if state["full"] else "",
         "snapshot": state["snapshot"],
         "coverage": coverage,
     }

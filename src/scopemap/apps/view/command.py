@@ -44,9 +44,9 @@ def view(
     ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
 ) -> None:
-    """Show a result in a browser window: its surface, its frames, measurements (extra app).
+    """Show a result, or compare two, in a browser window.
 
-    The window is at localhost until Ctrl-C. Films need neither the window nor the extra.
+    The window needs the extra app and is at localhost until Ctrl-C. Films need neither.
     """
     if colours is not None and video is None:
         raise typer.BadParameter("they are those of --video", param_hint="--colours")
