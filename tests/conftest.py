@@ -39,6 +39,7 @@ CLUSTER = {"test_engines", "test_addresses"}
 SLOW = {
     "test_backwards",
     "test_bad_input",
+    "test_browser_result_page",
     "test_baselines_photometric",
     "test_batch",
     "test_benchmark_runner",
