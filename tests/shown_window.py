@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
-from scopemap.apps.browser.window import Page, Window
+from scopemap.apps.browser.window import BrowserWindow, Page
 
 _PATIENCE_S = 120.0
 
@@ -17,7 +17,7 @@ class ShownWindow:
     """A window that does what is to be done in the test's own thread."""
 
     def __init__(self, *, anonymous: bool = False) -> None:
-        self.window = Window(0, anonymous=anonymous)
+        self.window = BrowserWindow(0, anonymous=anonymous)
 
     def show(self, page: Page) -> None:
         """Show a page and do what it asks for at once."""

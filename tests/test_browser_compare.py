@@ -24,7 +24,7 @@ from front_door import call, refused
 
 from scopemap.apps.browser.compare_page import ComparePage
 from scopemap.apps.browser.two_results import apart_of, compare_results, is_alone, is_same_input
-from scopemap.apps.browser.window import Window
+from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.exams.compare_exams import Change, ExamComparison
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.align import Similarity
@@ -132,8 +132,8 @@ def test_the_input_is_known_by_its_content_else_by_its_name(tmp_path: Path) -> N
 
 
 @contextmanager
-def opened(page: ComparePage, *, anonymous: bool = False) -> Iterator[Window]:
-    window = Window(anonymous=anonymous)
+def opened(page: ComparePage, *, anonymous: bool = False) -> Iterator[BrowserWindow]:
+    window = BrowserWindow(anonymous=anonymous)
     try:
         window.show(page)
         yield window

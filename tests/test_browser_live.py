@@ -25,7 +25,7 @@ from tiny_phantom import write_tiny
 from scopemap.apps.browser.live_page import open_live
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
-from scopemap.apps.browser.window import Window
+from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.apps.live.shown import words_and_facts
 from scopemap.engine.errors import InputError
@@ -132,7 +132,7 @@ def test_a_session_whose_window_is_gone_ends_with_its_result(clip: Path, tmp_pat
 
 def test_a_stream_in_the_window(clip: Path, tmp_path: Path) -> None:
     with Workspace(tmp_path) as workspace:
-        window = Window()
+        window = BrowserWindow()
         try:
             open_live(window, workspace, str(clip))
             until(window, lambda: "tracked at" in words(window), PATIENCE_S)

@@ -20,7 +20,7 @@ from drawn_run import draw_run
 from front_door import call
 
 from scopemap.apps.browser.result_page import ResultPage
-from scopemap.apps.browser.window import Window
+from scopemap.apps.browser.window import BrowserWindow
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -45,7 +45,7 @@ def browser() -> Iterator[Any]:
 class Looked:
     """A browser that looks at a window, which runs in a thread."""
 
-    def __init__(self, browser: Any, window: Window, size: tuple[int, int]) -> None:
+    def __init__(self, browser: Any, window: BrowserWindow, size: tuple[int, int]) -> None:
         self.window = window
         self.page = browser.new_context(viewport={"width": size[0], "height": size[1]}).new_page()
         self.page.set_default_timeout(1000 * PATIENCE_S)
@@ -76,7 +76,7 @@ class Looked:
 
 @pytest.fixture
 def shown(browser: Any, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Looked, ResultPage, Path]]:
-    folder, window = draw_run(tmp_path, scale=KNOWN), Window(0)
+    folder, window = draw_run(tmp_path, scale=KNOWN), BrowserWindow(0)
     page = ResultPage(folder)
     window.show(page)
     thread = threading.Thread(target=window.run, daemon=True)

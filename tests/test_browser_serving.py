@@ -22,7 +22,7 @@ from scopemap.apps.browser.input_page import InputPage
 from scopemap.apps.browser.names import Names
 from scopemap.apps.browser.serving import url_of
 from scopemap.apps.browser.start_page import StartPage
-from scopemap.apps.browser.window import Window, escaped, fenced
+from scopemap.apps.browser.window import BrowserWindow, escaped, fenced
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.cli.app import app
 
@@ -30,23 +30,23 @@ DEMO = Path(command.__file__).parents[1] / "demo" / "clip"
 
 
 @pytest.fixture
-def window() -> Iterator[Window]:
-    made = Window()
+def window() -> Iterator[BrowserWindow]:
+    made = BrowserWindow()
     yield made
     made.close()
 
 
-def port_of(window: Window) -> int:
+def port_of(window: BrowserWindow) -> int:
     return int(window.server.get_port())
 
 
-def ask(window: Window, **headers: str) -> http.client.HTTPResponse:
+def ask(window: BrowserWindow, **headers: str) -> http.client.HTTPResponse:
     connection = http.client.HTTPConnection("127.0.0.1", port_of(window), timeout=10)
     connection.request("GET", "/", headers={"Host": f"localhost:{port_of(window)}"} | headers)
     return connection.getresponse()
 
 
-def test_other_hosts_and_origins_are_refused(window: Window) -> None:
+def test_other_hosts_and_origins_are_refused(window: BrowserWindow) -> None:
     own = f"http://localhost:{port_of(window)}"
     assert ask(window).status == ask(window, Origin=own).status == 200
     for headers in ({"Host": "evil.example"}, {"Origin": "https://evil.example"}, {"Origin": "null"}, {"Host": ""}):
@@ -65,7 +65,7 @@ def test_other_hosts_and_origins_are_refused(window: Window) -> None:
         assert caught.value.response.status_code == 403
 
 
-def test_the_page_may_load_nothing_from_elsewhere(window: Window) -> None:
+def test_the_page_may_load_nothing_from_elsewhere(window: BrowserWindow) -> None:
     response = ask(window)
     policy = dict(part.strip().partition(" ")[::2] for part in response.headers["Content-Security-Policy"].split(";"))
     assert policy["default-src"].startswith("'self' ")
@@ -75,7 +75,7 @@ def test_the_page_may_load_nothing_from_elsewhere(window: Window) -> None:
     assert b"<title>scopemap</title>" in response.read()
 
 
-def test_no_client_opens_a_tunnel(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_client_opens_a_tunnel(window: BrowserWindow, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[object] = []
     monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda self, **rest: asked.append(self))
     client = Client(window)
@@ -89,7 +89,9 @@ def test_no_client_opens_a_tunnel(window: Window, monkeypatch: pytest.MonkeyPatc
     assert messages.ShareUrlRequest not in window.server._websock_server._incoming_handlers
 
 
-def test_light_and_dark_stay_from_page_to_page(tmp_path: Path, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_light_and_dark_stay_from_page_to_page(
+    tmp_path: Path, window: BrowserWindow, monkeypatch: pytest.MonkeyPatch
+) -> None:
     themes: list[bool] = []
     monkeypatch.setattr(window.gui, "configure_theme", lambda **rest: themes.append(rest["dark_mode"]))
     with Workspace(tmp_path) as workspace:
@@ -144,7 +146,7 @@ def test_anonymous_pages_show_no_names(tmp_path: Path) -> None:
     (folder / "Max.mp4").write_bytes(b"no video")
     names = ("Mustermann", "Erika", "Max", str(tmp_path))
     with Workspace(folder) as workspace:
-        window = Window(anonymous=True)
+        window = BrowserWindow(anonymous=True)
         try:
             window.show(StartPage(workspace))
             settle(window)

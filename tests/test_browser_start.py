@@ -22,7 +22,7 @@ from scopemap.apps.browser.looking import measured_rates
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.start_page import StartPage
-from scopemap.apps.browser.window import Window
+from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.result.result import Result
 from scopemap.result.run_view import read_map, view_folder
@@ -38,9 +38,9 @@ SIZE_SO_FAR = re.compile(r"The surface so far: ([\d,]+) points")
 
 
 @pytest.fixture
-def opened(tmp_path: Path) -> Iterator[tuple[Window, Workspace]]:
+def opened(tmp_path: Path) -> Iterator[tuple[BrowserWindow, Workspace]]:
     with Workspace(tmp_path) as workspace:
-        window = Window()
+        window = BrowserWindow()
         window.always(workspace.runs.tick)
         window.show(StartPage(workspace))
         settle(window)
@@ -48,7 +48,7 @@ def opened(tmp_path: Path) -> Iterator[tuple[Window, Workspace]]:
         window.close()
 
 
-def test_a_video_that_cannot_be_read_is_a_sentence(opened: tuple[Window, Workspace]) -> None:
+def test_a_video_that_cannot_be_read_is_a_sentence(opened: tuple[BrowserWindow, Workspace]) -> None:
     window, workspace = opened
     (workspace.folder / "broken.mp4").write_bytes(b"no video at all")
     window.show(StartPage(workspace))
@@ -63,7 +63,7 @@ def test_a_video_that_cannot_be_read_is_a_sentence(opened: tuple[Window, Workspa
     assert "reading the video" not in words(window)
 
 
-def test_paths_out_of_the_folder_are_refused_in_the_page(opened: tuple[Window, Workspace]) -> None:
+def test_paths_out_of_the_folder_are_refused_in_the_page(opened: tuple[BrowserWindow, Workspace]) -> None:
     window, workspace = opened
     for typed, said in (("../x.mp4", "is not in"), ("/etc/passwd", "is not in"), ("no.mp4", "there is no no.mp4")):
         element(window, "Other path")._impl.value = typed
@@ -77,7 +77,7 @@ def test_paths_out_of_the_folder_are_refused_in_the_page(opened: tuple[Window, W
     assert isinstance(window._page, InputPage)
 
 
-def test_switches_make_the_command(opened: tuple[Window, Workspace]) -> None:
+def test_switches_make_the_command(opened: tuple[BrowserWindow, Workspace]) -> None:
     window, workspace = opened
     for name in ("colon.mp4", "camera.yaml"):
         shutil.copyfile(CLIP.with_name(name), workspace.folder / name)
@@ -105,7 +105,7 @@ def test_switches_make_the_command(opened: tuple[Window, Workspace]) -> None:
     assert page.choice.arguments() == ["--scope=colonoscope", "--fov=100", "--frames=0:30", "--near-far=5:80"]
 
 
-def test_a_run_that_dies_is_told_and_goes_on_when_it_is_asked_again(opened: tuple[Window, Workspace]) -> None:
+def test_a_run_that_dies_is_told_and_goes_on_when_it_is_asked_again(opened: tuple[BrowserWindow, Workspace]) -> None:
     window, workspace = opened
     press(window, "Try the demonstration")
     page: Any = window._page

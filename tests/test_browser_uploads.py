@@ -13,16 +13,16 @@ from window_without_browser import Client, element, settle, until, words
 
 from scopemap.apps.browser.input_page import InputPage
 from scopemap.apps.browser.start_page import StartPage
-from scopemap.apps.browser.window import Window
+from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.browser.workspace import Workspace
 
 LIMIT = 100_000
 
 
 @pytest.fixture
-def opened(tmp_path: Path) -> Iterator[tuple[Window, Workspace, Client]]:
+def opened(tmp_path: Path) -> Iterator[tuple[BrowserWindow, Workspace, Client]]:
     with Workspace(tmp_path, most_bytes=LIMIT) as workspace:
-        window = Window()
+        window = BrowserWindow()
         window.show(StartPage(workspace))
         settle(window)
         client = Client(window)
@@ -35,11 +35,11 @@ def files(workspace: Workspace) -> list[str]:
     return sorted(path.name for path in workspace.uploads.iterdir()) if workspace.uploads.is_dir() else []
 
 
-def button(window: Window) -> Any:
+def button(window: BrowserWindow) -> Any:
     return element(window, "Send a video")
 
 
-def test_a_file_is_written_as_it_comes_under_a_name_of_ours(opened: tuple[Window, Workspace, Client]) -> None:
+def test_a_file_is_written_as_it_comes_under_a_name_of_ours(opened: tuple[BrowserWindow, Workspace, Client]) -> None:
     window, workspace, client = opened
     client.start(button(window), "../../Müller 1970.MP4", 10)
     client.part(button(window), 0, b"01234")
@@ -64,7 +64,7 @@ def test_a_file_is_written_as_it_comes_under_a_name_of_ours(opened: tuple[Window
     ],
 )
 def test_what_is_refused_is_refused_in_a_sentence(
-    opened: tuple[Window, Workspace, Client], size: int, parts: list[tuple[int, bytes]], sentence: str
+    opened: tuple[BrowserWindow, Workspace, Client], size: int, parts: list[tuple[int, bytes]], sentence: str
 ) -> None:
     window, workspace, client = opened
     client.start(button(window), "a.mp4", size)
@@ -80,7 +80,7 @@ def test_what_is_refused_is_refused_in_a_sentence(
 
 
 def test_a_full_disk_and_other_buttons_take_nothing(
-    opened: tuple[Window, Workspace, Client], monkeypatch: pytest.MonkeyPatch
+    opened: tuple[BrowserWindow, Workspace, Client], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     window, workspace, client = opened
     # viser's own would keep it in memory, for any element.
@@ -93,7 +93,9 @@ def test_a_full_disk_and_other_buttons_take_nothing(
     assert not window.gui._current_file_upload_states
 
 
-def test_what_came_in_part_goes_with_its_browser_and_with_the_window(opened: tuple[Window, Workspace, Client]) -> None:
+def test_what_came_in_part_goes_with_its_browser_and_with_the_window(
+    opened: tuple[BrowserWindow, Workspace, Client],
+) -> None:
     window, workspace, client = opened
     other = Client(window)
     for number, sender in (("1", client), ("2", other)):

@@ -12,26 +12,26 @@ import viser
 from viser import _messages as messages
 from websockets.sync.client import connect
 
-from scopemap.apps.browser.window import Window
+from scopemap.apps.browser.window import BrowserWindow
 
 PATIENCE_S = 120.0
 
 
-def until(window: Window, is_so: Callable[[], object], patience_s: float = PATIENCE_S) -> None:
+def until(window: BrowserWindow, is_so: Callable[[], object], patience_s: float = PATIENCE_S) -> None:
     """Run a window until something is so."""
     end = time.monotonic() + patience_s
     window.run(lambda: bool(is_so()) or time.monotonic() > end)
     assert is_so(), words(window)
 
 
-def settle(window: Window) -> None:
+def settle(window: BrowserWindow) -> None:
     """Let a window do what is to be done now."""
     done: list[int] = []
     window._calls.put(lambda: window._calls.put(lambda: done.append(1)))  # what is done may ask for more
     until(window, lambda: done)
 
 
-def elements(window: Window) -> list[Any]:
+def elements(window: BrowserWindow) -> list[Any]:
     """Return all elements of the panel that are there and seen, in order."""
     found: list[Any] = []
 
@@ -46,7 +46,7 @@ def elements(window: Window) -> list[Any]:
     return found
 
 
-def words(window: Window) -> str:
+def words(window: BrowserWindow) -> str:
     """Return all that is to be read in the panel, without the marks of Markdown."""
     texts = []
     for element in elements(window):
@@ -55,12 +55,12 @@ def words(window: Window) -> str:
     return "\n".join(texts).replace("\\", "").replace("**", "")
 
 
-def element(window: Window, label: str) -> Any:
+def element(window: BrowserWindow, label: str) -> Any:
     """Return the element of a label."""
     return next(one for one in elements(window) if getattr(one, "label", None) == label)
 
 
-def press(window: Window, label: str, value: Any = None) -> None:
+def press(window: BrowserWindow, label: str, value: Any = None) -> None:
     """Press a button, or give an input a value, as a browser does; and let the window do what follows."""
     handle = element(window, label)
     if value is not None:
@@ -73,7 +73,7 @@ def press(window: Window, label: str, value: Any = None) -> None:
 class Client:
     """A connection to a window as its page has one, that sends files."""
 
-    def __init__(self, window: Window) -> None:
+    def __init__(self, window: BrowserWindow) -> None:
         address = window.url.replace("http", "ws")
         self.socket = connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None)  # type: ignore[list-item]
 

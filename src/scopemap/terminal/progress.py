@@ -25,7 +25,7 @@ _COMPILING = "compiling kernels, once"
 class RunProgress(NamedTuple):
     """What a run calls: observers with each step (none if silent), `progress` before the first and after the last."""
 
-    observers: tuple[Callable[[Step], None], ...]
+    observers: tuple[Callable[[Step], bool | None], ...]
     progress: Callable[[str, int, int], None]
 
 

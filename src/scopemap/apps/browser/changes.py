@@ -21,7 +21,7 @@ from scopemap.report.sheet import rgb_of
 from scopemap.result.result import Result
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 _MOST = 12
 _MARK_SHARE = 0.02
@@ -37,7 +37,7 @@ class ShownChanges:
     """The part of the page that shows two examinations."""
 
     def __init__(
-        self, window: Window, found: ExamComparison, runs: tuple[Result, Result], folders: tuple[Path, Path]
+        self, window: BrowserWindow, found: ExamComparison, runs: tuple[Result, Result], folders: tuple[Path, Path]
     ) -> None:
         self._window, self._found, self._runs, self._folders = window, found, runs, folders
         self._poses = runs[0].frames["T_world_camera"][runs[0].frames.tracked]

@@ -15,7 +15,7 @@ import typer
 from scopemap.terminal.options import Quiet
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 _OPEN_TO_ALL = "warning: whoever reaches {host} sees the pictures and can start runs; a tunnel is safer (docs/app.md)"
 
@@ -51,25 +51,25 @@ def app(
     """
     from scopemap.apps.browser.serving import LOOPBACK
     from scopemap.apps.browser.start_page import StartPage
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
     from scopemap.apps.browser.workspace import Workspace
     from scopemap.engine.errors import InputError
 
     if watch is not None:
-        _beside_a_command(Window(port, host, anonymous=anonymous), watch, result, live=live, browser=browser)
+        _beside_a_command(BrowserWindow(port, host, anonymous=anonymous), watch, result, live=live, browser=browser)
         return
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder: name the folder of the videos")
     if host not in (LOOPBACK, "localhost", "::1"):
         typer.echo(_OPEN_TO_ALL.format(host=host), err=True)
     with Workspace(folder, keep_uploads=keep_uploads, most_bytes=round(upload_limit * 1e9)) as workspace:
-        window = Window(port, host, anonymous=anonymous)
+        window = BrowserWindow(port, host, anonymous=anonymous)
         window.always(workspace.runs.tick)
         window.show(StartPage(workspace))
         serve(window, browser=browser, quiet=quiet)
 
 
-def _beside_a_command(window: Window, view: Path, result: Path | None, *, live: bool, browser: bool) -> None:
+def _beside_a_command(window: BrowserWindow, view: Path, result: Path | None, *, live: bool, browser: bool) -> None:
     """Show the run of another command, and then its result; lines of text go to and fro."""
     from scopemap.apps.browser.beside import LIVE_BUTTONS, RunBeside
     from scopemap.apps.browser.result_page import ResultPage
@@ -88,7 +88,7 @@ def _beside_a_command(window: Window, view: Path, result: Path | None, *, live: 
     serve(window, browser=browser, quiet=True, ends=lambda: run.is_gone)
 
 
-def serve(window: Window, *, browser: bool, quiet: bool, ends: Callable[[], bool] = lambda: False) -> None:
+def serve(window: BrowserWindow, *, browser: bool, quiet: bool, ends: Callable[[], bool] = lambda: False) -> None:
     """Run a window until Ctrl-C, or until it `ends`."""
     if not quiet:
         typer.echo(f"{window.url} until Ctrl-C")

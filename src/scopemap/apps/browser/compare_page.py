@@ -22,7 +22,7 @@ from scopemap.report.sheet import rgb_of
 from scopemap.result.result import Result
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 _FIRST, _SECOND = "#466ec8", "#e07b1a"
 _DISTANCE, _ALONE, _PICTURE, _PLAIN = "distance to the other", "in one alone", "picture", "one colour each"
@@ -41,7 +41,7 @@ class ComparePage:
             raise InputError(f"{first} cannot be compared with itself: name another result")
         self._folders, self._workspace = (first, second), workspace
 
-    def open(self, window: Window) -> None:
+    def open(self, window: BrowserWindow) -> None:
         """Make the elements; what takes long is done beside."""
         self._window, gui = window, window.gui
         given = [folder.resolve().name for folder in self._folders]

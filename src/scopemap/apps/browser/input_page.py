@@ -20,7 +20,7 @@ from scopemap.input.scopes import SCOPES
 from scopemap.report.frame_pictures import shrunk
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 _UNKNOWN = "not known"
 _ESTIMATED, _BY_FOV = "estimated from the video", "by its field of view"
@@ -49,7 +49,7 @@ class InputPage:
         self.choice = RunChoice()
         """The options as they are set."""
 
-    def open(self, window: Window) -> None:
+    def open(self, window: BrowserWindow) -> None:
         """Make the elements, and look at the input."""
         self._window, gui = window, window.gui
         self._name = window.names.of(self._source, "video")

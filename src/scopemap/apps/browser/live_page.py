@@ -18,7 +18,7 @@ from scopemap.engine.errors import InputError
 from scopemap.result.run_view import view_folder
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 _LOG = "live.log"
 _MOST_LOG = 20_000
@@ -76,7 +76,7 @@ class LiveRun:
         self.press("stop")
 
 
-def open_live(window: Window, workspace: Workspace, source: str) -> None:
+def open_live(window: BrowserWindow, workspace: Workspace, source: str) -> None:
     """Reconstruct a live stream, and show it: the number of a camera, a device, or an address.
 
     Raises `InputError` where a run is going on: there is time for one alone.

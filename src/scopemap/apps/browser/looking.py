@@ -92,7 +92,7 @@ class Look:
     def kind(self) -> str:
         """Which kinds of endoscope the pictures are typical of, in words."""
         found = next((one for one in self.findings if one.code == "scope"), None)
-        return "the pictures do not tell the kind of endoscope" if found is None else found.message
+        return "the kind of endoscope cannot be told from the pictures" if found is None else found.message
 
     @property
     def trackable(self) -> str:

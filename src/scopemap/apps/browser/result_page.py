@@ -24,7 +24,7 @@ from scopemap.result.run_view import view_folder
 if TYPE_CHECKING:
     from viser import SceneClickEvent
 
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
     from scopemap.apps.browser.workspace import Workspace
 
 
@@ -35,7 +35,7 @@ class ResultPage:
         self._run, self._workspace = Result(folder).checked(), workspace
         self._frames: FramePart | None = None
 
-    def open(self, window: Window) -> None:
+    def open(self, window: BrowserWindow) -> None:
         """Make the elements."""
         self._window, gui = window, window.gui
         self._view = view = ResultView(window, self._run, self._workspace)

@@ -15,7 +15,7 @@ from scopemap.result.frame_table import NOT_USED
 from scopemap.result.result import Result
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
     from scopemap.apps.browser.workspace import Workspace
     from scopemap.apps.coverage.coverage import Coverage
 
@@ -29,7 +29,7 @@ class ResultView:
     rows : of the frames that were used, in the table of the whole result. row : of the frame that is shown.
     """
 
-    def __init__(self, window: Window, whole: Result, workspace: Workspace | None) -> None:
+    def __init__(self, window: BrowserWindow, whole: Result, workspace: Workspace | None) -> None:
         self.window, self.whole, self.workspace = window, whole, workspace
         self.rows = np.flatnonzero(whole.frames.place != NOT_USED).tolist()
         self.row = self.rows[0] if self.rows else 0

@@ -15,7 +15,7 @@ from scopemap.apps.browser.window import escaped, fenced
 from scopemap.result.run_view import RunProgressState, SeenMap, read_coverage, read_map, read_pictures, read_state
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 _MOST_FRUSTA = 60
 _FRUSTUM_SHARE = 0.05
@@ -69,7 +69,7 @@ class RunPage:
         self._ended = False
         self._written = self._first = -1
 
-    def open(self, window: Window) -> None:
+    def open(self, window: BrowserWindow) -> None:
         """Make the elements."""
         gui = window.gui
         self._window = window

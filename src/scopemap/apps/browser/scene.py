@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 PATH_COLOUR = (70, 110, 200)
 _MOST_POSITIONS = 2000
@@ -31,7 +31,7 @@ def draw_path(scene: Any, name: str, positions: np.ndarray, colour: tuple[int, i
     scene.add_line_segments(name, parts, colour, thickness=2.0, thickness_units="screen")
 
 
-def look_at(window: Window, pose: np.ndarray, points: np.ndarray, back: float = _BACK_SHARE) -> None:
+def look_at(window: BrowserWindow, pose: np.ndarray, points: np.ndarray, back: float = _BACK_SHARE) -> None:
     """Let all browsers look at points (N, 3) from behind a camera's pose (4, 4), also those that come later.
 
     back : how far behind them, over their size.
@@ -43,7 +43,7 @@ def look_at(window: Window, pose: np.ndarray, points: np.ndarray, back: float = 
     look_from(window, behind, centre, -pose[:3, 1])
 
 
-def look_from(window: Window, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
+def look_from(window: BrowserWindow, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
     """Let all browsers look from a position at a target (3,), also those that come later."""
     first = window.server.initial_camera
     for camera in (first, *(client.camera for client in window.server.get_clients().values())):

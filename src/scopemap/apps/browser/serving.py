@@ -9,6 +9,7 @@ import io
 import re
 import socket
 from collections.abc import Callable, Iterator
+from functools import wraps
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -91,6 +92,7 @@ def _guarded(*, only_own: bool) -> Iterator[None]:
 
     serve = websockets.serve
 
+    @wraps(serve)
     def guarded(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
         return serve(*arguments, process_request=_checked(process_request, only_own=only_own), **options)
 

@@ -19,7 +19,7 @@ from scopemap.engine.errors import InputError
 from scopemap.result.run_view import read_state, view_folder
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 _HELLO = """### A surface from an endoscope video
 
@@ -39,7 +39,7 @@ class StartPage:
         self._shown: tuple[Any, ...] = ()
         self._states: list[tuple[BrowserRun, Any]] = []
 
-    def open(self, window: Window) -> None:
+    def open(self, window: BrowserWindow) -> None:
         """Make the elements."""
         self._window, gui = window, window.gui
         window.names.hide_folder(self._workspace.folder)

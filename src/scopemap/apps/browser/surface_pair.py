@@ -12,7 +12,7 @@ from scopemap.apps.browser.scene import look_at
 from scopemap.report.shown_mesh import simplified
 
 if TYPE_CHECKING:
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
 _MOST_FACES = 200_000
 _GAP = 1.15
@@ -30,7 +30,7 @@ class SurfacePair:
 
     nodes = ("/page/first", "/page/second")
 
-    def __init__(self, window: Window, surfaces: Sequence[trimesh.Trimesh], pose: np.ndarray) -> None:
+    def __init__(self, window: BrowserWindow, surfaces: Sequence[trimesh.Trimesh], pose: np.ndarray) -> None:
         self._window, self._pose = window, np.asarray(pose, float)
         self.shown = [simplified(surface, _MOST_FACES // 2) for surface in surfaces]
         self._points = np.concatenate([np.asarray(surface.vertices) for surface in self.shown])

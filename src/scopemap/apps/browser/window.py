@@ -24,7 +24,7 @@ _LAST = 1e9
 class Page(Protocol):
     """What a window shows. Its elements are made in `open`, and go with it."""
 
-    def open(self, window: Window) -> None:
+    def open(self, window: BrowserWindow) -> None:
         """Make the elements of the panel and the scene."""
 
     def tick(self) -> None:
@@ -34,7 +34,7 @@ class Page(Protocol):
         """End what was begun; elements are removed by the window."""
 
 
-class Window:
+class BrowserWindow:
     """The panel and the scene of viser's server, shared by all browsers that look.
 
     gui, scene : viser's. Elements that a page makes in `open`, or in a call of `do`, are removed with it; nodes of the

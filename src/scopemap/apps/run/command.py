@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -16,7 +17,7 @@ import typer
 from scopemap.terminal import options
 from scopemap.terminal.figures import print_json, print_warnings
 from scopemap.terminal.interruption import Interruption
-from scopemap.terminal.progress import both, run_progress
+from scopemap.terminal.progress import RunProgress, both, run_progress
 
 if TYPE_CHECKING:
     from scopemap.engine.config import Config
@@ -170,12 +171,9 @@ def run(
             size=options.parse_size(size) if size else None,
             settings=resolved.input,
         )
-    from scopemap.apps.browser.beside import window_beside
-    from scopemap.result.run_view import view_folder
     from scopemap.runner.checkpoints import check_resumable, discard_unfinished
     from scopemap.runner.estimators import missing_weights
     from scopemap.runner.network_cost import network_cost
-    from scopemap.runner.watched import RunWatch
     from scopemap.runner.with_report import reconstruct_with_report
 
     if resume:
@@ -184,24 +182,42 @@ def run(
         discard_unfinished(out)
     if not (quiet or as_json or missing_weights(resolved)) and (cost := network_cost(resolved, sequence)):
         typer.echo(cost, err=True)
-    shows = run_progress(sequence.used_count, silent=quiet or as_json, adjusts=resolved.mapping.at_end)
-    with ExitStack() as beside:
-        if in_app:
-            stop = {"stop": partial(os.kill, os.getpid(), signal.SIGINT)}
-            beside.enter_context(window_beside(out, view_folder(out), stop, say=partial(typer.echo, err=True)))
-        with ExitStack() as stack:
-            shown, interruption = stack.enter_context(shows), stack.enter_context(Interruption())
-            observers, progress = (*shown.observers, interruption.observe), shown.progress
-            if watched or in_app:
-                watch = stack.enter_context(RunWatch(out, sequence.used_count, adjusts=resolved.mapping.at_end))
-                observers, progress = (watch, *observers), both(progress, watch.progress)
+    with _window(out) if in_app else nullcontext():
+        adjusts = resolved.mapping.at_end
+        with _shown(out, sequence.used_count, adjusts, quiet or as_json, watched or in_app) as (shown, interruption):
             result = reconstruct_with_report(
-                sequence, resolved, out, overwrite=overwrite, observers=observers, progress=progress
+                sequence, resolved, out, overwrite=overwrite, observers=shown.observers, progress=shown.progress
             )
         _report(result, resolved, out, as_json=as_json, quiet=quiet)
     # After the last frame there is nothing to cut short: the result is whole.
     if interruption.exit_code and result.provenance["interrupted_at_frame"] is not None:
         raise typer.Exit(interruption.exit_code)
+
+
+def _window(out: Path) -> AbstractContextManager[None]:
+    """Return the context of a window that shows the run, whose button to stop is Ctrl-C."""
+    from scopemap.apps.browser.beside import window_beside
+    from scopemap.result.run_view import view_folder
+
+    stop = {"stop": partial(os.kill, os.getpid(), signal.SIGINT)}
+    return window_beside(out, view_folder(out), stop, say=partial(typer.echo, err=True))
+
+
+@contextmanager
+def _shown(
+    out: Path, frames: int | None, adjusts: bool, silent: bool, watched: bool
+) -> Iterator[tuple[RunProgress, Interruption]]:
+    """Yield what a run tells how far it is, in the terminal and, `watched`, for a window; and what ends it early."""
+    from scopemap.runner.watched import RunWatch
+
+    with ExitStack() as stack:
+        shown = stack.enter_context(run_progress(frames, silent=silent, adjusts=adjusts))
+        interruption = stack.enter_context(Interruption())
+        observers, progress = (*shown.observers, interruption.observe), shown.progress
+        if watched:
+            watch = stack.enter_context(RunWatch(out, frames, adjusts=adjusts))
+            observers, progress = (watch, *observers), both(progress, watch.progress)
+        yield RunProgress(observers, progress), interruption
 
 
 def _report(result: Result, resolved: Config, out: Path, *, as_json: bool, quiet: bool) -> None:

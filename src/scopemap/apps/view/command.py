@@ -73,10 +73,10 @@ def view(
     from scopemap.apps.browser.compare_page import ComparePage
     from scopemap.apps.browser.result_page import ResultPage
     from scopemap.apps.browser.serving import check_installed
-    from scopemap.apps.browser.window import Window
+    from scopemap.apps.browser.window import BrowserWindow
 
     check_installed()
     page = ResultPage(run) if compare is None else ComparePage(run, compare)
-    window = Window(port)
+    window = BrowserWindow(port)
     window.show(page)
     serve(window, browser=browser, quiet=False)
