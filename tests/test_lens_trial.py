@@ -18,7 +18,7 @@ from scopemap.engine.geometry.se3 import so3_exp
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.focal_length.from_motion import FocalEstimate, with_focal_from_motion
 from scopemap.input.focal_length.trial import LensTrial, try_lenses
-from scopemap.input.focal_length.windows import BrowserWindow
+from scopemap.input.focal_length.windows import Window
 from scopemap.input.opening import open_sequence
 from scopemap.input.scopes import KINDS, SCOPES
 from scopemap.result.verdict import verdict
@@ -43,7 +43,7 @@ def _window(
     translation: tuple[float, float, float],
     noise_px: float = 0.1,
     depth_noise: float = 0.2,
-) -> BrowserWindow:
+) -> Window:
     """Points before a camera that turns and moves on, seen in 4 partners; their distances are about known."""
     rng, lens = np.random.default_rng(seed), _lens(kind, focal_px)
     pixel = rng.uniform(-1, 1, (POINTS, 2)) * [0.95 * HALF_PX, 0.7 * HALF_PX]
@@ -54,7 +54,7 @@ def _window(
         moved = point @ so3_exp(np.radians(rotation_deg) * share).T - share * np.array(translation)
         seen.append(lens.project(moved) + rng.normal(0, noise_px, (POINTS, 2)))
     distance = np.linalg.norm(point, axis=1) * np.exp(rng.normal(0, depth_noise, POINTS))
-    return BrowserWindow(pixel, np.stack(seen, 1), HALF_PX, log_distance=np.log(distance))
+    return Window(pixel, np.stack(seen, 1), HALF_PX, log_distance=np.log(distance))
 
 
 def _tried(kind: str, focal_px: float, **motion: object) -> LensTrial | None:
@@ -124,7 +124,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[LensTrial | None]:
     """What the trial says, to be filled in; the motion tells nothing."""
     said: list[LensTrial | None] = []
     place = "scopemap.input.focal_length.from_motion"
-    window = BrowserWindow(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
+    window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
 
     def motion(*arguments: object) -> FocalEstimate:
         arguments[2].append(window)  # type: ignore[attr-defined]
@@ -210,7 +210,7 @@ def test_what_is_seen_is_weighed_with_what_is_expected_of_a_kind_of_endoscope(
     fisheye: bool,
 ) -> None:
     tried.append(said)
-    window = BrowserWindow(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
+    window = Window(np.zeros((1, 2)), np.zeros((1, 1, 2)), 100.0)
     place = "scopemap.input.focal_length.from_motion.focal_from_motion"
     monkeypatch.setattr(place, lambda *arguments: arguments[2].append(window) or motion)
     config = Config.load(settings=LIGHT | {"input.scope": scope})
