@@ -32,13 +32,14 @@ NEEDS = {
 }
 # Others of which some tests skip without the networks.
 PARTLY_NETWORKS = {"test_alike", "test_depth_benchmark", "test_weights"}
-BROWSER = {"test_browser_start", "test_report_browser", "test_tissue_states"}
+BROWSER = {"test_browser_result_chromium", "test_browser_start", "test_report_browser", "test_tissue_states"}
 CLUSTER = {"test_engines", "test_addresses"}
 # Runs of whole clips, or of many processes: a module takes more than three seconds on an idle core. In other modules
 # single tests are marked `slow`, for the same reason.
 SLOW = {
     "test_backwards",
     "test_bad_input",
+    "test_browser_result_page",
     "test_baselines_photometric",
     "test_batch",
     "test_benchmark_runner",

@@ -11,6 +11,7 @@ from scopemap.apps.browser.files_part import FilesPart
 from scopemap.apps.browser.frame_part import FramePart
 from scopemap.apps.browser.measure_part import MeasurePart
 from scopemap.apps.browser.next_steps import NextRun, arguments_again
+from scopemap.apps.browser.pages import compare_page, start_page
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.surface_part import SurfacePart
@@ -102,15 +103,11 @@ class ResultPage:
         window.on(gui.add_button("Back to the start"), self._start)
 
     def _compare(self, other: Path) -> None:
-        from scopemap.apps.browser.compare_page import ComparePage
-
-        self._window.show(ComparePage(self._run.folder, other, self._workspace))
+        self._window.show(compare_page(self._run.folder, other, self._workspace))
 
     def _start(self) -> None:
-        from scopemap.apps.browser.start_page import StartPage
-
         assert self._workspace is not None
-        self._window.show(StartPage(self._workspace))
+        self._window.show(start_page(self._workspace))
 
     def _run_again(self, again: NextRun, value: str) -> None:
         """Start this run with one more option, and show it."""

@@ -134,7 +134,7 @@ class ResultView:
             self.note("This frame has no pose in this submap: nothing can be seen from it.")
             return
         ahead, self._inside = max(0.2 * self.surface.size_mm, 1e-3), True
-        self._see_with(self.vertical_fov)
+        self._see_with(self.vertical_fov, self.whole.camera.width / self.whole.camera.height)
         look_from(self.window, pose[:3, 3], pose[:3, 3] + ahead * pose[:3, 2], -pose[:3, 1])
         self._see()
 
@@ -174,7 +174,9 @@ class ResultView:
         for call in self._of_camera:
             call()
 
-    def _see_with(self, fov: float) -> None:
-        server = self.window.server
-        for camera in (server.initial_camera, *(client.camera for client in server.get_clients().values())):
-            camera.fov = fov
+    def _see_with(self, fov_rad: float, aspect: float = 1.0) -> None:
+        """Let all browsers see a vertical field of view, narrow ones all of its width, `aspect` times as wide."""
+        self.window.server.initial_camera.fov = fov_rad
+        for client in self.window.server.get_clients().values():
+            narrow = max(1.0, aspect / max(client.camera.aspect, 1e-3))
+            client.camera.fov = float(2 * np.arctan(np.tan(fov_rad / 2) * narrow))

@@ -39,11 +39,12 @@ def colourings(surface: ShownSurface) -> dict[str, Callable[[], Colouring]]:
         return found
     if "confidence" in surface.mesh.vertex_attributes:
         found["confidence"] = lambda: _confidence(surface)
-    if any(map(surface.run.depth.has, surface.run.tracked["index"].tolist())):
+    has_depth = any(map(surface.run.depth.has, surface.run.tracked["index"].tolist()))
+    if has_depth:
         found["times seen"] = lambda: _times_seen(surface)
     if "sigma_mm" in surface.mesh.vertex_attributes:
         found["depth deviation"] = lambda: _sigma(surface)
-    elif "times seen" in found:
+    elif has_depth:
         found["depth deviation"] = lambda: _disagreement(surface)
     return found
 

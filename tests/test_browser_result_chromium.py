@@ -1,0 +1,133 @@
+"""The page of a result in a real browser without a display: colours, clicks on the surface, keys of the time line."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+import pytest
+from drawn_run import draw_run
+from front_door import call
+
+from scopemap.apps.browser.result_page import ResultPage
+from scopemap.apps.browser.window import Window
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)")
+
+# Without a graphics card: WebGL on the processor.
+ARGUMENTS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
+PATIENCE_S = 180
+KNOWN = {"known": True, "source": "a ruler", "measured": True}
+BRIGHT = (230, 180, 130)  # of the drawn tube
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+        yield started
+        started.close()
+
+
+class Looked:
+    """A browser that looks at a window, which runs in a thread."""
+
+    def __init__(self, browser: Any, window: Window, size: tuple[int, int]) -> None:
+        self.window = window
+        self.page = browser.new_context(viewport={"width": size[0], "height": size[1]}).new_page()
+        self.page.set_default_timeout(1000 * PATIENCE_S)
+        self.requests: list[str] = []
+        self.errors: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(window.url)
+        self.page.get_by_role("tab", name="Measure").wait_for()
+
+    def until(self, found: Callable[[], bool], what: str) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not found():
+            assert time.monotonic() < end, f"not seen: {what}"
+            self.page.wait_for_timeout(100)
+
+    def tab(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name).click()
+
+    @property
+    def words(self) -> str:
+        return str(self.page.inner_text("body"))
+
+    def picture(self) -> np.ndarray:
+        bytes_ = self.page.locator("canvas").first.screenshot()
+        return cv2.imdecode(np.frombuffer(bytes_, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+
+@pytest.fixture
+def shown(browser: Any, request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Looked, ResultPage, Path]]:
+    folder, window = draw_run(tmp_path, scale=KNOWN), Window(0)
+    page = ResultPage(folder)
+    window.show(page)
+    thread = threading.Thread(target=window.run, daemon=True)
+    thread.start()
+    looked = Looked(browser, window, getattr(request, "param", (1280, 800)))
+    yield looked, page, folder
+    looked.page.context.close()
+    window.stop()
+    thread.join(PATIENCE_S)
+    window.close()
+
+
+def test_a_distance_between_two_clicks_is_the_commands(
+    shown: tuple[Looked, ResultPage, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    looked, page, folder = shown
+    looked.tab("Measure")
+    looked.page.get_by_role("button", name="Distance").click()
+    looked.until(lambda: "Click on two points of the surface" in looked.words, "what to do")
+    for count, place in enumerate(((420, 440), (470, 500)), 1):
+        looked.page.mouse.click(*place)
+        looked.until(lambda count=count: len(page._measure._picks) == count, f"point {count}")  # type: ignore[misc]
+    looked.until(lambda: "along the surface:" in looked.words, "the distance")
+    command = re.search(r'scopemap measure .*?--points "[^"]*"', looked.words, re.DOTALL)
+    assert command is not None
+    capsys.readouterr()
+    program, *words = shlex.split(command[0].replace("\\\n", " "))
+    assert words[1] == str(folder)
+    assert (program, call(*words, "--json")) == ("scopemap", 0)
+    found = {one["what"]: one["value"] for one in json.loads(capsys.readouterr().out)}
+    value = np.format_float_positional(float(f"{found['straight']:.3g}"), trim="-")
+    assert f"straight: {value} mm" in looked.words
+    assert looked.errors == []
+    assert {urlsplit(url).hostname for url in looked.requests if url.startswith("http")} <= {"localhost", "127.0.0.1"}
+
+
+@pytest.mark.parametrize("shown", [(800, 700)], indirect=True)
+def test_colours_are_those_of_the_surface_and_keys_move_the_time_line(shown: tuple[Looked, ResultPage, Path]) -> None:
+    looked, _, _ = shown
+    looked.tab("Surface")
+    looked.page.locator("label", has_text="Relief").first.click()
+    near = lambda: (np.abs(looked.picture() - BRIGHT).max(-1) <= 2).sum()  # noqa: E731
+    looked.until(lambda: near() > 2000, "the tissue's own colour")
+    looked.tab("Frames")
+    slider = looked.page.get_by_role("slider").first
+    slider.focus()
+    looked.page.keyboard.press("ArrowRight")
+    looked.until(lambda: "Frame 1, 0.04 s: tracked" in looked.words, "the next frame by an arrow key")
+    slider.blur()
+    looked.page.keyboard.press("n")
+    looked.until(lambda: "Frame 2, 0.08 s: tracked" in looked.words, "the next frame by N")
+    # Nothing is wider than the page.
+    assert looked.page.evaluate("document.documentElement.scrollWidth") <= 800
+    assert looked.errors == []

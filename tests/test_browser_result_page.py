@@ -1,0 +1,247 @@
+"""The page of a result in a window without a browser: what it says, and what its buttons do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_run import CAMERA, FRAMES, IN_RESULT, draw_run, pose_of, wavering
+from front_door import call
+from shown_window import ShownWindow, shown_window
+
+from scopemap.apps.browser.files_part import export_place
+from scopemap.apps.browser.result_page import ResultPage
+from scopemap.apps.browser.runs import BrowserRun
+from scopemap.apps.browser.workspace import Workspace
+from scopemap.engine.notices import Notice
+from scopemap.report.page_data import read_measurements
+from scopemap.result.result import Result
+from scopemap.result.summary import summary_lines
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
+
+KNOWN = {"known": True, "source": "a ruler", "measured": True}
+INTERLACED = [Notice("input-interlaced").as_json()]
+FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+
+
+def click(shown: ShownWindow, page: ResultPage, pixel: tuple[float, float], frame: int = 4) -> None:
+    """Click on what a frame shows at a pixel."""
+    pose = pose_of(frame)
+    shown.window.do(page.click, pose[:3, 3], pose[:3, :3] @ CAMERA.unproject(np.array(pixel)))
+    shown.settle()
+
+
+def test_it_says_what_the_summary_of_the_run_says(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path, notices=INTERLACED)
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        word, *lines = summary_lines(Result(folder))
+        assert word.replace(". ", "\n", 1) in shown.words.replace("### ", "")
+        for line in lines:
+            name, _, fact = line.strip().partition("  " if line.startswith("  ") else ": ")
+            assert f"{name}: {fact.strip()}" in shown.words.replace("Caution. ", "Caution: ").replace(
+                "Note. ", "Note: "
+            )
+        # Without a workspace nothing can be started.
+        assert not [label for label in shown.labels() if label.startswith("Run again")]
+        assert "Back to the start" not in shown.labels()
+
+
+def test_a_caution_starts_the_run_that_mends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "video.mp4").write_bytes(b"")
+    monkeypatch.setattr(BrowserRun, "start", lambda run: None)
+    camera = FACTS | {"source": "70 deg", "origin": "assumed"}
+    folder = draw_run(tmp_path / "one", name=str(tmp_path / "video.mp4"), notices=INTERLACED, camera=camera)
+    with Workspace(tmp_path) as workspace, shown_window() as shown:
+        shown.show(ResultPage(folder, workspace))
+        shown.choose("Dropdown", "--scope", "laparoscope")
+        shown.press("Run again with --scope")
+        (run,) = workspace.runs.runs
+        assert run.source == tmp_path / "video.mp4"
+        assert run.arguments[:2] == ("--config", str(folder / "config.toml"))
+        assert run.arguments[-2:] == ("--scope", "laparoscope")
+        assert "video.mp4, run again with --scope laparoscope" in shown.words
+        # What it ends in is the page of its own result.
+        draw_run(run.out)
+        run.status = "done"
+        shown.until(lambda: "Colour by" in shown.labels("Dropdown"))
+        shown.show(ResultPage(folder, workspace))
+        shown.press("Run again with --deinterlace")
+        assert workspace.runs.runs[-1].arguments[-1] == "--deinterlace"
+
+
+def test_an_input_that_is_another_file_now_is_said(tmp_path: Path) -> None:
+    video = tmp_path / "video.mp4"
+    video.write_bytes(b"now")
+    content = {"bytes": 7, "sha256": "0" * 64}
+    folder = draw_run(tmp_path / "one", name=str(video), notices=INTERLACED, input_content=content)
+    with Workspace(tmp_path) as workspace, shown_window() as shown:
+        shown.show(ResultPage(folder, workspace))
+        shown.press("Run again with --deinterlace")
+        assert "is another file now" in shown.window._error.content.replace("\\", "")
+        assert not workspace.runs.runs
+
+
+def test_frames_say_what_they_are(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        shown.until(lambda: "surface seen from there" in shown.words)
+        assert "Frame 0, 0.00 s: tracked" in shown.words
+        shown.choose("Slider", "Frame", IN_RESULT)
+        assert "Frame 14, 0.56 s: lost: too blurred." in shown.words
+        shown.press("Look from here")
+        assert "This frame has no pose in this submap" in shown.words
+        shown.choose("Slider", "Frame", FRAMES - 1)
+        assert "Frame 23, 0.92 s: tracked in submap 2, not the one that is shown" in shown.words
+        shown.choose("Dropdown", "Submap", shown.element("Dropdown", "Submap").options[1])
+        assert "Frame 17, 0.68 s: tracked\n" in shown.words
+        shown.choose("ButtonGroup", "Go", "Next")
+        assert shown.element("Slider", "Frame").value == 18
+        shown.press("Look from here")
+        place = np.array(shown.window.server.initial_camera.position)
+        np.testing.assert_allclose(place, pose_of(18)[:3, 3], atol=1e-6)
+
+
+def test_frames_are_played_to_their_end(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path, states=wavering())
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        assert "Moving tissue" in shown.labels("Checkbox")
+        shown.choose("Slider", "Frame", FRAMES - 4)
+        shown.choose("ButtonGroup", "Go", "Play")
+        shown.until(lambda: shown.element("Slider", "Frame").value == FRAMES - 1)
+
+
+def test_a_click_lists_the_frames_that_saw_the_place(tmp_path: Path) -> None:
+    page = ResultPage(draw_run(tmp_path))
+    with shown_window() as shown:
+        shown.show(page)
+        click(shown, page, (60.0, 40.0))
+        listed = shown.element("Dropdown", "Frames that saw it")
+        assert "frame 4, 0.16 s" in listed.options
+        shown.choose("Dropdown", "Frames that saw it", "frame 4, 0.16 s")
+        assert shown.element("Slider", "Frame").value == 4
+        shown.window.do(page.click, np.array([0.0, 0.0, -50.0]), np.array([0.0, 0.0, -1.0]))
+        shown.settle()
+        assert "There is no surface there." in shown.words
+
+
+def test_a_distance_is_measured_and_kept(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path, scale=KNOWN)
+    page = ResultPage(folder)
+    with shown_window() as shown:
+        shown.show(page)
+        shown.choose("ButtonGroup", "Measure", "Distance")
+        click(shown, page, (20.0, 20.0))
+        click(shown, page, (60.0, 44.0))
+        shown.until(lambda: "straight: " in shown.words)
+        assert f"scopemap measure {folder}" in shown.words
+        shown.press("Save the measurements")
+        (kept,) = read_measurements(folder)
+        assert f"straight: {kept['found'][0]['value']:.3g} mm" in shown.words
+        # One of points that no frame saw together is refused in a sentence.
+        click(shown, page, (60.0, 44.0))
+        shown.window.do(page.click, np.array([0.0, 0.0, 8.0]), np.array([1.0, 0.0, 0.0]))
+        shown.until(lambda: "no frame saw all of these points" in shown.window._error.content)
+        shown.choose("ButtonGroup", "Points", "Clear")
+        assert len(read_measurements(folder)) == 1
+
+
+def test_without_a_scale_two_points_become_the_reference(tmp_path: Path) -> None:
+    page = ResultPage(draw_run(tmp_path))
+    with shown_window() as shown:
+        shown.show(page)
+        shown.choose("ButtonGroup", "Measure", "Distance")
+        click(shown, page, (24.0, 45.0))
+        click(shown, page, (40.0, 45.0))
+        assert "The scale is unknown: use these two points as reference" in shown.words
+        shown.element("Number", "Its length").value = 5.0
+        shown.press("Use as reference")
+        shown.choose("ButtonGroup", "Measure", "Area")
+        for pixel in ((20.0, 20.0), (60.0, 20.0), (60.0, 44.0)):
+            click(shown, page, pixel)
+        shown.press("Measure the area")
+        shown.until(lambda: "--reference-mm 5" in shown.words)
+        assert "mm2" in shown.words
+        shown.press("Forget the reference")
+        assert "Forget the reference" not in shown.labels()
+
+
+def test_a_lesion_is_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = draw_run(tmp_path, scale=KNOWN)
+    page = ResultPage(folder)
+    with shown_window() as shown:
+        shown.show(page)
+        shown.choose("Slider", "Frame", 4)
+        shown.choose("ButtonGroup", "Measure", "Lesion")
+        corners = ((52.0, 26.0), (64.0, 26.0), (64.0, 38.0), (52.0, 38.0))
+        for pixel in corners:
+            click(shown, page, pixel)
+        shown.press("Measure the lesion")
+        shown.until(lambda: "largest diameter" in shown.words)
+        outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+        assert f'--lesion "{outline}"' in shown.words
+        capsys.readouterr()
+        assert call("measure", folder, "--frame", 4, "--lesion", outline) == 0
+        for line in capsys.readouterr().out.splitlines()[:-1]:
+            assert line in shown.words
+
+
+def test_blind_spots_are_those_of_the_command(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    assert call("coverage", folder, "--quiet") == 0
+    facts = json.loads((folder / "coverage" / "coverage.json").read_text())
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        shown.press("What was not seen")
+        shown.until(lambda: "with a probability of 90 %" in shown.words)
+        assert f"{100 * facts['total']['share']:.0f} % was not seen" in shown.words
+        spots = [label for label in shown.labels() if label[0].isdigit()]
+        assert len(spots) == len(facts["blind_spots"])
+        shown.press("1. ")
+        assert f"seen from frame {facts['blind_spots'][0]['frame']}" in shown.words
+        camera = shown.window.server.initial_camera
+        np.testing.assert_allclose(camera.look_at, facts["blind_spots"][0]["position_mm"], rtol=1e-6)
+        shown.choose("Dropdown", "Colour by", "coverage")
+        assert "The surface is closed where it has gaps." in shown.words
+
+
+def test_an_export_is_written_beside_the_result(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    with shown_window(anonymous=True) as shown:
+        shown.show(ResultPage(folder))
+        shown.choose("Dropdown", "Format", "stl")
+        for file in ("stl.stl", "stl_2.stl"):
+            shown.press("Write")
+            shown.until(lambda file=file: f"RESULT/exports/{file}" in shown.words)  # type: ignore[misc]
+            assert (folder / "exports" / file).is_file()
+        assert "Download" in shown.labels()
+        assert str(tmp_path) not in shown.words
+    assert export_place(folder, "colmap") == folder / "exports" / "colmap"
+
+
+def test_a_result_without_a_surface_can_be_looked_at(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    (folder / "mesh.ply").unlink()
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        assert "There is no surface." in shown.words
+        shown.choose("Slider", "Frame", 3)
+        assert "Frame 3" in shown.words
+        assert shown.element("Dropdown", "Colour by").options == ("picture",)
+
+
+def test_everything_goes_with_the_page(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    with shown_window() as shown:
+        page = ResultPage(folder)
+        shown.show(page)
+        count = len(shown.handles("Button"))
+        shown.show(ResultPage(folder))
+        assert len(shown.handles("Button")) == count
+        assert len(shown.window.scene._scene_pointer_cb) == 1
+        assert len(shown.window.gui._command_handle_from_uuid) == 2
