@@ -170,7 +170,7 @@ def test_the_page_says_and_shows_how_far_two_are_apart(tmp_path: Path) -> None:
         assert drawn <= nodes.keys()
     with opened(ComparePage(first, second), anonymous=True) as window:
         until(window, lambda: "One over the other" in words(window))
-        assert "the first and the second" in words(window)
+        assert "### result 1 and result 2" in words(window)
         assert str(tmp_path) not in words(window)
 
 

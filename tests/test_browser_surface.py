@@ -96,7 +96,7 @@ def test_what_is_not_known_is_not_offered(tmp_path: Path) -> None:
 
 def test_relief_darkens_what_does_not_face_the_camera(folder: Path) -> None:
     surface = ShownSurface(Result(folder))
-    shaded = in_relief(surface, surface.colours).astype(int)
+    shaded = in_relief(surface.facing, surface.colours).astype(int)
     assert (shaded <= surface.colours).all()
     z = np.asarray(surface.mesh.vertices)[:, 2]
     assert surface.facing[np.abs(z - 8) < 1].mean() > 0.9

@@ -50,7 +50,7 @@ class ShownChanges:
             first.mesh.vertices, first.mesh.faces, vertex_colors=vertex_colours(first.mesh), process=False
         )
         mesh.vertex_attributes[_COMPARED] = found.compared.astype(float)
-        self._pair = SurfacePair(window, (mesh, found.second), self._poses[0])
+        self._pair = SurfacePair(window, (mesh, found.second), self._poses)
         draw_path(window.scene, f"{self._pair.nodes[0]}/path", self._poses[:, :3, 3])
         unit = "mm" if first.scale_known else "units"
         for number, change in enumerate(found.changes[:_MOST], 1):

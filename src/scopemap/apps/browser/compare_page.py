@@ -44,9 +44,8 @@ class ComparePage:
     def open(self, window: BrowserWindow) -> None:
         """Make the elements; what takes long is done beside."""
         self._window, gui = window, window.gui
-        given = [folder.resolve().name for folder in self._folders]
-        is_clear = not window.anonymous and given[0] != given[1]
-        self._names = (given[0], given[1]) if is_clear else ("the first", "the second")
+        given = [window.names.of(folder.resolve(), "result") for folder in self._folders]
+        self._names = (given[0], given[1]) if given[0] != given[1] else ("the first", "the second")
         if self._workspace is not None:
             window.on(gui.add_button("Back to the start", color="gray"), self._back, self._workspace)
         first, second = (escaped(name) for name in self._names)
@@ -81,7 +80,7 @@ class ComparePage:
         gui.add_markdown("\n".join(f"- {escaped(line)}" for line in found.sentences(*self._names)))
         self._legend = gui.add_html("")
         if found.surfaces is not None:
-            self._pair = SurfacePair(window, found.surfaces, found.poses[0][0])
+            self._pair = SurfacePair(window, found.surfaces, np.concatenate(found.poses))
             chosen = gui.add_dropdown("Colours", (_DISTANCE, _ALONE, _PICTURE, _PLAIN), initial_value=_DISTANCE)
             window.on(chosen, self._colour)
             overlaid = gui.add_checkbox("One over the other", initial_value=False)

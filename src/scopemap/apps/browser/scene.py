@@ -31,15 +31,12 @@ def draw_path(scene: Any, name: str, positions: np.ndarray, colour: tuple[int, i
     scene.add_line_segments(name, parts, colour, thickness=2.0, thickness_units="screen")
 
 
-def look_at(window: BrowserWindow, pose: np.ndarray, points: np.ndarray, back: float = _BACK_SHARE) -> None:
-    """Let all browsers look at points (N, 3) from behind a camera's pose (4, 4), also those that come later.
-
-    back : how far behind them, over their size.
-    """
+def look_at(window: BrowserWindow, pose: np.ndarray, points: np.ndarray) -> None:
+    """Let all browsers look at points (N, 3) from behind a camera's pose (4, 4), also those that come later."""
     low, high = np.percentile(points, [5, 95], axis=0)
     centre, size = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
     pose = np.asarray(pose, float)
-    behind = pose[:3, 3] - back * size * pose[:3, 2] - 0.3 * size * pose[:3, 1]
+    behind = pose[:3, 3] - _BACK_SHARE * size * pose[:3, 2] - 0.3 * size * pose[:3, 1]
     look_from(window, behind, centre, -pose[:3, 1])
 
 

@@ -45,12 +45,7 @@ class ShownSurface:
     @cached_property
     def facing(self) -> np.ndarray:
         """Cosines (V,), 0 to 1, at which the nearest camera sees the vertices."""
-        cameras = self.run.tracked["T_world_camera"][:, :3, 3]
-        if self.is_empty or not len(cameras):
-            return np.ones(len(self._vertices))
-        ray = self._vertices - cameras[cKDTree(cameras).query(self._vertices)[1]]
-        ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
-        return np.asarray(np.abs((np.asarray(self.mesh.vertex_normals) * ray).sum(1)))
+        return facing_of(self.mesh, self.run.tracked["T_world_camera"][:, :3, 3])
 
     @cached_property
     def _vertices(self) -> np.ndarray:
@@ -111,3 +106,13 @@ class ShownSurface:
         first, second, third = self._vertices[self.faces[pick.face]]
         normal = np.cross(second - first, third - first)
         return np.asarray(normal / max(float(np.linalg.norm(normal)), 1e-12))
+
+
+def facing_of(mesh: trimesh.Trimesh, cameras: np.ndarray) -> np.ndarray:
+    """Return cosines (V,), 0 to 1, at which the nearest of cameras, positions (N, 3), sees the vertices of a mesh."""
+    vertices = np.asarray(mesh.vertices)
+    if not len(mesh.faces) or not len(cameras):
+        return np.ones(len(vertices))
+    ray = vertices - cameras[cKDTree(cameras).query(vertices)[1]]
+    ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+    return np.asarray(np.abs((np.asarray(mesh.vertex_normals) * ray).sum(1)))

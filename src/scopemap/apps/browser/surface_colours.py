@@ -61,9 +61,9 @@ def looking_frames(run: Result, most: int = _LOOKED_AT) -> list[SeenFrame]:
     return found
 
 
-def in_relief(surface: ShownSurface, colours: np.ndarray) -> np.ndarray:
-    """Return colours (V, 3) uint8 of vertices, darker where they do not face the nearest camera."""
-    light = _AMBIENT + (1 - _AMBIENT) * surface.facing
+def in_relief(facing: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """Return colours (V, 3) uint8 of vertices, darker where they do not face a camera, by `facing_of`, (V,)."""
+    light = _AMBIENT + (1 - _AMBIENT) * facing
     return np.asarray(np.round(colours * light[:, None]), np.uint8)
 
 

@@ -115,7 +115,7 @@ class SurfacePart:
             vertices, faces, colours = self._shown
         else:
             vertices, faces, colours = surface.vertices_at(self._view.state), surface.faces, self._colours
-            colours = in_relief(surface, colours) if self._relief.value else colours
+            colours = in_relief(surface.facing, colours) if self._relief.value else colours
         content = unlit_glb(vertices, faces, colours)
         scene.add_glb(_SURFACE, content, cast_shadow=False, receive_shadow=False)
 
