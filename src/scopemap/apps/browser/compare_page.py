@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from scopemap.apps.browser.legends import ramp_html, words_html
+from scopemap.apps.browser.pages import start_page
 from scopemap.apps.browser.scene import draw_path, look_at
 from scopemap.apps.browser.surface_pair import SurfacePair
 from scopemap.apps.browser.two_results import TwoResults, apart_of, compare_results, is_alone, is_same_input
@@ -66,9 +67,7 @@ class ComparePage:
         """Nothing was begun."""
 
     def _back(self, workspace: Workspace) -> None:
-        from scopemap.apps.browser.start_page import StartPage
-
-        self._window.show(StartPage(workspace))
+        self._window.show(start_page(workspace))
 
     def _show_exams(self, found: Any) -> None:
         from scopemap.apps.browser.changes import ShownChanges

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scopemap.apps.browser.beside import LIVE_BUTTONS
+from scopemap.apps.browser.pages import start_page
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.workspace import Workspace
@@ -91,10 +92,8 @@ def open_live(window: BrowserWindow, workspace: Workspace, source: str) -> None:
         window.show(ResultPage(out, workspace))
 
     def back() -> None:
-        from scopemap.apps.browser.start_page import StartPage
-
         run.stop()
-        window.show(StartPage(workspace))
+        window.show(start_page(workspace))
 
     buttons = {words: partial(run.press, name) for words, name in LIVE_BUTTONS.items()}
     window.show(RunPage(run, view_folder(out), "Live", finished, back, buttons=buttons))
