@@ -16,6 +16,7 @@ import typer
 from scopemap.terminal import options
 from scopemap.terminal.figures import print_json, print_warnings
 from scopemap.terminal.interruption import Interruption
+from scopemap.terminal.loading import loading
 from scopemap.terminal.progress import both, run_progress
 
 if TYPE_CHECKING:
@@ -159,26 +160,27 @@ def run(
     chosen = {key: value for key, value in given.items() if value is not None} | options.parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)
 
-    from scopemap.input.opening import open_sequence
+    # What is needed is loaded while the input is looked at, which loads nothing of it: imports in two threads can lock up.
+    with loading():
+        from scopemap.input.opening import open_sequence
 
-    # The rest is loaded while the input is looked at, which loads nothing of it: imports in two threads can lock up.
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(import_module, "scopemap.runner.with_report")
-        sequence = open_sequence(
-            source,
-            dataset=dataset,
-            camera=camera,
-            fov_deg=fov,
-            size=options.parse_size(size) if size else None,
-            settings=resolved.input,
-        )
-    from scopemap.apps.browser.beside import window_beside
-    from scopemap.result.run_view import view_folder
-    from scopemap.runner.checkpoints import check_resumable, discard_unfinished
-    from scopemap.runner.estimators import missing_weights
-    from scopemap.runner.network_cost import network_cost
-    from scopemap.runner.watched import RunWatch
-    from scopemap.runner.with_report import reconstruct_with_report
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(import_module, "scopemap.runner.with_report")
+            sequence = open_sequence(
+                source,
+                dataset=dataset,
+                camera=camera,
+                fov_deg=fov,
+                size=options.parse_size(size) if size else None,
+                settings=resolved.input,
+            )
+        from scopemap.apps.browser.beside import window_beside
+        from scopemap.result.run_view import view_folder
+        from scopemap.runner.checkpoints import check_resumable, discard_unfinished
+        from scopemap.runner.estimators import missing_weights
+        from scopemap.runner.network_cost import network_cost
+        from scopemap.runner.watched import RunWatch
+        from scopemap.runner.with_report import reconstruct_with_report
 
     if resume:
         check_resumable(out, sequence, resolved)
