@@ -37,7 +37,7 @@ def pairs_in_order(frames: Iterator[_Frame], count: int, picture: Callable[[_Fra
 
     picture : returns that of a frame; it is called for the frames that are looked at.
     """
-    found, run = list[SampledPair](), iter(())
+    found, run = list[SampledPair](), islice(frames, 0)
     for _ in range(count):
         deque(run, maxlen=0)
         run = islice(frames, SAMPLED_EVERY)

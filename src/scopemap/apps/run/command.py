@@ -21,6 +21,7 @@ from scopemap.terminal.progress import both, run_progress
 
 if TYPE_CHECKING:
     from scopemap.engine.config import Config
+    from scopemap.input.sequence import Sequence
     from scopemap.result.result import Result
 
 _SKIPPED = {"repeated": "skipped as repeats", "thinned": "skipped by --fps", "size": "skipped: of another size"}
@@ -160,27 +161,15 @@ def run(
     chosen = {key: value for key, value in given.items() if value is not None} | options.parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)
 
-    # What is needed is loaded while the input is looked at, which loads nothing of it: imports in two threads can lock up.
-    with loading():
-        from scopemap.input.opening import open_sequence
-
-        with ThreadPoolExecutor(1) as pool:
-            pool.submit(import_module, "scopemap.runner.with_report")
-            sequence = open_sequence(
-                source,
-                dataset=dataset,
-                camera=camera,
-                fov_deg=fov,
-                size=options.parse_size(size) if size else None,
-                settings=resolved.input,
-            )
-        from scopemap.apps.browser.beside import window_beside
-        from scopemap.result.run_view import view_folder
-        from scopemap.runner.checkpoints import check_resumable, discard_unfinished
-        from scopemap.runner.estimators import missing_weights
-        from scopemap.runner.network_cost import network_cost
-        from scopemap.runner.watched import RunWatch
-        from scopemap.runner.with_report import reconstruct_with_report
+    known = {"dataset": dataset, "camera": camera, "fov_deg": fov, "size": options.parse_size(size) if size else None}
+    sequence = _opened(source, resolved, known)
+    from scopemap.apps.browser.beside import window_beside
+    from scopemap.result.run_view import view_folder
+    from scopemap.runner.checkpoints import check_resumable, discard_unfinished
+    from scopemap.runner.estimators import missing_weights
+    from scopemap.runner.network_cost import network_cost
+    from scopemap.runner.watched import RunWatch
+    from scopemap.runner.with_report import reconstruct_with_report
 
     if resume:
         check_resumable(out, sequence, resolved)
@@ -206,6 +195,16 @@ def run(
     # After the last frame there is nothing to cut short: the result is whole.
     if interruption.exit_code and result.provenance["interrupted_at_frame"] is not None:
         raise typer.Exit(interruption.exit_code)
+
+
+def _opened(source: Path, resolved: Config, known: dict[str, Any]) -> Sequence:
+    """Return the frames of an input by what is `known` of it; what a run needs is loaded meanwhile."""
+    with loading(), ThreadPoolExecutor(1) as pool:
+        from scopemap.input.opening import open_sequence
+
+        # To open an input loads nothing of it: imports in two threads can lock up.
+        pool.submit(import_module, "scopemap.runner.with_report")
+        return open_sequence(source, settings=resolved.input, **known)
 
 
 def _report(result: Result, resolved: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
