@@ -68,6 +68,8 @@ def test_a_measurement_is_kept_and_slower_stages_are_named(measured: Speed, tmp_
     assert before.slower_than(slower, 0.25) == []
     whole = replace(measured, cpu_ms=2 * measured.cpu_ms)
     assert [line.partition(":")[0] for line in whole.slower_than(before, 0.25)] == ["whole process"]
+    assert slower.slower_than(before, 0.25, whole=True) == []
+    assert len(whole.slower_than(before, 0.25, whole=True)) == 1
     unknown = replace(before, stages={name: stage for name, stage in before.stages.items() if name != "depth network"})
     assert measured.slower_than(unknown, 0.25)[0].startswith("depth network: ")
     with pytest.raises(InputError, match="preset realtime: measure the same"):
@@ -97,6 +99,18 @@ def test_the_command_prints_compares_and_fails(
     slower = CliRunner().invoke(app, ["bench", "speed", "--compare", str(file)])
     assert slower.exit_code == 1
     assert "slower: depth network" in slower.stderr
+
+
+def test_a_slower_whole_is_measured_once_more(measured: Speed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "speed.json"
+    file.write_text(json.dumps(measured.json()), encoding="utf-8")
+    slow = replace(measured, cpu_ms=2 * measured.cpu_ms)
+    for found, code in (([slow, measured], 0), ([slow, slow], 1), ([measured], 0)):
+        runs = iter(found)
+        monkeypatch.setattr(speed, "measure_speed", lambda *_, runs=runs: next(runs))
+        answer = CliRunner().invoke(app, ["bench", "speed", "--compare", str(file), "--whole"])
+        assert (answer.exit_code, next(runs, None)) == (code, None)
+    assert CliRunner().invoke(app, ["bench", "speed", "--whole"]).exit_code == 2
 
 
 @pytest.mark.parametrize("words", [("speed", "--dry-run"), ("speed", "--out", "x"), ("scared", "--frames", "5")])

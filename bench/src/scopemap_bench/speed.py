@@ -115,14 +115,15 @@ class Speed:
         rounded: dict[str, Any] = json.loads(json.dumps(asdict(self)), parse_float=lambda text: round(float(text), 4))
         return rounded
 
-    def slower_than(self, before: Speed, tolerance: float) -> list[str]:
+    def slower_than(self, before: Speed, tolerance: float, *, whole: bool = False) -> list[str]:
         """Return a line for each stage, and for the whole process, slower by more than the share `tolerance`.
 
-        Raises `InputError` for other clips or presets.
+        whole : only for the whole process. Raises `InputError` for other clips or presets.
         """
         if before._measured != self._measured:
             raise InputError(f"cannot compare {self._measured} with {before._measured}: measure the same")
-        now, then = ({name: stage.ratio for name, stage in speed.stages.items()} for speed in (self, before))
+        stages = ({} if whole else speed.stages for speed in (self, before))
+        now, then = ({name: stage.ratio for name, stage in of_run.items()} for of_run in stages)
         now["whole process"], then["whole process"] = (one.cpu_ms / one.calibration_ms for one in (self, before))
         slower = {name: (ratio, then.get(name, 0.0)) for name, ratio in now.items()}
         return [

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,6 +17,7 @@ SAMPLED_EVERY = 10
 MOST_REPEATS = 4
 """Pictures after a sample among which one that differs from it is sought."""
 
+_Frame = TypeVar("_Frame")
 SampledPair = tuple[np.ndarray, np.ndarray]
 """A picture (h, w, 3) uint8, and the next one of its size that does not repeat it; itself where there is none."""
 
@@ -30,14 +32,17 @@ def pair_of(pictures: Iterable[np.ndarray]) -> SampledPair | None:
     return first, next((rgb for rgb in same_size if not is_repeat(first, rgb)), first)
 
 
-def pairs_in_order(pictures: Iterator[np.ndarray], count: int) -> list[SampledPair]:
-    """Return up to `count` pairs of an input that is read in order, from its begin on."""
-    found = []
+def pairs_in_order(frames: Iterator[_Frame], count: int, picture: Callable[[_Frame], np.ndarray]) -> list[SampledPair]:
+    """Return up to `count` pairs of an input that is read in order, from its begin on.
+
+    picture : returns that of a frame; it is called for the frames that are looked at.
+    """
+    found, run = list[SampledPair](), islice(frames, 0)
     for _ in range(count):
-        run = islice(pictures, SAMPLED_EVERY)
-        pair = pair_of(run)
+        deque(run, maxlen=0)
+        run = islice(frames, SAMPLED_EVERY)
+        pair = pair_of(map(picture, run))
         if pair is None:
             break
         found.append(pair)
-        deque(run, maxlen=0)
     return found

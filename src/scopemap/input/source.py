@@ -137,7 +137,7 @@ class Source:
 
     def sample_pairs(self, count: int) -> list[SampledPair]:
         """Return about `count` pictures from all parts of the input, or of its begin, each with the next other one."""
-        return pairs_in_order((frame.rgb for frame in self.frames(slice(None))), count)
+        return pairs_in_order(self.frames(slice(None)), count, lambda frame: frame.rgb)
 
     def media(self) -> str | None:
         """Return the name that FFmpeg opens where the frames are those of one video; None elsewhere."""

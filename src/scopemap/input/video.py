@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -19,7 +19,7 @@ from av.video.stream import VideoStream
 
 from scopemap.engine.errors import InputError
 from scopemap.input.decoding import limit_in_words, most_pixels
-from scopemap.input.sampling import SampledPair, pair_of
+from scopemap.input.sampling import SampledPair, pair_of, pairs_in_order
 from scopemap.input.source import Source, SourceFrame
 
 # Some headers give the unit of their clock for the rate.
@@ -130,15 +130,22 @@ class VideoFile(Source):
         found, reformatter = dict[int | None, SampledPair](), VideoReformatter()
         with suppress(av.FFmpegError, StopIteration), self._opened() as container:
             start, length = container.start_time or 0, container.duration or 0
-            for part in range(count):
+            stream = container.streams.video[0]
+            for part in range(count if _may_be_entered(container, stream, count // 2) else 0):
                 container.seek(start + length * part // count)
-                frames = container.decode(container.streams.video[0])
+                frames = container.decode(stream)
                 first = next(frames)
                 shown = (self._shown(frame, reformatter) for frame in chain([first], frames))
                 if (pair := pair_of(shown)) is not None:
                     found[first.pts] = pair
-        pairs = [pair for pair in found.values() if pair[0].shape[:2] == (self.height, self.width)]
-        return pairs if len(pairs) >= count // 2 else super().sample_pairs(count)
+        pairs = self._of_this_size(found.values())
+        if len(pairs) >= count // 2:
+            return pairs
+        decoded = (frame for _, _, frame in self._decoded())
+        return self._of_this_size(pairs_in_order(decoded, count, lambda frame: self._shown(frame, reformatter)))
+
+    def _of_this_size(self, pairs: Iterable[SampledPair]) -> list[SampledPair]:
+        return [pair for pair in pairs if pair[0].shape[:2] == (self.height, self.width)]
 
     def media(self) -> str:
         """Return what FFmpeg opens: the file's name, or that of its bytes within another file."""
@@ -248,6 +255,13 @@ class VideoFile(Source):
         if self.count is None:
             raise InputError(f"reading the video {self.path}: its length is unknown, so count frames from the start")
         return selection.indices(self.count)
+
+
+def _may_be_entered(container: InputContainer, stream: VideoStream, places: int) -> bool:
+    """Return whether a video can be entered at so many places; only some formats list these before they are read."""
+    if not container.format.name.startswith(_WITH_EDIT_LISTS):
+        return True
+    return sum(entry.is_keyframe for entry in stream.index_entries) >= places
 
 
 def _tolerance(count: int) -> float:

@@ -10,17 +10,19 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, nullco
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from scopemap.terminal import options
 from scopemap.terminal.figures import print_json, print_warnings
 from scopemap.terminal.interruption import Interruption
+from scopemap.terminal.loading import loading
 from scopemap.terminal.progress import RunProgress, both, run_progress
 
 if TYPE_CHECKING:
     from scopemap.engine.config import Config
+    from scopemap.input.sequence import Sequence
     from scopemap.result.result import Result
 
 
@@ -158,19 +160,8 @@ def run(
     chosen = {key: value for key, value in given.items() if value is not None} | options.parse_settings(settings or [])
     resolved = Config.load(preset, config, chosen)
 
-    from scopemap.input.opening import open_sequence
-
-    # The rest is loaded while the input is looked at, which loads nothing of it: imports in two threads can lock up.
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(import_module, "scopemap.runner.with_report")
-        sequence = open_sequence(
-            source,
-            dataset=dataset,
-            camera=camera,
-            fov_deg=fov,
-            size=options.parse_size(size) if size else None,
-            settings=resolved.input,
-        )
+    known = {"dataset": dataset, "camera": camera, "fov_deg": fov, "size": options.parse_size(size) if size else None}
+    sequence = _opened(source, resolved, known)
     from scopemap.runner.checkpoints import check_resumable, discard_unfinished
     from scopemap.runner.estimators import missing_weights
     from scopemap.runner.network_cost import network_cost
@@ -208,16 +199,26 @@ def _shown(
     out: Path, frames: int | None, adjusts: bool, silent: bool, watched: bool
 ) -> Iterator[tuple[RunProgress, Interruption]]:
     """Yield what a run tells how far it is, in the terminal and, `watched`, for a window; and what ends it early."""
-    from scopemap.runner.watched import RunWatch
-
     with ExitStack() as stack:
         shown = stack.enter_context(run_progress(frames, silent=silent, adjusts=adjusts))
         interruption = stack.enter_context(Interruption())
         observers, progress = (*shown.observers, interruption.observe), shown.progress
         if watched:
+            from scopemap.runner.watched import RunWatch
+
             watch = stack.enter_context(RunWatch(out, frames, adjusts=adjusts))
             observers, progress = (watch, *observers), both(progress, watch.progress)
         yield RunProgress(observers, progress), interruption
+
+
+def _opened(source: Path, resolved: Config, known: dict[str, Any]) -> Sequence:
+    """Return the frames of an input by what is `known` of it; what a run needs is loaded meanwhile."""
+    with loading(), ThreadPoolExecutor(1) as pool:
+        from scopemap.input.opening import open_sequence
+
+        # To open an input loads nothing of it: imports in two threads can lock up.
+        pool.submit(import_module, "scopemap.runner.with_report")
+        return open_sequence(source, settings=resolved.input, **known)
 
 
 def _report(result: Result, resolved: Config, out: Path, *, as_json: bool, quiet: bool) -> None:

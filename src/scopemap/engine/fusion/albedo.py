@@ -16,7 +16,7 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.fusion.tsdf import BLOCK, MeasuredSurface, TsdfCamera, VoxelBlocks, measure_surface
@@ -137,12 +137,12 @@ def _mean(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return cv2.blur(values, window) / np.maximum(cv2.blur(known.astype(np.float32), window), np.float32(1e-6))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _painted(rgb, inverse_depth, light):  # type: ignore[no-untyped-def]
     """Return rgb / light and the weight of each pixel's colour, (H, W, 4) float32; 0 where light is NaN."""
     height, width = light.shape
     result = np.zeros((height, width, 4), np.float32)
-    for row in prange(height):
+    for row in range(height):
         for col in range(width):
             if light[row, col] > 0:
                 most = 0

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.median import median
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.notices import Notice
 
@@ -203,12 +204,14 @@ def _count(points_mm: np.ndarray, colour: np.ndarray, view: _View, counts: np.nd
             known += 1
     if known == 0:
         return
-    median = np.median(ratios[:known])
-    tolerance = max(_TOLERANCE * median, _SIGMAS * 1.4826 * np.median(np.abs(ratios[:known] - median)))
+    usual = median(ratios[:known])
+    for n in range(known):
+        ratios[n] = abs(ratios[n] - usual)
+    tolerance = max(_TOLERANCE * usual, _SIGMAS * 1.4826 * median(ratios[:known]))
     for n in range(len(points_mm)):
         i, j, depth_mm = _place(points_mm, n, P, nearest_mm)
-        if depth_mm > 0 and farthest_mm[i, j] >= (median - tolerance) * depth_mm:
-            behind = nearest_mm[i, j] / depth_mm - median
+        if depth_mm > 0 and farthest_mm[i, j] >= (usual - tolerance) * depth_mm:
+            behind = nearest_mm[i, j] / depth_mm - usual
             counts[n, 0] += 1
             counts[n, 1] += behind > tolerance
             counts[n, 2] += behind > _CERTAIN * tolerance

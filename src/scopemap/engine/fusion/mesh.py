@@ -152,7 +152,7 @@ def _all_contours() -> np.ndarray:
     return table
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _march(
     field: np.ndarray, used: np.ndarray, contours: np.ndarray, vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[int, int]:
@@ -191,9 +191,10 @@ def _march(
             centre = loop[max(start, 0)]
             if start < 0 and size > 0:
                 centre = vertex_count
-                vertices[centre] = 0.0
-                for n in range(size):
-                    vertices[centre] += vertices[loop[n]] / size
+                for axis in range(3):
+                    vertices[centre, axis] = 0.0
+                    for n in range(size):
+                        vertices[centre, axis] += vertices[loop[n], axis] / size
                 vertex_count += 1
             for n in range(size) if start < 0 else range(1, size - 1):
                 faces[face_count, 0] = centre
@@ -203,7 +204,7 @@ def _march(
     return vertex_count, face_count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _contours(corners: np.ndarray) -> np.ndarray:
     """Return the edge (12,) that follows each around the surface in a cell with these corners (8,); -1: not crossed."""
     following: np.ndarray = np.full(len(_EDGES), -1)
@@ -227,7 +228,7 @@ def _contours(corners: np.ndarray) -> np.ndarray:
     return following
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fan_start(vertices: np.ndarray, loop: np.ndarray, edges: np.ndarray, size: int) -> int:
     """Return where a contour's fan of triangles begins, so that its diagonals are short; -1: not at any vertex.
 

@@ -76,7 +76,7 @@ def _slope(before: np.float32, here: np.float32, after: np.float32, most: np.flo
     return total / ((_F32(is_back) + _F32(is_ahead)) * _F32(_SLOPE_STEP_PX))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def measure_surface(
     inverse_depth: np.ndarray, camera: TsdfCamera, largest_step: float, min_incidence: float, max_depth_mm: float
 ) -> MeasuredSurface:
@@ -94,7 +94,7 @@ def measure_surface(
     fx, fy, cx, cy = _F32(camera.fx), _F32(camera.fy), _F32(camera.cx), _F32(camera.cy)
     share, least, nearness = _F32(_SLOPE_STEP_PX * largest_step), _F32(min_incidence), _F32(2.0 / max_depth_mm)
     step, nan = _SLOPE_STEP_PX, _F32(np.nan)
-    for row in prange(height):
+    for row in range(height):
         y = (_F32(row) - cy) / fy
         for col in range(width):
             here, x = inverse_depth[row, col], (_F32(col) - cx) / fx
@@ -162,8 +162,10 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
     # From the middle of the four pixels to the corner of one of them.
     footprint = 1.5 / min(camera.fx, camera.fy)
     # Outside the loop: numba counts references of arrays that are read from a tuple.
-    R, per_mm = camera.R, 1.0 / grid.voxel_mm
-    origin = -R.T @ camera.t
+    R, t, per_mm = camera.R, camera.t, 1.0 / grid.voxel_mm
+    origin_x = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
+    origin_y = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
+    origin_z = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
     recent = np.full(_RECENT, -1, np.int64)
     keys, count = np.empty(4096, np.int64), 0
     # By piece: the blocks of the pixels before, which are most often these pixels' as well. At first, none.
@@ -188,9 +190,9 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
                 near = max(first_mm + piece * piece_mm, 0.0)
                 far = max(near, first_mm + (piece + 1) * piece_mm)
                 wide = footprint * far
-                first_x, last_x = _blocks_between(origin[0] + near * dx, origin[0] + far * dx, wide, per_mm)
-                first_y, last_y = _blocks_between(origin[1] + near * dy, origin[1] + far * dy, wide, per_mm)
-                first_z, last_z = _blocks_between(origin[2] + near * dz, origin[2] + far * dz, wide, per_mm)
+                first_x, last_x = _blocks_between(origin_x + near * dx, origin_x + far * dx, wide, per_mm)
+                first_y, last_y = _blocks_between(origin_y + near * dy, origin_y + far * dy, wide, per_mm)
+                first_z, last_z = _blocks_between(origin_z + near * dz, origin_z + far * dz, wide, per_mm)
                 box = (first_x, last_x, first_y, last_y, first_z, last_z)
                 if box == last_box[piece]:
                     continue
@@ -209,12 +211,12 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
     return keys[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _whole_cells(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
     """Return whether a pixel, its right, its lower and its diagonal neighbour are one surface, (H, W) bool."""
     height, width = inverse_depth.shape
     whole = np.zeros((height, width), np.bool_)
-    for row in prange(height - 1):
+    for row in range(height - 1):
         for col in range(width - 1):
             a, b = inverse_depth[row, col], inverse_depth[row, col + 1]
             c, d = inverse_depth[row + 1, col], inverse_depth[row + 1, col + 1]
@@ -292,7 +294,6 @@ def _integrate_block(
                 colour[i, j, k, 3] += weight
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def integrate_blocks(
     voxels: Voxels,
     slots: np.ndarray,
@@ -309,11 +310,23 @@ def integrate_blocks(
     the surface than the truncation, along the optical axis, stay unchanged; towards there the weight falls to 0
     (Oleynikova et al., IROS 2017, eq. 6). Changes `voxels`.
     """
-    whole = _whole_cells(surface.inverse_depth, grid.largest_step)
-    projection = np.empty((3, 4))
-    projection[:, :3], projection[:, 3] = camera.R, camera.t
+    projection = np.column_stack([camera.R, camera.t])
     projection[0] = camera.fx * projection[0] + camera.cx * projection[2]
     projection[1] = camera.fy * projection[1] + camera.cy * projection[2]
+    _integrate_blocks(voxels, slots, corners, surface, picture, projection, grid)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+def _integrate_blocks(
+    voxels: Voxels,
+    slots: np.ndarray,
+    corners: np.ndarray,
+    surface: MeasuredSurface,
+    picture: np.ndarray,
+    projection: np.ndarray,
+    grid: Grid,
+) -> None:
+    whole = _whole_cells(surface.inverse_depth, grid.largest_step)
     for n in prange(len(slots)):
         block = Voxels(voxels.tsdf[slots[n]], voxels.weight[slots[n]], voxels.colour[slots[n]])
         _integrate_block(block, corners[n], surface, whole, picture, projection, grid)

@@ -34,7 +34,7 @@ def _pixel_grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mean_of_known(neighbours, a, b):  # type: ignore[no-untyped-def]
     """Mean of the known ones of four values by their bilinear weights; NaN where these are below a half."""
     total, share = np.float32(0.0), np.float32(0.0)
@@ -46,7 +46,7 @@ def _mean_of_known(neighbours, a, b):  # type: ignore[no-untyped-def]
     return total / share if share >= 0.5 else np.float32(np.nan)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sampled(image, to_previous):  # type: ignore[no-untyped-def]
     """Sample floats (H, W, C) as `pull` says; (H, W, C) float32."""
     h, w, channels = image.shape

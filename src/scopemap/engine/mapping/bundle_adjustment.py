@@ -279,7 +279,7 @@ def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -
     return PointBlock(columns, A, b, here, h + held, g + held * off, E)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _summed(
     rows: _Rows, point: np.ndarray, observer: np.ndarray, host: int, points: int, keyframes: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -291,16 +291,24 @@ def _summed(
     A = np.zeros((size, size))
     b, E = np.zeros(size), np.zeros((points, size))
     h, g = np.zeros(points), np.zeros(points)
+    # Element by element: numba takes seconds to compile sums of arrays.
     touched = np.empty(12 + lens, np.int64)
-    touched[6:12] = PER_KEYFRAME * host + np.arange(6)
-    touched[12:] = last + np.arange(lens)
+    for i in range(6):
+        touched[6 + i] = PER_KEYFRAME * host + i
+    for i in range(lens):
+        touched[12 + i] = last + i
     rows_of, weighed = np.empty((2, 12 + lens)), np.empty((2, 12 + lens))
     for k in range(len(weight)):
-        touched[:6] = PER_KEYFRAME * observer[k] + np.arange(6)
+        for i in range(6):
+            touched[i] = PER_KEYFRAME * observer[k] + i
         for axis in range(2):
-            row, own = rows_of[axis], weight[k] * by_depth[k, axis]
-            row[:6], row[6:12], row[12:] = by_camera[k, axis], by_host[k, axis], by_lens[k, axis]
-            weighed[axis] = weight[k] * row
+            own = weight[k] * by_depth[k, axis]
+            for i in range(6):
+                rows_of[axis, i], rows_of[axis, 6 + i] = by_camera[k, axis, i], by_host[k, axis, i]
+            for i in range(lens):
+                rows_of[axis, 12 + i] = by_lens[k, axis, i]
+            for i in range(12 + lens):
+                weighed[axis, i] = weight[k] * rows_of[axis, i]
             h[point[k]] += own * by_depth[k, axis]
             g[point[k]] += own * error[k, axis]
         for i in range(12 + lens):

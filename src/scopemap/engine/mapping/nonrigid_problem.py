@@ -247,7 +247,7 @@ class _Normal(NamedTuple):
     g: np.ndarray
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_points(normal: _Normal, start: np.ndarray, scale: np.ndarray, linear: _Linear) -> None:
     """Add the normal equations of keyframes, modes and curves, without the points.
 
@@ -256,7 +256,10 @@ def _add_points(normal: _Normal, start: np.ndarray, scale: np.ndarray, linear: _
     size = len(normal.gradient)
     # A point touches few unknowns: its sums are made among these, and added to the matrix once.
     columns, place = np.empty(size, np.int64), np.full(size, -1)
-    rows = np.zeros((2 * np.diff(start).max(), size))
+    most = 0
+    for p in range(len(scale)):
+        most = max(most, start[p + 1] - start[p])
+    rows = np.zeros((2 * most, size))
     by, off, b, E = np.empty(len(rows)), np.empty(len(rows)), np.zeros(size), np.zeros(size)
     for p in range(len(scale)):
         held, used, count = linear.held[p], 0, 1

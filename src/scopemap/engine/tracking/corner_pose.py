@@ -11,6 +11,8 @@ neighbouring points agree and noise does not explain them, the tissue moves on i
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -109,12 +111,13 @@ def _medians(values: np.ndarray, group: np.ndarray, groups: int) -> tuple[np.nda
     return count, np.where(count[:, None] > 0, middle, np.nan)
 
 
-def _problem(data: tuple[object, ...], unit_mm: float) -> Problem[np.ndarray]:
+def _problem(data: tuple[Any, ...], unit_mm: float) -> Problem[np.ndarray]:
     """Problem over T_current_reference; steps are in rad and, for the translation, in `unit_mm`."""
+    count = max(len(data[0]), 1)
 
     def linearise(T: np.ndarray) -> DenseModel:
         hessian, gradient, cost = _normal_equations(T, *data)
-        return DenseModel(cost, gradient, hessian)
+        return DenseModel(cost / count, gradient / count, hessian / count)
 
     def retract(T: np.ndarray, step: np.ndarray) -> np.ndarray:
         return se3_exp(step * np.repeat([1.0, unit_mm], 3)) @ T
@@ -135,9 +138,9 @@ def _projected(
     return focal * xy + [camera.cx, camera.cy], along, in_front
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _normal_equations(T, points_mm, pixels, along, intrinsics, scale, unit_mm):  # type: ignore[no-untyped-def]
-    """Mean hessian (6, 6), gradient (6,) and cost of Cauchy-weighted errors; infinite cost behind the camera."""
+    """Summed hessian (6, 6), gradient (6,) and cost of Cauchy-weighted errors; infinite cost behind the camera."""
     fx, fy, cx, cy = intrinsics
     variance, width = _SIGMA_PX**2, scale**2
     hessian, gradient, J, cost = np.zeros((6, 6)), np.zeros(6), np.zeros((2, 6)), 0.0
@@ -166,5 +169,4 @@ def _normal_equations(T, points_mm, pixels, along, intrinsics, scale, unit_mm): 
             for j in range(6):
                 line_j = a0 * J[0, j] + a1 * J[1, j]
                 hessian[i, j] += weight * (J[0, i] * J[0, j] + J[1, i] * J[1, j] - shrink * line_i * line_j)
-    count = max(len(points_mm), 1)
-    return hessian / count, gradient / count, cost / count
+    return hessian, gradient, cost

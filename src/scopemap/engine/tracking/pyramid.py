@@ -94,7 +94,7 @@ def _halve_image(grey: np.ndarray, weight: np.ndarray, size: tuple[int, int]) ->
     return mean, (share > 0.5).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _halve_depth(depth_mm):  # type: ignore[no-untyped-def]
     """Mean of the known depths of four pixels on the nearest of their surfaces (within 5 %)."""
     h, w = depth_mm.shape[0] // 2, depth_mm.shape[1] // 2

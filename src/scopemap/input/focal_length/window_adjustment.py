@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 
 from scopemap.engine.geometry.least_squares import RAYLEIGH_TO_SIGMA
+from scopemap.engine.geometry.median import median
 
 _MIN_SIGMA_PX = 0.03
 _CAUCHY2 = 2.0**2  # squared residual, in variances, that gets half the weight
@@ -89,7 +90,7 @@ def at_rest(scene: Scene) -> Start:
     return Start(np.tile(np.eye(3, 4), (scene.seen.shape[1], 1, 1)), scene.expected.copy(), scene.lens.copy())
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def adjusted(scene: Scene, begin: Start, most: int, min_decrease: float) -> WindowSolution:
     """Return what is found from a start in `most` iterations, or until one lowers the cost by less than a share."""
     damping, found = 0.0, _linearised(scene, begin, _errors(scene, begin))
@@ -109,7 +110,7 @@ def adjusted(scene: Scene, begin: Start, most: int, min_decrease: float) -> Wind
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _errors(scene: Scene, state: Start) -> np.ndarray:
     """Return the reprojection errors (N, K, 2), px; NaN where not observed, infinite behind a camera."""
     focal, b, w2 = np.exp(state.lens[0]), state.lens[1], scene.half_width_px**2
@@ -131,14 +132,14 @@ def _errors(scene: Scene, state: Start) -> np.ndarray:
     return error
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _moved(T: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
     X = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
     Y = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
     return X, Y, T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _bend(wanted: float, b: float) -> float:
     """Return the factor of a radius, half widths, that the lens bends a straight one by: Newton's method."""
     if b == 0 or wanted == 0:
@@ -151,7 +152,7 @@ def _bend(wanted: float, b: float) -> float:
     return radius / wanted
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _robust_sigma(error: np.ndarray) -> float:
     lengths, count = np.empty(error.size // 2), 0
     for n in range(error.shape[0]):
@@ -159,10 +160,10 @@ def _robust_sigma(error: np.ndarray) -> float:
             if np.isfinite(error[n, k, 0]):
                 lengths[count] = np.sqrt(error[n, k, 0] ** 2 + error[n, k, 1] ** 2)
                 count += 1
-    return max(RAYLEIGH_TO_SIGMA * np.median(lengths[:count]), _MIN_SIGMA_PX) if count else _MIN_SIGMA_PX
+    return max(RAYLEIGH_TO_SIGMA * median(lengths[:count]), _MIN_SIGMA_PX) if count else _MIN_SIGMA_PX
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cost(scene: Scene, state: Start, error: np.ndarray, sigma_px: float) -> float:
     cost = 0.0
     for n in range(error.shape[0]):
@@ -178,7 +179,7 @@ def _cost(scene: Scene, state: Start, error: np.ndarray, sigma_px: float) -> flo
     return cost
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution:
     """Return the normal equations at a state; A with the prior of the lens."""
     points, partners, sigma_px = error.shape[0], error.shape[1], _robust_sigma(error)
@@ -241,7 +242,7 @@ def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution
     return WindowSolution(state, error, sigma_px, A, scores, E, h, g)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _stepped(scene: Scene, found: WindowSolution, damping: float) -> Start:
     """Return the state after a damped Gauss-Newton step; points move in inverse depth, which parallax is linear in."""
     state, A, E, g, h = found.state, found.A, found.E, found.g, found.h
@@ -275,7 +276,7 @@ def _stepped(scene: Scene, found: WindowSolution, damping: float) -> Start:
     return Start(T, depths, lens)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _solve(matrix: np.ndarray, wanted: np.ndarray) -> None:
     """Put the solution in place of `wanted` (C,), by Cholesky's factors of a matrix (C, C), of which the lower half."""
     size = len(wanted)
@@ -295,7 +296,7 @@ def _solve(matrix: np.ndarray, wanted: np.ndarray) -> None:
         wanted[j] /= matrix[j, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _turn(twist: np.ndarray, T: np.ndarray, turned: np.ndarray) -> None:
     """Put a pose (3, 4), turned by a rotation vector and then moved, in place of `turned`: Rodrigues' formula."""
     x, y, z = twist[0], twist[1], twist[2]
