@@ -101,12 +101,12 @@ class FrameImages:
 def _tile(image: np.ndarray, size: tuple[int, int], words: str, mark: np.ndarray | None, width: int) -> np.ndarray:
     """Return an image in a size (width, height), its caption below, with a ring at a pixel of a picture so wide."""
     out = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
-    if mark is not None:
-        place = np.round((np.asarray(mark) + 0.5) * size[0] / width).astype(int).tolist()
-        cv2.circle(out, place, _MARK_PX, (255, 255, 255), 5, cv2.LINE_AA)
-        cv2.circle(out, place, _MARK_PX, CLICKED, 3, cv2.LINE_AA)
     low = size[1] - _CAPTION_PX
     out[low:] = out[low:] // 3
     at = (8, size[1] - 9)
     cv2.putText(out, words, at, cv2.FONT_HERSHEY_SIMPLEX, _LETTERS, (255, 255, 255), 2, cv2.LINE_AA)
+    if mark is not None:
+        place = np.round((np.asarray(mark) + 0.5) * size[0] / width).astype(int).tolist()
+        cv2.circle(out, place, _MARK_PX, (255, 255, 255), 5, cv2.LINE_AA)
+        cv2.circle(out, place, _MARK_PX, CLICKED, 3, cv2.LINE_AA)
     return out

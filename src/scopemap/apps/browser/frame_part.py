@@ -9,7 +9,7 @@ import numpy as np
 
 from scopemap.apps.browser.frame_images import FrameImages
 from scopemap.apps.browser.marks import CLICKED, draw_marks
-from scopemap.apps.browser.result_view import LOOKING, ResultView
+from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.scene import quaternion
 from scopemap.apps.browser.seen_by import frames_that_saw
 from scopemap.apps.browser.shown_surface import SurfacePick
@@ -20,6 +20,7 @@ from scopemap.result.run_input import places_of_input
 from scopemap.runner.reread_frames import reread_frames
 
 _FRUSTUM = "/page/frame"
+_CLICK = "Click on the surface to see which frames saw that place."
 _CLICKED = "/page/clicked"
 _FRUSTUM_SHARE = 0.045
 _COLOUR = (30, 160, 70)
@@ -58,7 +59,7 @@ class FramePart:
     def _add_list(self) -> None:
         """Make the list of the frames that saw a place."""
         gui = self._view.window.gui
-        self._no_list = gui.add_markdown(LOOKING)
+        self._no_list = gui.add_markdown(_CLICK)
         self._list = self._view.window.on(gui.add_dropdown("Frames that saw it", [""], visible=False), self._choose)
 
     def _hide_list(self) -> None:
@@ -86,7 +87,7 @@ class FramePart:
         self._list.options = list(self._listed)
         self._list.value = self._list.options[0]
         count = "1 frame" if len(seen) == 1 else f"{len(seen)} frames"
-        view.note(f"{count} saw this place. Frame {best} saw it best: Frames shows it.")
+        view.note(f"{count} saw it, frame {best} best: see Frames.")
         self._list.visible, self._no_list.visible = True, False
         self._mark(pick)
         self._marked = {sight.frame: sight.pixels[0] for sight in seen}

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 _POINT_SHARE = 0.008
+_MOST_POINTS = 200
+"""Of one mark, when it is drawn with fewer again."""
 INK = (20, 90, 220)
 REFERENCE = (215, 105, 0)
 PALE = (140, 140, 140)
@@ -27,9 +29,13 @@ def draw_marks(
 
     What was there by this name goes. size_mm : of the surface. line : (M, 3), that is drawn instead of straight ones.
     """
-    scene.remove_by_name(name)
     if not len(points):
+        scene.remove_by_name(name)
         return
+    # A browser may lose nodes that are made right after their parent was removed: only what is too much goes.
+    left = [str(number) for number in range(len(points), _MOST_POINTS)]
+    for gone in (*left, *(["lines"] if len(points) < 2 else []), *([] if words else ["words"])):
+        scene.remove_by_name(f"{name}/{gone}")
     for number, point in enumerate(points):
         scene.add_icosphere(
             f"{name}/{number}",

@@ -9,14 +9,13 @@ import numpy as np
 from scopemap.apps.browser.hand_measures import HandMeasure, Reference, line_on_surface, measure_by_hand
 from scopemap.apps.browser.lesion_part import LesionPart
 from scopemap.apps.browser.marks import REFERENCE, draw_marks
-from scopemap.apps.browser.measured_list import MeasuredList, in_words
+from scopemap.apps.browser.measured_list import MeasuredList, short
 from scopemap.apps.browser.result_view import LOOKING, ResultView
 from scopemap.apps.browser.shown_surface import SurfacePick
 
 Mode = Literal["Look", "Distance", "Area", "Lesion"]
 _CHOOSE = "Choose what to measure."
 _UNKNOWN = "Sizes are unknown. Choose **Distance** and click on both ends of something whose length you know."
-_REFERENCE = "Click on both ends of something whose length you know"
 _FEWEST = 3
 _PICKED = "/page/picked"
 _REFERRED = "/page/reference"
@@ -90,7 +89,7 @@ class MeasurePart:
         def then(found: tuple[HandMeasure, np.ndarray]) -> None:
             one, line = found
             self._picks = []
-            self._view.note(in_words(one))
+            self._view.note(", ".join(f"{found.what}: {short(found)}" for found in one.found))
             self._show()
             self._measured.add(one, reference, line)
 
@@ -100,7 +99,7 @@ class MeasurePart:
         first, second = self._picks
         self._picks = []
         self._refer_to(Reference((first, second), float(self._length.value) or None))
-        self._view.note("The reference is set. Now click on the two points to be measured.")
+        self._view.note("The reference is set. Now measure with two clicks.")
 
     def _forget_reference(self) -> None:
         self._refer_to(None)
@@ -159,8 +158,8 @@ class MeasurePart:
                 return f"Distance: click on the {'2nd' if count == 1 else '1st'} of 2 points."
             if count == 2:
                 return "Distance: press Use as reference, in Measure."
-            return f"{_REFERENCE}: {'2nd' if count == 1 else '1st'} of 2 points."
+            return f"Distance: click on the {'2nd' if count == 1 else '1st'} end of a known length."
         what = self.mode.lower()
         if count < _FEWEST:
-            return f"{self.mode}: click on point {count + 1} of 3 or more around the {what}."
-        return f"{self.mode}: click on more points, or press Measure the {what}."
+            return f"{self.mode}: click on point {count + 1} of 3 or more around it."
+        return f"{self.mode}: add points, or press Measure the {what}."

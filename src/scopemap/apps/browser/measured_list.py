@@ -73,14 +73,18 @@ class MeasuredList:
         self._draw()
 
     def _is_earlier(self, listed: _Listed) -> bool:
-        return listed.one.reference is not None and (listed.reference is None or listed.reference != self._reference)
+        return listed.one.reference is not None and (
+            listed.reference is None or listed.reference is not self._reference
+        )
 
     def _note(self, listed: _Listed) -> str:
         return " *by an earlier reference*" if self._is_earlier(listed) else ""
 
     def _draw(self) -> None:
         view, here = self._view, folder_in_whole(self._view.run)
-        view.window.scene.remove_by_name(_KEPT)
+        for place in range(len(self._all) + 1):
+            if place == len(self._all) or self._all[place].one.folder != here:
+                view.window.scene.remove_by_name(f"{_KEPT}/{place}")
         for place, listed in enumerate(self._all):
             one = listed.one
             if one.folder != here:
@@ -95,7 +99,7 @@ class MeasuredList:
         gone = self._all.pop()
         self.show(self._reference)
         remove_measurement(self._view.whole.folder, gone.one)
-        self._view.note(f"Removed: {in_words(gone.one)}.")
+        self._view.note(f"Removed: {short(gone.one.found[0])}.")
 
 
 def in_words(one: HandMeasure) -> str:

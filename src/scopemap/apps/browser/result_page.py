@@ -105,8 +105,9 @@ class ResultPage:
             window.on(button, lambda: self._compare(others[names[shown.index(chosen.value)]]))
 
     def _ways_now(self) -> tuple[str, ...]:
-        back = (_BACK,) if self._workspace is not None else ()
-        return (*back, _WHOLE, *((_STOP,) if self._view.measuring else ()))
+        # Not more than two: they stay in one row, and the tabs where they are.
+        first = _WHOLE if self._workspace is None else _BACK
+        return (first, _STOP) if self._view.measuring else (first,)
 
     def _show_ways(self) -> None:
         if self._ways.options != self._ways_now():

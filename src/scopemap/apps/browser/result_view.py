@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scopemap.apps.browser.workspace import Workspace
     from scopemap.apps.coverage.coverage import Coverage
 
-LOOKING = "Click on the surface to see which frames saw that place."
+LOOKING = "A click shows which frames saw the place."
 """What a click is for where nothing is measured."""
 
 _NOTHING = "\u00a0"

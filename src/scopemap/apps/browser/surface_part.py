@@ -58,6 +58,7 @@ class SurfacePart:
         if view.surface.moves:
             self._state = window.on(gui.add_checkbox("Moving tissue", initial_value=True), self._choose_state)
             self._state.hint = "In the state of the frame; play the frames to see it move"
+        window.on(gui.add_button("Look at the whole surface", color="gray"), view.look_at_all)
         view.follow(frame=self._follow_frame, submap=self._follow_submap)
         self._follow_submap()
 
