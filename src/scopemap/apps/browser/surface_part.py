@@ -12,7 +12,6 @@ from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
 from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, stops_of
 from scopemap.apps.browser.unlit_mesh import unlit_glb
-from scopemap.apps.browser.unseen_part import unseen_words
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import COLOURS
 from scopemap.report.shown_mesh import simplified
@@ -105,7 +104,7 @@ class SurfacePart:
         seen, _, hidden = COLOURS
         colours = {name: COLOURS[name] for name in (seen, hidden)}
         self._legend.content, self._legend.visible = words_html(colours), True
-        self._words.content = f"{unseen_words(found)} {_LIDS}"
+        self._words.content = _LIDS
         self._shown = np.asarray(painted.vertices), np.asarray(painted.faces), vertex_colours(painted)[:, :3]
         self._draw()
 

@@ -75,7 +75,7 @@ class UnseenPart:
         scene, radius = view.window.scene, _SHARE * view.surface.size_mm
         scene.add_icosphere(f"{_MARK}/ball", radius, _INK, position=tuple(place), cast_shadow=False)
         scene.add_label(f"{_MARK}/words", f"blind spot {number}", position=tuple(place), anchor="bottom-center")
-        view.note(f"Blind spot {number}, seen from frame {spot.frame}, whose camera was nearest.")
+        view.note(f"Blind spot {number}, seen from frame {spot.frame}, the nearest.")
 
 
 def unseen_words(found: Coverage) -> str:
