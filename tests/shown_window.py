@@ -69,6 +69,16 @@ class ShownWindow:
         self.settle()
 
     @property
+    def ways(self) -> tuple[str, ...]:
+        """The buttons above the tabs of a result."""
+        return tuple(self.element("ButtonGroup", "").options)
+
+    @property
+    def nodes(self) -> dict[str, Any]:
+        """What is in the scene, by name."""
+        return dict(self.window.scene._handle_from_node_name)
+
+    @property
     def words(self) -> str:
         """All sentences that are seen, without the signs of Markdown."""
         texts = [one.content for one in self.handles("Markdown") if one.visible]

@@ -92,14 +92,16 @@ def shown(browser: Any, request: pytest.FixtureRequest, tmp_path: Path) -> Itera
 def test_a_distance_between_two_clicks_is_the_commands(
     shown: tuple[Looked, ResultPage, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    looked, page, folder = shown
+    looked, _, folder = shown
     looked.tab("Measure")
     looked.page.get_by_role("button", name="Distance").click()
-    looked.until(lambda: "Click on two points of the surface" in looked.words, "what to do")
-    for count, place in enumerate(((420, 440), (470, 500)), 1):
-        looked.page.mouse.click(*place)
-        looked.until(lambda count=count: len(page._measure._picks) == count, f"point {count}")  # type: ignore[misc]
-    looked.until(lambda: "along the surface:" in looked.words, "the distance")
+    looked.until(lambda: "Distance: click on the 1st of 2 points" in looked.words, "what to do")
+    looked.page.mouse.click(420, 440)
+    looked.until(lambda: "click on the 2nd of 2 points" in looked.words, "the first point")
+    looked.page.mouse.click(470, 500)
+    looked.until(lambda: "Command of 1" in looked.words, "the distance")
+    looked.page.get_by_text("Command of 1").click()
+    looked.until(lambda: "--points" in looked.words, "the command")
     command = re.search(r'scopemap measure .*?--points "[^"]*"', looked.words, re.DOTALL)
     assert command is not None
     capsys.readouterr()
@@ -117,7 +119,7 @@ def test_a_distance_between_two_clicks_is_the_commands(
 def test_colours_are_those_of_the_surface_and_keys_move_the_time_line(shown: tuple[Looked, ResultPage, Path]) -> None:
     looked, _, _ = shown
     looked.tab("Surface")
-    looked.page.locator("label", has_text="Relief").first.click()
+    looked.page.locator("label", has_text="Shading").first.click()
     near = lambda: (np.abs(looked.picture() - BRIGHT).max(-1) <= 2).sum()  # noqa: E731
     looked.until(lambda: near() > 2000, "the tissue's own colour")
     looked.tab("Frames")

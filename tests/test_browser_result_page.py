@@ -12,9 +12,11 @@ from front_door import call
 from shown_window import ShownWindow, shown_window
 
 from scopemap.apps.browser.files_part import export_place
+from scopemap.apps.browser.marks import CLICKED
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.workspace import Workspace
+from scopemap.apps.coverage.coverage import BLIND, coverage
 from scopemap.engine.notices import Notice
 from scopemap.report.page_data import read_measurements
 from scopemap.result.result import Result
@@ -34,6 +36,11 @@ def click(shown: ShownWindow, page: ResultPage, pixel: tuple[float, float], fram
     shown.settle()
 
 
+def ring(shown: ShownWindow) -> int:
+    """How many pixels of the frame's picture mark the place that was clicked."""
+    return int((shown.handles("Image")[0].image == CLICKED).all(-1).sum())
+
+
 def test_it_says_what_the_summary_of_the_run_says(tmp_path: Path) -> None:
     folder = draw_run(tmp_path, notices=INTERLACED)
     with shown_window() as shown:
@@ -47,7 +54,7 @@ def test_it_says_what_the_summary_of_the_run_says(tmp_path: Path) -> None:
             )
         # Without a workspace nothing can be started.
         assert not [label for label in shown.labels() if label.startswith("Run again")]
-        assert "Back to the start" not in shown.labels()
+        assert shown.ways == ("Whole surface",)
 
 
 def test_a_caution_starts_the_run_that_mends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +96,7 @@ def test_frames_say_what_they_are(tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
     with shown_window() as shown:
         shown.show(ResultPage(folder))
-        shown.until(lambda: "surface seen from there" in shown.words)
+        shown.until(lambda: shown.handles("Image")[0].image.shape[1] == 960)
         assert "Frame 0, 0.00 s: tracked" in shown.words
         shown.choose("Slider", "Frame", IN_RESULT)
         assert "Frame 14, 0.56 s: lost: too blurred." in shown.words
@@ -121,13 +128,23 @@ def test_a_click_lists_the_frames_that_saw_the_place(tmp_path: Path) -> None:
     with shown_window() as shown:
         shown.show(page)
         click(shown, page, (60.0, 40.0))
-        listed = shown.element("Dropdown", "Frames that saw it")
-        assert "frame 4, 0.16 s" in listed.options
-        shown.choose("Dropdown", "Frames that saw it", "frame 4, 0.16 s")
+        listed = shown.element("Dropdown", "Frames that saw it").options
+        # The best one is shown at once, with the place marked in its picture and on the surface.
+        best = int(listed[0].split()[1].rstrip(","))
+        assert listed[0].endswith("(best)")
+        assert shown.element("Slider", "Frame").value == best
+        assert "/page/clicked/0" in shown.nodes
+        shown.until(lambda: ring(shown) > 100)
+        other = next(name for name in listed if name.startswith("frame 4, 0.16 s"))
+        shown.choose("Dropdown", "Frames that saw it", other)
         assert shown.element("Slider", "Frame").value == 4
         shown.window.do(page.click, np.array([0.0, 0.0, -50.0]), np.array([0.0, 0.0, -1.0]))
         shown.settle()
         assert "There is no surface there." in shown.words
+        # The list and the marks go with their message.
+        assert "Frames that saw it" not in shown.labels("Dropdown")
+        assert "/page/clicked/0" not in shown.nodes
+        shown.until(lambda: ring(shown) == 0)
 
 
 def test_a_distance_is_measured_and_kept(tmp_path: Path) -> None:
@@ -135,20 +152,37 @@ def test_a_distance_is_measured_and_kept(tmp_path: Path) -> None:
     page = ResultPage(folder)
     with shown_window() as shown:
         shown.show(page)
+        assert "A click shows which frames saw the place." in shown.words
         shown.choose("ButtonGroup", "Measure", "Distance")
+        assert "Distance: click on the 1st of 2 points." in shown.words
+        assert "Points" not in shown.labels("ButtonGroup")
         click(shown, page, (20.0, 20.0))
+        assert "Distance: click on the 2nd of 2 points." in shown.words
+        assert "Points" in shown.labels("ButtonGroup")
         click(shown, page, (60.0, 44.0))
         shown.until(lambda: "straight: " in shown.words)
         assert f"scopemap measure {folder}" in shown.words
-        shown.press("Save the measurements")
         (kept,) = read_measurements(folder)
-        assert f"straight: {kept['found'][0]['value']:.3g} mm" in shown.words
+        assert f"straight: {kept['found'][0]['value']:.3g} mm, 95 % interval " in shown.words
+        assert shown.nodes["/page/measured/0/words"].text == f"{kept['found'][0]['value']:.3g} mm"
         # One of points that no frame saw together is refused in a sentence.
         click(shown, page, (60.0, 44.0))
         shown.window.do(page.click, np.array([0.0, 0.0, 8.0]), np.array([1.0, 0.0, 0.0]))
         shown.until(lambda: "no frame saw all of these points" in shown.window._error.content)
         shown.choose("ButtonGroup", "Points", "Clear")
         assert len(read_measurements(folder)) == 1
+        assert shown.ways == ("Whole surface", "Stop measuring")
+        shown.choose("ButtonGroup", "", "Stop measuring")
+        assert page._measure.mode == "Look"
+        assert shown.ways == ("Whole surface",)
+        # They are there when the result is opened again, until they are removed.
+        shown.show(ResultPage(folder))
+        assert f"straight: {kept['found'][0]['value']:.3g} mm" in shown.words
+        assert "/page/measured/0/words" in shown.nodes
+        shown.press("Remove the last")
+        assert read_measurements(folder) == []
+        assert "/page/measured/0/words" not in shown.nodes
+        assert "Remove the last" not in shown.labels()
 
 
 def test_without_a_scale_two_points_become_the_reference(tmp_path: Path) -> None:
@@ -158,17 +192,32 @@ def test_without_a_scale_two_points_become_the_reference(tmp_path: Path) -> None
         shown.choose("ButtonGroup", "Measure", "Distance")
         click(shown, page, (24.0, 45.0))
         click(shown, page, (40.0, 45.0))
-        assert "The scale is unknown: use these two points as reference" in shown.words
-        shown.element("Number", "Its length").value = 5.0
+        assert "Distance: press Use as reference" in shown.words
+        assert "Sizes are unknown: compare shapes" in shown.words
+        shown.element("Number", "Length of this line").value = 5.0
         shown.press("Use as reference")
+        assert "Sizes are in mm by your reference (5 mm)." in shown.words
+        assert "Sizes are unknown" not in shown.words
+        assert shown.nodes["/page/reference/words"].text == "5 mm"
         shown.choose("ButtonGroup", "Measure", "Area")
         for pixel in ((20.0, 20.0), (60.0, 20.0), (60.0, 44.0)):
             click(shown, page, pixel)
         shown.press("Measure the area")
         shown.until(lambda: "--reference-mm 5" in shown.words)
         assert "mm2" in shown.words
+        assert "by an earlier reference" not in shown.words
+        # Another reference: what was measured by the one before is marked.
+        shown.choose("ButtonGroup", "Measure", "Distance")
         shown.press("Forget the reference")
         assert "Forget the reference" not in shown.labels()
+        assert "/page/reference/words" not in shown.nodes
+        for pixel in ((24.0, 45.0), (44.0, 45.0)):
+            click(shown, page, pixel)
+        shown.element("Number", "Length of this line").value = 0.0
+        shown.press("Use as reference")
+        assert "Sizes are in multiples of your reference." in shown.words
+        assert "by an earlier reference" in shown.words
+        assert shown.nodes["/page/reference/words"].text == "reference"
 
 
 def test_a_lesion_is_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -198,16 +247,19 @@ def test_blind_spots_are_those_of_the_command(tmp_path: Path) -> None:
     with shown_window() as shown:
         shown.show(ResultPage(folder))
         shown.press("What was not seen")
-        shown.until(lambda: "with a probability of 90 %" in shown.words)
-        assert f"{100 * facts['total']['share']:.0f} % was not seen" in shown.words
+        shown.until(lambda: "was not seen, estimated (90 % interval" in shown.words)
+        assert f"{100 * facts['total']['share']:.0f} % of the wall" in shown.words
         spots = [label for label in shown.labels() if label[0].isdigit()]
         assert len(spots) == len(facts["blind_spots"])
         shown.press("1. ")
         assert f"seen from frame {facts['blind_spots'][0]['frame']}" in shown.words
-        camera = shown.window.server.initial_camera
-        np.testing.assert_allclose(camera.look_at, facts["blind_spots"][0]["position_mm"], rtol=1e-6)
+        # It is looked at where a face was not seen, the nearest one to the spot's middle.
+        found = coverage(folder)
+        hidden = found.surface.triangles_center[np.nan_to_num(found.unseen) > BLIND]
+        apart = np.linalg.norm(hidden - facts["blind_spots"][0]["position_mm"], axis=1)
+        np.testing.assert_allclose(shown.window.server.initial_camera.look_at, hidden[apart.argmin()], rtol=1e-6)
         shown.choose("Dropdown", "Colour by", "coverage")
-        assert "The surface is closed where it has gaps." in shown.words
+        assert "The surface is closed where it has gaps: flat lids close its open ends." in shown.words
 
 
 def test_an_export_is_written_beside_the_result(tmp_path: Path) -> None:

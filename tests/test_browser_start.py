@@ -152,7 +152,10 @@ def test_a_run_that_dies_is_told_and_goes_on_when_it_is_asked_again(opened: tupl
     assert measured_rates(workspace.finished, "realtime") == []
     window.show(StartPage(workspace))
     settle(window)
-    assert run.out.name in element(window, "Result").options
+    listed = [re.sub(r", \d{4}-\d\d-\d\d \d\d:\d\d,", "", one) for one in element(window, "Result").options]
+    assert listed.count(f"{run.out.name} {verdict(Result(run.out)).word}") == 1
+    # A finished run is a result, and no longer among the runs.
+    assert f"{run.out.name} done" not in words(window)
     assert not any(getattr(one, "options", ()) == ("Look at it", "Stop") for one in elements(window))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from scopemap.apps.browser.frame_images import FrameImages
+from scopemap.apps.browser.marks import CLICKED, draw_marks
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.scene import quaternion
 from scopemap.apps.browser.seen_by import frames_that_saw
@@ -19,17 +20,14 @@ from scopemap.result.run_input import places_of_input
 from scopemap.runner.reread_frames import reread_frames
 
 _FRUSTUM = "/page/frame"
+_CLICK = "Click on the surface to see which frames saw that place."
+_CLICKED = "/page/clicked"
 _FRUSTUM_SHARE = 0.045
 _COLOUR = (30, 160, 70)
 _STEP_S = 0.2
 _MOST_STEPS = 150
 """Of a film of the time line: of longer videos frames are left out."""
 _MOST_LISTED = 30
-_PLACES = {
-    LOST: "**lost**",
-    ROTATED: "**lost**, only its rotation is known",
-    ELSEWHERE: "in a submap too small to be kept",
-}
 
 
 class FramePart:
@@ -43,43 +41,62 @@ class FramePart:
         self._slider.hint = "Arrow keys when it is chosen; N and P: next and previous frame"
         moves = gui.add_button_group("Go", ["Previous", "Next", "Play"])
         moves.on_click(lambda event: window.do(self._move, moves.value))
+        window.on(gui.add_button("Look from here", color="gray"), view.look_from_frame)
         self._words = gui.add_markdown("")
         self._image = gui.add_image(np.zeros((8, 640, 3), np.uint8))
-        self._shown = gui.add_markdown("")
-        window.on(gui.add_button("Look from here"), view.look_from_frame)
+        self._add_list()
         self._with_camera = window.on(gui.add_checkbox("Fly along", initial_value=False), self._go_with)
         self._with_camera.hint = "Look from each frame that is chosen or played"
         self._reread = window.on(gui.add_button("Read its own picture from the video", visible=False), self._read_again)
+        self._marked: dict[int, np.ndarray] = {}
         self._has_input = bool(places_of_input(view.whole.folder))
         self._commands = [
             self._command("Next frame", "N", "Next"),
             self._command("Previous frame", "P", "Previous"),
         ]
-        view.follow(frame=self._follow, camera=self._draw)
+        view.follow(frame=self._follow, camera=self._draw, note=self._hide_list)
 
-    def add_list(self) -> None:
+    def _add_list(self) -> None:
         """Make the list of the frames that saw a place."""
         gui = self._view.window.gui
+        self._no_list = gui.add_markdown(_CLICK)
         self._list = self._view.window.on(gui.add_dropdown("Frames that saw it", [""], visible=False), self._choose)
 
-    def hide_list(self) -> None:
-        """Show no list."""
-        self._list.visible = False
+    def _hide_list(self) -> None:
+        """Show no list, and no place: there is another message."""
+        self._list.visible, self._no_list.visible = False, True
+        self._view.window.scene.remove_by_name(_CLICKED)
+        if self._marked:
+            self._marked = {}
+            self._view.window.do(self._show_images, self._view.index)
 
     def list_that_saw(self, pick: SurfacePick) -> None:
-        """List the frames that saw a place on the surface, the best first."""
-        seen = frames_that_saw(self._view.surface, [pick])
-        self._list.visible = bool(seen)
+        """List the frames that saw a place on the surface, the best first, mark the place, and show the best frame."""
+        view, seen = self._view, frames_that_saw(self._view.surface, [pick])
         if not seen:
-            self._view.note("No frame saw this place clearly.")
+            view.note("No frame saw this place clearly.")
+            self._mark(pick)
             return
         times = dict(zip(self._view.whole.frames["index"].tolist(), self._view.whole.frames["time_s"], strict=True))
         shown = seen[:_MOST_LISTED]
-        self._listed = {f"frame {sight.frame}, {times[sight.frame]:.2f} s": sight.frame for sight in shown}
-        count = "1 frame" if len(seen) == 1 else f"{len(seen)} frames"
-        self._list.options = [f"{count}: choose one", *self._listed]
+        best = seen[0].frame
+        self._listed = {
+            f"frame {sight.frame}, {times[sight.frame]:.2f} s{' (best)' if sight.frame == best else ''}": sight.frame
+            for sight in shown
+        }
+        self._list.options = list(self._listed)
         self._list.value = self._list.options[0]
-        self._view.note(f"{count} saw this place, frame {seen[0].frame} best. Choose one to see it.")
+        count = "1 frame" if len(seen) == 1 else f"{len(seen)} frames"
+        view.note(f"{count} saw it, frame {best} best: see Frames.")
+        self._list.visible, self._no_list.visible = True, False
+        self._mark(pick)
+        self._marked = {sight.frame: sight.pixels[0] for sight in seen}
+        view.show_frame(best)
+
+    def _mark(self, pick: SurfacePick) -> None:
+        view = self._view
+        place = view.surface.position(pick, view.state)[None]
+        draw_marks(view.window.scene, _CLICKED, place, view.surface.size_mm, colour=CLICKED)
 
     def close(self) -> None:
         """End what plays, and the keys."""
@@ -162,8 +179,7 @@ class FramePart:
     def _show_images(self, index: int) -> None:
         if index != self._view.index:
             return
-        image, words = self._images.all_of(index)
-        self._image.image, self._shown.content = image, escaped(words)
+        self._image.image = self._images.all_of(index, self._marked.get(index))
         found = self._images.picture(index)
         self._reread.visible = self._has_input and (found is None or found[0] != index)
 

@@ -6,6 +6,7 @@ import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,11 @@ from scopemap.result.json_numbers import without_nan
 from scopemap.result.result import Result
 
 _MOST_TRIED = 4
+_NUMBERS = ("value", "low", "high")
+_STEPS = 16
+"""Parts of a line along the surface between two places."""
+_LIFT = 0.01
+"""By which share of the way to the camera such a line is above the surface, so that it is seen."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,19 @@ class HandMeasure:
             "command": self.command("."),
             "world": self.world.tolist(),
         }
+
+    @classmethod
+    def from_json(cls, kept: dict[str, Any]) -> HandMeasure:
+        """Return what measurements.json has of one, as `read_measurements` returns it."""
+        found = [
+            Measure(
+                one["what"], **{name: np.nan if one[name] is None else one[name] for name in _NUMBERS}, unit=one["unit"]
+            )
+            for one in kept["found"]
+        ]
+        reference = None if kept["reference"] is None else np.array(kept["reference"], float)
+        pixels, world = np.array(kept["points"], float), np.array(kept["world"], float).reshape(-1, 3)
+        return cls(kept["folder"], kept["frame"], pixels, reference, kept["reference_mm"], found, world)
 
 
 def measure_by_hand(
@@ -121,6 +140,37 @@ def broken(command: str) -> str:
 def folder_in_whole(run: Result) -> str:
     """Return where a submap is in the whole result: "maps/1", or "." for the result itself."""
     return f"maps/{run.folder.resolve().name}" if run.is_submap else "."
+
+
+def kept_measures(folder: Path) -> list[HandMeasure]:
+    """Return what was measured by hand and kept in a result's folder."""
+    return [HandMeasure.from_json(one) for one in read_measurements(folder)]
+
+
+def remove_measurement(folder: Path, gone: HandMeasure) -> None:
+    """Remove a measurement from those kept in a result's folder. Raises `InputError` where they cannot be written."""
+    (same,) = checked_measurements(json.dumps([gone.as_json]).encode())
+    keep_measurements(folder, json.dumps([one for one in read_measurements(folder) if one != same]).encode())
+
+
+def line_on_surface(surface: ShownSurface, frame: int, places: np.ndarray) -> np.ndarray:
+    """Return the line (M, 3) on a surface that a frame sees as straight between places (N, 3); of more than two closed.
+
+    Where the surface has a gap, it is straight in space. Places are as they are in the result.
+    """
+    closed = np.concatenate([places, places[: int(len(places) > 2)]])
+    shares = np.linspace(0, 1, _STEPS + 1)[:, None]
+    points = np.concatenate([first + shares * (last - first) for first, last in pairwise(closed)])
+    tracked = surface.run.tracked
+    row = np.flatnonzero(tracked["index"] == frame)
+    if not len(row):
+        return points
+    eye, line = tracked["T_world_camera"][row[0]][:3, 3], []
+    for point in points:
+        met = surface.pick(eye, point - eye)
+        on = point if met is None else surface.position(met)
+        line.append(on + _LIFT * (eye - on))
+    return np.array(line)
 
 
 def add_measurements(folder: Path, measured: Sequence[HandMeasure]) -> int:

@@ -20,7 +20,7 @@ from scopemap.apps.browser.marks import draw_marks
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.seen_by import frames_that_saw
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
-from scopemap.apps.browser.window import escaped
+from scopemap.apps.browser.window import escaped, fenced
 from scopemap.apps.measure.lesion import MeasuredLesion, measure_lesion
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.se3 import inverse, transform
@@ -30,15 +30,29 @@ _FEWEST = 3
 
 
 class LesionPart:
-    """Controls of a lesion's outline in the frame that is shown when it begins."""
+    """Controls of a lesion's outline in the frame that is shown when it begins.
 
-    def __init__(self, view: ResultView, reference: Callable[[], Reference | None]) -> None:
+    changed : called where there are more corners, or fewer.
+    """
+
+    def __init__(
+        self, view: ResultView, reference: Callable[[], Reference | None], changed: Callable[[], None]
+    ) -> None:
         self._view, self._reference = view, reference
+        self._changed = changed
         self._picks: list[SurfacePick] = []
         self._frame = -1
         gui = view.window.gui
         self._button = view.window.on(gui.add_button("Measure the lesion", visible=False), self._measure)
         self._found = gui.add_markdown("", visible=False)
+        self._folder = gui.add_folder("Command", expand_by_default=False, visible=False)
+        with self._folder:
+            self._command = gui.add_markdown("")
+
+    @property
+    def count(self) -> int:
+        """How many corners there are."""
+        return len(self._picks)
 
     def begin(self, *, shown: bool) -> None:
         """Begin an outline in the frame that is shown, seen from there; or end it, where the mode is another one."""
@@ -72,6 +86,7 @@ class LesionPart:
         self._button.visible = len(self._picks) >= _FEWEST
         points = np.array([view.surface.position(pick, view.state) for pick in self._picks])
         draw_marks(view.window.scene, _OUTLINE, points, view.surface.size_mm)
+        self._changed()
 
     def _measure(self) -> None:
         surface, frame = self._view.surface, self._frame
@@ -100,7 +115,8 @@ class LesionPart:
         found, command = measured
         lines = [f"- {escaped(str(one))}" for one in found.measures]
         lines.append(f"\nFrom {len(found.masks)} frames; the scale rests on {escaped(found.scale)}.")
-        self._found.content, self._found.visible = "\n".join(lines) + f"\n```\n{broken(command)}\n```", True
+        self._found.content, self._command.content = "\n".join(lines), fenced(broken(command))
+        self._found.visible = self._folder.visible = True
         self._view.note(str(found.measures[0]))
 
 

@@ -1,4 +1,4 @@
-"""Measuring: clicks on the surface become points, two of them a distance, more an area, with the command for it."""
+"""Measuring: clicks on the surface become points, two of them a distance, more an area; and the reference of sizes."""
 
 from __future__ import annotations
 
@@ -6,30 +6,19 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from scopemap.apps.browser.hand_measures import (
-    HandMeasure,
-    Reference,
-    add_measurements,
-    broken,
-    measure_by_hand,
-)
+from scopemap.apps.browser.hand_measures import HandMeasure, Reference, line_on_surface, measure_by_hand
 from scopemap.apps.browser.lesion_part import LesionPart
-from scopemap.apps.browser.marks import draw_marks
-from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.marks import REFERENCE, draw_marks
+from scopemap.apps.browser.measured_list import MeasuredList, short
+from scopemap.apps.browser.result_view import LOOKING, ResultView
 from scopemap.apps.browser.shown_surface import SurfacePick
-from scopemap.apps.browser.window import escaped
-from scopemap.report.page_data import MEASUREMENTS
 
 Mode = Literal["Look", "Distance", "Area", "Lesion"]
-_HINTS: dict[Mode, str] = {
-    "Look": "Click on the surface to see which frames saw that place.",
-    "Distance": "Click on two points of the surface.",
-    "Area": "Click on three or more points around the area, then press Measure the area.",
-    "Lesion": "Click around the lesion as this frame shows it, then press Measure the lesion.",
-}
-_UNKNOWN = "Sizes are unknown. Choose **Distance** and click on a length that you know: it becomes the reference."
+_CHOOSE = "Choose what to measure."
+_UNKNOWN = "Sizes are unknown. Choose **Distance** and click on both ends of something whose length you know."
+_FEWEST = 3
 _PICKED = "/page/picked"
-_KEPT = "/page/measured"
+_REFERRED = "/page/reference"
 
 
 class MeasurePart:
@@ -40,23 +29,25 @@ class MeasurePart:
         self.mode: Mode = "Look"
         self._picks: list[SurfacePick] = []
         self._reference: Reference | None = None
-        self._measured: list[tuple[int, HandMeasure]] = []
         self._hint = gui.add_markdown("")
-        modes = gui.add_button_group("Measure", [*get_args(Mode)[1:], "Stop"])
+        modes = gui.add_button_group("Measure", get_args(Mode)[1:])
         modes.on_click(lambda event: window.do(self._choose, modes.value))
-        points = gui.add_button_group("Points", ["Undo", "Clear"])
+        self._points = points = gui.add_button_group("Points", ["Undo", "Clear"], visible=False)
         points.on_click(lambda event: window.do(self._take_back, points.value))
         self._area = window.on(gui.add_button("Measure the area", visible=False), self._measure)
-        self._length = gui.add_number("Its length, mm", 0.0, min=0.0, step=0.1, visible=False)
-        self._length.hint = "0: not known; other lengths are then multiples of it"
+        self._length = gui.add_number("Length of this line, mm (0: not known)", 0.0, min=0.0, step=0.1, visible=False)
+        self._length.hint = "0: other lengths are then multiples of it"
         self._refer = window.on(gui.add_button("Use as reference", visible=False), self._use_as_reference)
-        self._forget = window.on(gui.add_button("Forget the reference", visible=False), self._forget_reference)
-        self._lesion = LesionPart(view, lambda: self._reference)
-        self._list = gui.add_markdown("")
-        self._save = window.on(gui.add_button("Save the measurements", visible=False), self._keep)
-        self._save.hint = f"To {MEASUREMENTS} in the result's folder, where the report shows them"
-        view.follow(submap=self._follow_submap)
-        self._show()
+        forget = gui.add_button("Forget the reference", visible=False, color="gray")
+        self._forget = window.on(forget, self._forget_reference)
+        self._lesion = LesionPart(view, lambda: self._reference, self._say_mode)
+        self._measured = MeasuredList(view)
+        view.follow(submap=self._follow_submap, frame=self._follow_frame)
+        self._refer_to(None)
+
+    @property
+    def _is_known(self) -> bool:
+        return self._view.whole.scale_known or self._reference is not None
 
     def add(self, pick: SurfacePick) -> None:
         """Take a place that was clicked on the surface, by what a click is for."""
@@ -67,17 +58,17 @@ class MeasurePart:
             self._picks = []
         self._picks.append(pick)
         self._show()
-        if self.mode == "Distance" and len(self._picks) == 2:
-            if self._view.whole.scale_known or self._reference is not None:
-                self._measure()
-            else:
-                self._view.note("The scale is unknown: use these two points as reference, with their length if known.")
+        if self.mode == "Distance" and len(self._picks) == 2 and self._is_known:
+            self._measure()
+
+    def stop(self) -> None:
+        """Let clicks no longer measure."""
+        self._choose("Look")
 
     def _choose(self, mode: str) -> None:
-        self.mode = "Look" if mode == "Stop" else next(known for known in get_args(Mode) if known == mode)
+        self.mode = next(known for known in get_args(Mode) if known == mode)
         self._picks = []
         self._view.note("")
-        self._view.measure_by_clicks(on=self.mode != "Look")
         self._lesion.begin(shown=self.mode == "Lesion")
         self._show()
 
@@ -89,68 +80,86 @@ class MeasurePart:
         self._show()
 
     def _measure(self) -> None:
-        surface, picks, reference, number = self._view.surface, [*self._picks], self._reference, self._view.number
+        surface, picks, reference = self._view.surface, [*self._picks], self._reference
 
-        def then(found: HandMeasure) -> None:
-            self._measured.append((number, found))
-            self._view.note(in_words(found))
-            if self.mode == "Area":
-                self._picks = []
+        def work() -> tuple[HandMeasure, np.ndarray]:
+            found = measure_by_hand(surface, picks, reference)
+            return found, line_on_surface(surface, found.frame, found.world)
+
+        def then(found: tuple[HandMeasure, np.ndarray]) -> None:
+            one, line = found
+            self._picks = []
+            self._view.note(", ".join(f"{found.what}: {short(found)}" for found in one.found))
             self._show()
+            self._measured.add(one, reference, line)
 
-        self._view.window.job("measuring", lambda: measure_by_hand(surface, picks, reference), then)
+        self._view.window.job("measuring", work, then)
 
     def _use_as_reference(self) -> None:
         first, second = self._picks
-        self._reference = Reference((first, second), float(self._length.value) or None)
         self._picks = []
-        self._show()
-        known = f"{self._length.value:g} mm" if self._length.value else "the unit of lengths"
-        self._view.note(f"The reference is {known}. Now click on the two points to be measured.")
+        self._refer_to(Reference((first, second), float(self._length.value) or None))
+        self._view.note("The reference is set. Now measure with two clicks.")
 
     def _forget_reference(self) -> None:
-        self._reference = None
-        self._show()
+        self._refer_to(None)
 
-    def _keep(self) -> None:
-        count = add_measurements(self._view.whole.folder, [found for _, found in self._measured])
-        self._view.note(f"Saved: {MEASUREMENTS} has {count} now. `scopemap report` puts them into the report.")
+    def _refer_to(self, reference: Reference | None) -> None:
+        """Use a reference, or none, and say what sizes are by it."""
+        self._reference = reference
+        if reference is None:
+            self._view.say_sizes()
+        elif reference.length_mm is None:
+            self._view.say_sizes("Sizes are in multiples of your reference.")
+        else:
+            self._view.say_sizes(f"Sizes are in mm by your reference ({reference.length_mm:g} mm).")
+        self._measured.show(reference)
+        self._show()
 
     def _follow_submap(self) -> None:
-        self._picks, self._reference = [], None
+        self._picks = []
+        self._refer_to(None)
         self._lesion.begin(shown=self.mode == "Lesion")
-        self._show()
+
+    def _follow_frame(self) -> None:
+        # Tissue may be in another state.
+        if self._view.state is not None:
+            self._show()
 
     def _show(self) -> None:
-        view, picks = self._view, self._picks
-        self._hint.content = _hint(self.mode, known=view.whole.scale_known or self._reference is not None)
+        view, picks, scene = self._view, self._picks, self._view.window.scene
         two = self.mode == "Distance" and len(picks) == 2
         self._length.visible = self._refer.visible = two
         self._forget.visible = self._reference is not None
-        self._area.visible = self.mode == "Area" and len(picks) > 2
-        self._save.visible = bool(self._measured)
-        size, scene = view.surface.size_mm, view.window.scene
-        draw_marks(scene, _PICKED, np.array([view.surface.position(pick, view.state) for pick in picks]), size)
-        scene.remove_by_name(_KEPT)
-        for place, (number, one) in enumerate(self._measured):
-            if number == view.number:
-                draw_marks(scene, f"{_KEPT}/{place}", one.world, size, _label(one))
-        self._list.content = "\n\n".join(
-            f"**{place}.** {escaped(in_words(one))}\n```\n{broken(one.command(view.folder_words))}\n```"
-            for place, (_, one) in enumerate(self._measured, 1)
-        )
+        self._area.visible = self.mode == "Area" and len(picks) >= _FEWEST
+        self._hint.content = _CHOOSE if self._is_known else _UNKNOWN
+        size_mm = view.surface.size_mm
+        draw_marks(scene, _PICKED, self._places(picks), size_mm)
+        reference = self._reference
+        ends = self._places(list(reference.picks) if reference else [])
+        words = f"{reference.length_mm:g} mm" if reference and reference.length_mm else "reference"
+        draw_marks(scene, _REFERRED, ends, size_mm, words, REFERENCE)
+        self._say_mode()
 
+    def _places(self, picks: list[SurfacePick]) -> np.ndarray:
+        return np.array([self._view.surface.position(pick, self._view.state) for pick in picks])
 
-def in_words(one: HandMeasure) -> str:
-    """Return what was measured in one line."""
-    return f"{'; '.join(map(str, one.found))} (frame {one.frame})"
+    def _say_mode(self) -> None:
+        """Say what the next click does, and offer to take back where there is something."""
+        count = self._lesion.count if self.mode == "Lesion" else len(self._picks)
+        self._points.visible = count > 0
+        self._view.clicks_are_for(self._next_click(count))
 
-
-def _label(one: HandMeasure) -> str:
-    return str(one.found[0]).partition(": ")[2].partition(" (")[0]
-
-
-def _hint(mode: Mode, *, known: bool) -> str:
-    if mode != "Look":
-        return f"**{mode}.** {_HINTS[mode]}"
-    return "Choose what to measure." if known else _UNKNOWN
+    def _next_click(self, count: int) -> str:
+        if self.mode == "Look":
+            return LOOKING
+        if self.mode == "Distance":
+            if self._is_known:
+                return f"Distance: click on the {'2nd' if count == 1 else '1st'} of 2 points."
+            if count == 2:
+                return "Distance: press Use as reference, in Measure."
+            return f"Distance: click on the {'2nd' if count == 1 else '1st'} end of a known length."
+        what = self.mode.lower()
+        if count < _FEWEST:
+            return f"{self.mode}: click on point {count + 1} of 3 or more around it."
+        return f"{self.mode}: add points, or press Measure the {what}."

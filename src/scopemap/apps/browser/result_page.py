@@ -16,7 +16,7 @@ from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.surface_part import SurfacePart
 from scopemap.apps.browser.unseen_part import UnseenPart
-from scopemap.apps.browser.verdict_part import VerdictPart, headline
+from scopemap.apps.browser.verdict_part import VerdictPart
 from scopemap.result.result import Result
 from scopemap.result.run_input import find_input
 from scopemap.result.run_view import view_folder
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
     from scopemap.apps.browser.window import BrowserWindow
     from scopemap.apps.browser.workspace import Workspace
+
+_BACK = "Back to the start"
+_WHOLE = "Whole surface"
+_STOP = "Stop measuring"
 
 
 class ResultPage:
@@ -39,9 +43,11 @@ class ResultPage:
         """Make the elements."""
         self._window, gui = window, window.gui
         self._view = view = ResultView(window, self._run, self._workspace)
-        gui.add_markdown(headline(view))
+        view.add_headline()
         view.add_note()
-        list_place = gui.add_folder(None)
+        self._ways = gui.add_button_group("", self._ways_now())
+        self._ways.on_click(lambda event: window.do(self._go, self._ways.value))
+        view.follow(camera=self._show_ways)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Verdict"):
             VerdictPart(view, self._run_again)
@@ -51,9 +57,7 @@ class ResultPage:
             gui.add_divider()
             UnseenPart(view)
         with tabs.add_tab("Frames"):
-            self._frames = frames = FramePart(view)
-        with list_place:
-            frames.add_list()
+            self._frames = FramePart(view)
         with tabs.add_tab("Measure"):
             self._measure = MeasurePart(view)
         with tabs.add_tab("Files"):
@@ -84,7 +88,6 @@ class ResultPage:
         elif self._measure.mode == "Look":
             frames.list_that_saw(pick)
         else:
-            frames.hide_list()
             self._measure.add(pick)
 
     def _add_ways_on(self) -> None:
@@ -100,7 +103,23 @@ class ResultPage:
             chosen = gui.add_dropdown("Other result", shown)
             button = gui.add_button("Compare with it")
             window.on(button, lambda: self._compare(others[names[shown.index(chosen.value)]]))
-        window.on(gui.add_button("Back to the start"), self._start)
+
+    def _ways_now(self) -> tuple[str, ...]:
+        # Not more than two: they stay in one row, and the tabs where they are.
+        first = _WHOLE if self._workspace is None else _BACK
+        return (first, _STOP) if self._view.measuring else (first,)
+
+    def _show_ways(self) -> None:
+        if self._ways.options != self._ways_now():
+            self._ways.options = self._ways_now()
+
+    def _go(self, way: str) -> None:
+        if way == _BACK:
+            self._start()
+        elif way == _WHOLE:
+            self._view.look_at_all()
+        else:
+            self._measure.stop()
 
     def _compare(self, other: Path) -> None:
         self._window.show(compare_page(self._run.folder, other, self._workspace))

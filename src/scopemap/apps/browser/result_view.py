@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -13,12 +14,18 @@ from scopemap.apps.browser.shown_surface import ShownSurface
 from scopemap.apps.browser.window import escaped
 from scopemap.result.frame_table import NOT_USED
 from scopemap.result.result import Result
+from scopemap.result.verdict import verdict
 
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
     from scopemap.apps.browser.workspace import Workspace
     from scopemap.apps.coverage.coverage import Coverage
 
+LOOKING = "A click shows which frames saw the place."
+"""What a click is for where nothing is measured."""
+
+_NOTHING = "\u00a0"
+"""Keeps a line's place."""
 _WHOLE_FOV = 0.9
 """Vertical field of view from outside, rad."""
 
@@ -35,7 +42,9 @@ class ResultView:
         self.row = self.rows[0] if self.rows else 0
         self.number, self.surface = 0, ShownSurface(whole)
         self.in_state = self.surface.moves
-        self._inside = self._measuring = False
+        self._inside = False
+        self._click_words = LOOKING
+        self._of_note: list[Callable[[], None]] = []
         self._of_frame: list[Callable[[], None]] = []
         self._of_camera: list[Callable[[], None]] = []
         self._of_submap: list[Callable[[], None]] = []
@@ -78,7 +87,12 @@ class ResultView:
     @property
     def shows_picture(self) -> bool:
         """Whether the frame's picture is in the scene: not where it would hide the surface."""
-        return not (self._inside or self._measuring)
+        return not (self._inside or self.measuring)
+
+    @property
+    def measuring(self) -> bool:
+        """Whether clicks measure."""
+        return self._click_words != LOOKING
 
     def follow(
         self,
@@ -86,16 +100,21 @@ class ResultView:
         frame: Callable[[], None] | None = None,
         submap: Callable[[], None] | None = None,
         camera: Callable[[], None] | None = None,
+        note: Callable[[], None] | None = None,
     ) -> None:
-        """Call where another frame or submap is shown, or where `shows_picture` may have changed."""
+        """Call where another frame, submap or note is shown, or where `shows_picture` may have changed."""
         self._of_frame += [frame] if frame else []
         self._of_submap += [submap] if submap else []
         self._of_camera += [camera] if camera else []
+        self._of_note += [note] if note else []
 
-    def measure_by_clicks(self, *, on: bool) -> None:
-        """State whether clicks are points to be measured."""
-        self._measuring = on
-        self._see()
+    def clicks_are_for(self, words: str) -> None:
+        """Say above all tabs what the next click does; `LOOKING`: nothing is measured."""
+        changed = (words != LOOKING) != self.measuring
+        self._click_words = words
+        self._clicks.content = f"**{escaped(words)}**" if self.measuring else escaped(words)
+        if changed:
+            self._see()
 
     def show_row(self, row: int) -> None:
         """Show the frame of a row."""
@@ -148,11 +167,25 @@ class ResultView:
 
     def note(self, words: str) -> None:
         """Show a sentence that is always seen; "": none."""
-        self._note.content, self._note.visible = escaped(words), bool(words)
+        self._note.content = escaped(words) or _NOTHING
+        for call in self._of_note:
+            call()
 
     def add_note(self) -> None:
-        """Make the place of the sentence."""
-        self._note = self.window.gui.add_markdown("", visible=False)
+        """Make the places of the sentence and of what a click does."""
+        self._clicks = self.window.gui.add_markdown(LOOKING)
+        self._note = self.window.gui.add_markdown(_NOTHING)
+
+    def say_sizes(self, words: str = "") -> None:
+        """Show the verdict, with a sentence in place of what it says of sizes; "": as it is."""
+        found = verdict(self.whole)
+        advice = re.sub(r"Sizes .*$", words, found.advice) if words else found.advice
+        self._head.content = f"### {found.word.capitalize()}\n{escaped(advice)}"
+
+    def add_headline(self) -> None:
+        """Make the place of the verdict in a word, and of what the result may be used for."""
+        self._head = self.window.gui.add_markdown("")
+        self.say_sizes()
 
     def coverage(self, then: Callable[[Coverage], None]) -> None:
         """Call with what was not seen of the submap, which is found in a job, once."""

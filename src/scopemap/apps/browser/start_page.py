@@ -14,7 +14,7 @@ from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage, words_of
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.window import escaped
-from scopemap.apps.browser.workspace import DEMONSTRATION, VIDEO_KINDS, Workspace
+from scopemap.apps.browser.workspace import DEMONSTRATION, VIDEO_KINDS, Workspace, made_and_word
 from scopemap.engine.errors import InputError
 from scopemap.result.run_view import read_state, view_folder
 
@@ -49,14 +49,16 @@ class StartPage:
             pass
         gui.add_markdown(_HELLO)
         window.on(gui.add_button("Try the demonstration", color="green"), self._demonstrate)
+        self._top = gui.add_folder(None, visible=False)
+        with self._top:
+            self._changing = gui.add_folder(None)
+        self._show_runs()
         self._add_videos()
         self._add_upload()
         with gui.add_folder("A camera or a stream", expand_by_default=False):
             hint = "Number of a camera, /dev/video0, or an address such as rtsp://..."
             source = gui.add_text("Source", "", hint=hint)
             window.on(gui.add_button("Watch it live"), lambda: self._open_live(str(source.value).strip()))
-        self._changing = gui.add_folder(None)
-        self._show_runs()
 
     def tick(self) -> None:
         """Show what has changed: of the runs, and of what is being sent."""
@@ -102,17 +104,21 @@ class StartPage:
         self._states = []
         gui, runs = self._window.gui, self._workspace.runs.runs[-_MOST_RUNS:]
         self._shown = tuple((run, run.status, run.stopping) for run in runs)
-        self._changing = gui.add_folder(None)
+        finished, left = self._workspace.finished, self._workspace.interrupted
+        # A finished run is a result.
+        going = [run for run in runs if run.status != "done" or run.out not in finished]
+        self._top.visible = bool(finished or going or left)
+        with self._top:
+            self._changing = gui.add_folder(None)
         with self._changing:
-            left = self._workspace.interrupted
-            if runs or left:
+            self._add_results(finished)
+            if going or left:
                 with gui.add_folder("Runs"):
-                    for run in reversed(runs):
+                    for run in reversed(going):
                         self._add_run(run)
                     for folder in left:
                         name = escaped(self._window.names.of(folder, "result"))
                         gui.add_markdown(f"**{name}** was interrupted. Choose its video again: the run goes on.")
-            self._add_results()
 
     def _add_run(self, run: BrowserRun) -> None:
         gui = self._window.gui
@@ -139,16 +145,17 @@ class StartPage:
         is_at = "starting" if state is None else words_of(state).partition("\n")[0]
         return f"**{name}** {'is stopping' if run.stopping else 'runs'}: {is_at}"
 
-    def _add_results(self) -> None:
-        gui, results = self._window.gui, self._labelled(self._workspace.finished, "result")
+    def _add_results(self, finished: list[Path]) -> None:
+        gui, labelled = self._window.gui, self._labelled(finished, "result")
+        results = {f"{label}, {made_and_word(path)}": path for label, path in labelled.items()}
         if not results:
             return
-        with gui.add_folder("Results"):
+        with gui.add_folder("Your results"):
             first = gui.add_dropdown("Result", tuple(results))
             self._window.on(gui.add_button("Look at this result"), lambda: self._show_result(results, first.value))
             if len(results) > 1:
                 second = gui.add_dropdown("Compare with", tuple(results), initial_value=list(results)[1])
-                compare = gui.add_button("Compare the two")
+                compare = gui.add_button("Compare the two", color="gray")
                 self._window.on(compare, lambda: self._compare(results, first.value, second.value))
 
     def _labelled(self, paths: Iterable[Path], kind: str) -> dict[str, Path]:

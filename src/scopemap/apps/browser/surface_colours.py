@@ -25,11 +25,15 @@ _AMBIENT = 0.55
 
 @dataclass(frozen=True)
 class Colouring:
-    """Colours (V, 3) uint8 of a surface's vertices, what they mean in words, and those from low to high (256, 3)."""
+    """Colours (V, 3) uint8 of a surface's vertices, what they mean in a sentence, and their scale.
+
+    ramp : colours from low to high (256, 3); None: they are no scale. ticks : values below it, evenly spaced.
+    """
 
     colours: np.ndarray
     words: str
     ramp: np.ndarray | None = None
+    ticks: tuple[str, ...] = ()
 
 
 def colourings(surface: ShownSurface) -> dict[str, Callable[[], Colouring]]:
@@ -67,13 +71,13 @@ def in_relief(facing: np.ndarray, colours: np.ndarray) -> np.ndarray:
     return np.asarray(np.round(colours * light[:, None]), np.uint8)
 
 
-def legend_picture(ramp: np.ndarray, width: int = 360, height: int = 14) -> np.ndarray:
-    """Return colours (256, 3) from left to right, (height, width, 3) uint8."""
-    return np.asarray(np.repeat(ramp[np.linspace(0, len(ramp) - 1, width).astype(int)][None], height, axis=0))
+def stops_of(ramp: np.ndarray, count: int = 9) -> list[str]:
+    """Return evenly spaced colours "#rrggbb" of a ramp (256, 3)."""
+    return ["#" + bytes(colour).hex() for colour in ramp[np.linspace(0, len(ramp) - 1, count).astype(int)]]
 
 
 def _picture_words(run: Result) -> str:
-    return "As in the video, without the fall-off of the light." if is_albedo(run) else "As in the video."
+    return "As in the video, in even light." if is_albedo(run) else "As in the video."
 
 
 def is_albedo(run: Result) -> bool:
@@ -85,40 +89,40 @@ def _ramp(colour_map: int) -> np.ndarray:
     return np.asarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], colour_map)[:, 0, ::-1])
 
 
-def _coloured(values: np.ndarray, low: float, high: float, words: str, colour_map: int) -> Colouring:
-    """Return the colouring of values (V,), NaN = unknown, by a colour map from `low` to `high`."""
+def _coloured(values: np.ndarray, high: float, words: str, ticks: tuple[str, ...], colour_map: int) -> Colouring:
+    """Return the colouring of values (V,), NaN = unknown, by a colour map from 0 to `high`."""
     ramp, known = _ramp(colour_map), np.isfinite(values)
-    share = (np.where(known, values, low) - low) / max(high - low, 1e-9)
+    share = np.where(known, values, 0) / max(high, 1e-9)
     colours = ramp[np.round(255 * np.clip(share, 0, 1)).astype(int)]
     colours[~known] = _UNKNOWN
-    return Colouring(colours, words, ramp)
+    return Colouring(colours, words, ramp, ticks)
 
 
 def _confidence(surface: ShownSurface) -> Colouring:
     values = np.asarray(surface.mesh.vertex_attributes["confidence"], float).ravel()
-    words = "Confidence: 0 (dark blue) to 1 (yellow)."
-    return _coloured(values, 0.0, 1.0, words, cv2.COLORMAP_VIRIDIS)
+    words = "How often, how near and how frontally the place was seen. 1 is best."
+    return _coloured(values, 1.0, words, ("0", "0.5", "1"), cv2.COLORMAP_VIRIDIS)
 
 
 def _times_seen(surface: ShownSurface) -> Colouring:
     frames = looking_frames(surface.run)
     count = times_seen(surface.mesh, frames, surface.run.camera)
-    words = f"Seen by 0 (dark blue) to {len(frames)} (yellow) of {len(frames)} frames that are spread over the video."
-    return _coloured(count, 0.0, float(len(frames)), words, cv2.COLORMAP_VIRIDIS)
+    words = f"How many of {len(frames)} frames, spread over the video, saw the place."
+    return _coloured(count, float(len(frames)), words, ("0", str(len(frames))), cv2.COLORMAP_VIRIDIS)
 
 
 def _sigma(surface: ShownSurface) -> Colouring:
     values = np.asarray(surface.mesh.vertex_attributes["sigma_mm"], float).ravel()
     high, unit = _high(values), "mm" if surface.run.scale_known else "units (scale unknown)"
-    words = f"Standard deviation of depth: 0 (dark) to {high:.2g} {unit} and more (yellow)."
-    return _coloured(values, 0.0, high, words, cv2.COLORMAP_INFERNO)
+    words = "Standard deviation of depth."
+    return _coloured(values, high, words, ("0", f"{high:.2g} {unit} and more"), cv2.COLORMAP_INFERNO)
 
 
 def _disagreement(surface: ShownSurface) -> Colouring:
     values = 100 * depth_differences(surface)
     high = _high(values)
-    words = f"Depth of frames differs from the surface by 0 (dark) to {high:.2g} % and more (yellow); grey: not known."
-    return _coloured(values, 0.0, high, words, cv2.COLORMAP_INFERNO)
+    words = "By how much the depth of frames differs from the surface. Grey: not known."
+    return _coloured(values, high, words, ("0 %", f"{high:.2g} % and more"), cv2.COLORMAP_INFERNO)
 
 
 def _high(values: np.ndarray) -> float:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import trimesh
 
+from scopemap.apps.browser.legends import ramp_html, words_html
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
-from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, legend_picture
+from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, stops_of
 from scopemap.apps.browser.unlit_mesh import unlit_glb
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import COLOURS
-from scopemap.report.sheet import Sheet
 from scopemap.report.shown_mesh import simplified
 from scopemap.report.video_parts import video_parts
 from scopemap.result.verdict import WORDS, level_of_submap
@@ -29,7 +29,10 @@ _FRUSTUM_SHARE = 0.03
 _COVERAGE = "coverage"
 _MOST_FACES = 200_000
 _MOST_SUBMAPS = 100
-_LEGEND_PX = (360, 26)
+_LIDS = (
+    "The surface is closed where it has gaps: flat lids close its open ends. Where you see the grey background, "
+    "nothing was examined."
+)
 
 
 class SurfacePart:
@@ -43,16 +46,18 @@ class SurfacePart:
             window.on(gui.add_dropdown("Submap", self._names), self._choose_submap)
             gui.add_markdown(strip_words(view))
         self._by = window.on(gui.add_dropdown("Colour by", self._options()), self._colour)
-        self._legend = gui.add_image(np.zeros((14, 360, 3), np.uint8), visible=False)
         self._words = gui.add_markdown("")
-        self._relief = window.on(gui.add_checkbox("Relief", initial_value=True), lambda value: self._draw())
+        self._legend = gui.add_html("", visible=False)
+        self._relief = window.on(gui.add_checkbox("Shading", initial_value=True), lambda value: self._draw())
         self._relief.hint = "Darker where the surface does not face the camera; off: the colours as they are"
         self._path = window.on(gui.add_checkbox("Camera path", initial_value=True), lambda value: self._draw_path())
-        self._frusta = window.on(gui.add_checkbox("Keyframes", initial_value=False), lambda value: self._draw_path())
+        self._frusta = window.on(
+            gui.add_checkbox("Camera at keyframes", initial_value=False), lambda value: self._draw_path()
+        )
         if view.surface.moves:
             self._state = window.on(gui.add_checkbox("Moving tissue", initial_value=True), self._choose_state)
             self._state.hint = "In the state of the frame; play the frames to see it move"
-        window.on(gui.add_button("Look at the whole surface"), view.look_at_all)
+        window.on(gui.add_button("Look at the whole surface", color="gray"), view.look_at_all)
         view.follow(frame=self._follow_frame, submap=self._follow_submap)
         self._follow_submap()
 
@@ -89,7 +94,7 @@ class SurfacePart:
     def _explain(self, found: Colouring) -> None:
         self._words.content, self._legend.visible = found.words, found.ramp is not None
         if found.ramp is not None:
-            self._legend.image = legend_picture(found.ramp)
+            self._legend.content = ramp_html("", stops_of(found.ramp), found.ticks)
 
     def _paint_coverage(self, found: Coverage) -> None:
         # What was not examined would close the view into it.
@@ -98,10 +103,8 @@ class SurfacePart:
         painted = simplified(part, _MOST_FACES)
         seen, _, hidden = COLOURS
         colours = {name: COLOURS[name] for name in (seen, hidden)}
-        sheet = Sheet(*_LEGEND_PX)
-        sheet.legend((6, 6), colours, _LEGEND_PX[0] / len(colours), 12)
-        self._legend.image, self._legend.visible = sheet.rgb, True
-        self._words.content = f"The surface is closed where it has gaps. {found.sentence}"
+        self._legend.content, self._legend.visible = words_html(colours), True
+        self._words.content = _LIDS
         self._shown = np.asarray(painted.vertices), np.asarray(painted.faces), vertex_colours(painted)[:, :3]
         self._draw()
 

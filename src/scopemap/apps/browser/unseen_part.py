@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from scopemap.apps.coverage.coverage import BlindSpot, Coverage
 
 _MOST_LISTED = 20
+_LEAST_SHARE = 0.05
+"""Of what was not seen: smaller spots are folded away."""
 _MARK = "/page/blind_spot"
 _INK = (155, 34, 38)
 _SHARE = 0.012
@@ -28,37 +31,71 @@ class UnseenPart:
             lambda: view.coverage(self._list),
         )
         self._words = gui.add_markdown("It takes some seconds. Colour by coverage shows it on the surface.")
-        self._place = gui.add_folder(None)
-        self._buttons: list[Any] = []
+        self._outer = gui.add_folder(None, visible=False)
+        with self._outer:
+            self._place = gui.add_folder(None)
         view.follow(submap=self._clear)
 
     def _clear(self) -> None:
-        for button in self._buttons:
-            button.remove()
-        self._buttons = []
+        self._place.remove()
+        with self._outer:
+            self._place = self._view.window.gui.add_folder(None, visible=False)
         self._view.window.scene.remove_by_name(_MARK)
         self._ask.disabled, self._words.content = self._view.surface.is_empty, ""
+        self._outer.visible = False
 
     def _list(self, found: Coverage) -> None:
         self._clear()
-        along, area = found.facts["along_unit"], f"{found.unit}²"
         shown = found.spots[:_MOST_LISTED]
-        count = f"{len(found.spots)} blind spots" + (
-            f", the largest {len(shown)}:" if len(found.spots) > len(shown) else ""
-        )
-        self._words.content = escaped(f"{found.sentence} {found.scale.capitalize()}. {count}")
+        count = "1 blind spot" if len(found.spots) == 1 else f"{len(found.spots)} blind spots"
+        largest = f", the largest {len(shown)}:" if len(found.spots) > len(shown) else "."
+        self._words.content = escaped(f"{unseen_words(found)} {count}{largest}")
+        large = [spot for spot in shown if share_of(found, spot) >= _LEAST_SHARE]
+        small = shown[len(large) :]
+        self._outer.visible = self._place.visible = bool(shown)
         with self._place:
-            for number, spot in enumerate(shown, 1):
-                size = np.format_float_positional(float(f"{spot.area:.3g}"), trim="-")
-                label = f"{number}. {size} {area} at {spot.time_s:.1f} s"
-                button = self._view.window.gui.add_button(label, hint=spot.where(along))
-                self._buttons.append(self._view.window.on(button, self._fly, number, spot))
+            self._add(found, large, 1)
+            if small:
+                with self._view.window.gui.add_folder(f"{len(small)} smaller", expand_by_default=False):
+                    self._add(found, small, len(large) + 1)
 
-    def _fly(self, number: int, spot: BlindSpot) -> None:
-        view, place = self._view, np.array(spot.position_mm)
+    def _add(self, found: Coverage, spots: Sequence[BlindSpot], first: int) -> None:
+        along, unit = found.facts["along_unit"], "mm²" if found.unit == "mm" else "unit² (scale unknown)"
+        for number, spot in enumerate(spots, first):
+            share = f"{100 * share_of(found, spot):.2g}"
+            label = f"{number}. near frame {spot.frame}, {share} % of what was not seen"
+            hint = f"{np.format_float_positional(float(f'{spot.area:.3g}'), trim='-')} {unit} {spot.where(along)}"
+            button = self._view.window.gui.add_button(label, hint=hint, color="gray")
+            self._view.window.on(button, self._fly, number, spot, unseen_place(found, spot))
+
+    def _fly(self, number: int, spot: BlindSpot, place: np.ndarray) -> None:
+        view = self._view
         view.show_frame(spot.frame)
         view.look_from_spot(place)
         scene, radius = view.window.scene, _SHARE * view.surface.size_mm
         scene.add_icosphere(f"{_MARK}/ball", radius, _INK, position=tuple(place), cast_shadow=False)
         scene.add_label(f"{_MARK}/words", f"blind spot {number}", position=tuple(place), anchor="bottom-center")
-        view.note(f"Blind spot {number}, seen from frame {spot.frame}, whose camera was nearest.")
+        view.note(f"Blind spot {number}, seen from frame {spot.frame}, the nearest.")
+
+
+def unseen_words(found: Coverage) -> str:
+    """Return which share of what was not seen, with its interval, in a sentence."""
+    low, share, high = (f"{100 * value:.0f}" for value in (found.total.low, found.total.share, found.total.high))
+    what = "of the wall between the first and the last place that was examined"
+    if found.layout.kind != "lumen":
+        what = "of the wall in the directions that were examined"
+    return f"{share} % {what} was not seen, estimated (90 % interval {low} to {high} %)."
+
+
+def share_of(found: Coverage, spot: BlindSpot) -> float:
+    """Return the share of a blind spot in all that was not seen, 0 to 1."""
+    return min(1.0, spot.area / max(found.total.share * found.total.area, 1e-12))
+
+
+def unseen_place(found: Coverage, spot: BlindSpot) -> np.ndarray:
+    """Return the middle (3,) of the face that was not seen and is nearest to a spot's position, which may be in air."""
+    from scopemap.apps.coverage.coverage import BLIND
+
+    middles = np.asarray(found.surface.triangles_center)[np.nan_to_num(found.unseen) > BLIND]
+    position = np.array(spot.position_mm)
+    return middles[np.linalg.norm(middles - position, axis=1).argmin()] if len(middles) else position

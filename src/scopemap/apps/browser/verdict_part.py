@@ -11,13 +11,10 @@ from scopemap.result.summary import summary_facts
 from scopemap.result.verdict import Level, Reason, verdict
 
 _NAMES: dict[Level, str] = {"bad": "Not usable", "doubtful": "Caution", "note": "Note"}
+_GOOD = "The surface agrees with its own video. Its true shape was not measured."
+_DETAILS = ("frames", "surface", "time")
+"""Facts that reasons state, too, or that few need."""
 _MOST_BUTTONS = 3
-
-
-def headline(view: ResultView) -> str:
-    """Return the verdict in a word, and what the result may be used for, as Markdown."""
-    found = verdict(view.whole)
-    return f"### {found.word.capitalize()}\n{escaped(found.advice)}"
 
 
 class VerdictPart:
@@ -27,8 +24,10 @@ class VerdictPart:
         self._view, self._again = view, again
         gui, found = view.window.gui, verdict(view.whole)
         self._can_run = view.workspace is not None and source_of(view.whole) is not None
-        facts = "\n".join(f"- **{name}**: {escaped(fact)}" for name, fact in summary_facts(view.whole).items())
-        gui.add_markdown(facts)
+        if found.level == "good":
+            gui.add_markdown(_GOOD)
+        facts = {name: f"- **{name}**: {escaped(fact)}" for name, fact in summary_facts(view.whole).items()}
+        gui.add_markdown("\n".join(fact for name, fact in facts.items() if name not in _DETAILS))
         for reason in found.reasons:
             if reason.level in ("bad", "doubtful"):
                 self._add(reason)
@@ -40,6 +39,8 @@ class VerdictPart:
         good = [reason for reason in found.reasons if reason.level == "good"]
         if good:
             gui.add_markdown("\n".join(f"- {escaped(reason.text)}" for reason in good))
+        with gui.add_folder("Details", expand_by_default=False):
+            gui.add_markdown("\n".join(facts[name] for name in _DETAILS if name in facts))
 
     def _add(self, reason: Reason) -> None:
         step = f" {escaped(reason.next_step)}" if reason.next_step else ""

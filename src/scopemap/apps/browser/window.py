@@ -11,11 +11,16 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Any, Protocol
 
+import numpy as np
+
 from scopemap.apps.browser.names import Names
 from scopemap.apps.browser.serving import LOOPBACK, start_server, stop_server, url_of
 from scopemap.engine.errors import ScopemapError
 
 _TICK_S = 0.5
+_LIGHT = 222
+_DARK = 44
+"""Grey levels behind the scene: white is seen before both."""
 _PANEL_PX = 400
 _LAST = 1e9
 """Order of what stands below all pages."""
@@ -130,6 +135,7 @@ class BrowserWindow:
     def theme(self, *, dark: bool) -> None:
         """Show everything dark, or light."""
         self.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
+        self.scene.set_background_image(np.full((1, 1, 3), _DARK if dark else _LIGHT, np.uint8), format="png")
 
     def clear_error(self) -> None:
         """Show nothing above the page."""

@@ -6,6 +6,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,6 +17,7 @@ from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.input.opening import VIDEO_ENDINGS
 from scopemap.result.result import Result
 from scopemap.result.result_folder import UNFINISHED
+from scopemap.result.verdict import WORDS, level_of_submap
 
 _RESULTS = "scopemap"
 _UPLOADS = "uploads"
@@ -150,6 +152,13 @@ def _inside(folder: Path) -> list[Path]:
         return [path for path in sorted(folder.iterdir()) if not path.is_symlink()]
     except OSError:
         return []
+
+
+def made_and_word(folder: Path) -> str:
+    """Return when a finished result was made, and its verdict: "2026-11-28 08:15, good"."""
+    made = datetime.fromtimestamp((folder / _MARK).stat().st_mtime)  # noqa: DTZ006: the person's own time
+    run = Result(folder)
+    return f"{made:%Y-%m-%d %H:%M}, {WORDS[level_of_submap(run)]}"
 
 
 def _is_result(path: Path) -> bool:

@@ -1,0 +1,115 @@
+"""What was measured by hand: kept in measurements.json, listed in the panel, and drawn on the surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scopemap.apps.browser.hand_measures import (
+    HandMeasure,
+    Reference,
+    add_measurements,
+    broken,
+    folder_in_whole,
+    kept_measures,
+    line_on_surface,
+    remove_measurement,
+)
+from scopemap.apps.browser.marks import INK, PALE, draw_marks
+from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.window import escaped, fenced
+from scopemap.apps.measure.measure import Measure
+from scopemap.report.page_data import MEASUREMENTS
+
+_KEPT = "/page/measured"
+_SHORT = {"mm": "mm", "mm2": "mm²", "times the reference": "x", "times the reference's square": "x²"}
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """One measurement, by which reference of this window it was made (None: none, or an earlier window's), its line."""
+
+    one: HandMeasure
+    reference: Reference | None
+    line: np.ndarray | None = None
+
+
+class MeasuredList:
+    """The measurements of a result; they are kept as they are made, and are there when the result is opened again."""
+
+    def __init__(self, view: ResultView) -> None:
+        self._view, gui = view, view.window.gui
+        self._reference: Reference | None = None
+        self._all = [_Listed(one, None) for one in kept_measures(view.whole.folder)]
+        # Rebuilt within a place that stays.
+        self._outer = gui.add_folder(None)
+        with self._outer:
+            self._place = gui.add_folder(None)
+        self._remove = view.window.on(gui.add_button("Remove the last", color="gray"), self._remove_last)
+        view.follow(submap=self._draw)
+
+    def add(self, one: HandMeasure, reference: Reference | None, line: np.ndarray) -> None:
+        """Show and keep a measurement by a reference, with its line (M, 3) on the surface."""
+        self._all.append(_Listed(one, reference, line))
+        self.show(self._reference)
+        add_measurements(self._view.whole.folder, [one])
+
+    def show(self, reference: Reference | None) -> None:
+        """List and draw all; those by another reference than this one are pale."""
+        self._reference = reference
+        gui = self._view.window.gui
+        self._place.remove()
+        with self._outer:
+            self._place = gui.add_folder(None)
+        self._outer.visible = self._remove.visible = bool(self._all)
+        with self._place:
+            if self._all:
+                gui.add_markdown(f"Measured, and kept in {escaped(MEASUREMENTS)} for the report:")
+            for number, listed in enumerate(self._all, 1):
+                gui.add_markdown(f"**{number}.** {escaped(in_words(listed.one))}{self._note(listed)}")
+                with gui.add_folder(f"Command of {number}", expand_by_default=False):
+                    gui.add_markdown(fenced(broken(listed.one.command(self._view.folder_words))))
+        self._draw()
+
+    def _is_earlier(self, listed: _Listed) -> bool:
+        return listed.one.reference is not None and (
+            listed.reference is None or listed.reference is not self._reference
+        )
+
+    def _note(self, listed: _Listed) -> str:
+        return " *by an earlier reference*" if self._is_earlier(listed) else ""
+
+    def _draw(self) -> None:
+        view, here = self._view, folder_in_whole(self._view.run)
+        for place in range(len(self._all) + 1):
+            if place == len(self._all) or self._all[place].one.folder != here:
+                view.window.scene.remove_by_name(f"{_KEPT}/{place}")
+        for place, listed in enumerate(self._all):
+            one = listed.one
+            if one.folder != here:
+                continue
+            if listed.line is None:
+                listed = self._all[place] = replace(listed, line=line_on_surface(view.surface, one.frame, one.world))
+            colour = PALE if self._is_earlier(listed) else INK
+            name, size_mm = f"{_KEPT}/{place}", view.surface.size_mm
+            draw_marks(view.window.scene, name, one.world, size_mm, short(one.found[0]), colour, listed.line)
+
+    def _remove_last(self) -> None:
+        gone = self._all.pop()
+        self.show(self._reference)
+        remove_measurement(self._view.whole.folder, gone.one)
+        self._view.note(f"Removed: {short(gone.one.found[0])}.")
+
+
+def in_words(one: HandMeasure) -> str:
+    """Return what was measured in one line."""
+    found = "; ".join(str(measure).replace(" (", ", 95 % interval ").rstrip(")") for measure in one.found)
+    return f"{found} (frame {one.frame})"
+
+
+def short(measure: Measure) -> str:
+    """Return a value as the scene shows it: "16 mm", "0.75 x"."""
+    if not np.isfinite(measure.value):
+        return "gap"
+    return f"{measure.value:.3g} {_SHORT.get(measure.unit, measure.unit)}"
