@@ -11,7 +11,13 @@ from plane_scene import CAMERA
 
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.tracking.alike import AlikeFeatures
-from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures, match_features, relative_pose_pnp
+from scopemap.engine.tracking.features import (
+    FeatureDetector,
+    SiftFeatures,
+    match_features,
+    relative_pose_pnp,
+    similarities,
+)
 
 HERE = plane_scene.pose()
 # Half of the picture's width to the side, turned by some 20 degrees about the axis: far beyond what alignment bridges.
@@ -63,3 +69,15 @@ def test_no_pose_without_enough_inliers(what: str, detector: FeatureDetector) ->
     else:
         least = 10_000
     assert relative_pose_pnp(detector.detect(known), seen, CAMERA, least) is None
+
+
+def test_similarities_of_many_pictures_are_those_of_each() -> None:
+    random = np.random.default_rng(0)
+    drawn = [random.normal(size=(count, 8)).astype(np.float32) for count in (9, 0, 1, *[12] * 70)]
+    own, *pictures = (some / np.linalg.norm(some, axis=1, keepdims=True) for some in drawn)
+    each = [similarities(own, [picture])[0] for picture in pictures]
+    np.testing.assert_allclose(similarities(own, pictures), each, rtol=1e-6)
+    assert each[0] == 0
+    nearest = (own @ pictures[5].T).max(1)
+    assert each[5] == pytest.approx(np.maximum(nearest - 0.8, 0).sum(), rel=1e-5)
+    assert similarities(own[:0], pictures).tolist() == [0.0] * len(pictures)

@@ -19,7 +19,7 @@ from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, transform
 from scopemap.engine.masking.masker import Masker
 from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.corner_pose import pose_from_correspondences
-from scopemap.engine.tracking.features import FeatureDetector, Features, relative_pose_pnp, similarity
+from scopemap.engine.tracking.features import FeatureDetector, Features, relative_pose_pnp, similarities
 from scopemap.input.mask_files import create_masks
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence as FrameSequence
@@ -152,9 +152,9 @@ class PlaceMap:
         """Return the poses by the most similar keyframes."""
         current = self._detector.detect(replace(frame, depth_mm=None))
         strongest = current.descriptors[:_STRONGEST]
-        alike = [similarity(strongest, place.strongest) for place in self._places]
+        alike = similarities(strongest, [place.strongest for place in self._places])
         found = []
-        for number in np.argsort(-np.array(alike), kind="stable")[:_CANDIDATES]:
+        for number in np.argsort(-alike, kind="stable")[:_CANDIDATES]:
             place = self._places[number]
             relative = relative_pose_pnp(place.features, current, frame.camera, _LEAST_SUPPORT)
             if alike[number] > 0 and relative is not None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import NamedTuple
 
 import cv2
@@ -23,7 +22,13 @@ from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.geometry.se3 import transform
 from scopemap.engine.kept import Kept
-from scopemap.engine.tracking.features import FeatureDetector, Features, SiftFeatures, relative_pose_pnp, similarity
+from scopemap.engine.tracking.features import (
+    FeatureDetector,
+    Features,
+    SiftFeatures,
+    relative_pose_pnp,
+    similarities,
+)
 
 _STRONGEST_VALUES = 8192  # by hand: of the descriptors of the strongest features, by which candidates are ranked
 _CANDIDATES = 3  # by hand: that are verified, the most similar ones
@@ -176,11 +181,13 @@ class LoopFinder:
     def between(self, map_of: Sequence[int]) -> list[Loop]:
         """Return further loops between maps, after the last keyframe, of the most similar keyframes of two maps."""
         ranked = defaultdict[tuple[int, int], list[tuple[float, int, int]]](list)
-        for past, new in combinations(self._features, 2):
-            if map_of[past] != map_of[new] and new not in self._loops_to[past]:
+        for new in self._features:
+            others = [k for k in self._features if k < new and map_of[k] != map_of[new]]
+            others = [k for k in others if new not in self._loops_to[k]]
+            alike = self._similarities(self._features[new].strongest.astype(np.float32), others)
+            for past, how in zip(others, alike.tolist(), strict=True):
                 maps = min(map_of[past], map_of[new]), max(map_of[past], map_of[new])
-                strongest = self._features[new].strongest.astype(np.float32)
-                ranked[maps].append((similarity(strongest, self._features[past].strongest), past, new))
+                ranked[maps].append((how, past, new))
         likely = [pair for pairs in ranked.values() for pair in sorted(pairs, reverse=True)[:_TRIED_BETWEEN]]
         loops = []
         for _, past, new in sorted(likely, reverse=True)[:_MOST_TRIED]:
@@ -222,10 +229,13 @@ class LoopFinder:
         elsewhere = [k for k in kept if self._map_of[k] != map_number]
         candidates: list[int] = []
         for some in (own, elsewhere):
-            alike = np.array([similarity(strongest, self._features[k].strongest) for k in some])
+            alike = self._similarities(strongest, some)
             ranked = [some[k] for k in np.argsort(-alike, kind="stable") if alike[k] > 0]
             candidates += [k for k in ranked if self._allows_loop(k)][:_CANDIDATES]
         return candidates
+
+    def _similarities(self, strongest: np.ndarray, keyframes: list[int]) -> np.ndarray:
+        return similarities(strongest, [self._features[k].strongest for k in keyframes])
 
     def _allows_loop(self, past: int) -> bool:
         loops = self._loops_to[past]

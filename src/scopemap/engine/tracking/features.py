@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,6 +19,7 @@ _MIN_CONTRAST = 0.01  # a quarter of OpenCV's default: tissue texture is faint
 _MAX_EDGE_RATIO = 15.0  # by hand; OpenCV's default, Lowe's, is 10
 _MAX_RATIO = 0.8  # Lowe 2004: ratio test
 _MIN_SIMILARITY = 0.8  # by hand: cosine of descriptors above which they count for the similarity of two pictures
+_AT_ONCE = 32  # by hand, for memory: pictures that are compared
 _MAX_ITERATIONS = 500  # by hand: of RANSAC
 _CONFIDENCE = 0.999  # by hand: of RANSAC
 _INLIER_SHARE = 1 / 80  # by hand: largest reprojection error of an inlier, share of the image's width
@@ -106,10 +108,20 @@ def match_features(reference: Features, current: Features) -> np.ndarray:
     return np.column_stack([rows, best])[mutual]
 
 
-def similarity(strongest: np.ndarray, others: np.ndarray) -> float:
-    """Return the sum over descriptors (n, D) of the cosine to the nearest of a picture's (m, D), above a threshold."""
-    cosine = strongest @ others.astype(strongest.dtype).T
-    return float(np.maximum(cosine.max(1) - _MIN_SIMILARITY, 0).sum()) if cosine.size else 0.0
+def similarities(strongest: np.ndarray, pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Return how alike pictures are to one with `strongest` (n, D), by descriptors (m, D) of each, (pictures,).
+
+    It is the sum over the n descriptors of the cosine to the nearest in the picture, above a threshold.
+    """
+    found = np.zeros(len(pictures))
+    known = [place for place, descriptors in enumerate(pictures) if len(descriptors)]
+    for first in range(0, len(known) if len(strongest) else 0, _AT_ONCE):
+        some = known[first : first + _AT_ONCE]
+        joined = np.concatenate([pictures[place] for place in some]).astype(strongest.dtype)
+        starts = np.cumsum([0] + [len(pictures[place]) for place in some[:-1]])
+        nearest = np.maximum.reduceat(joined @ strongest.T, starts)
+        found[some] = np.maximum(nearest - _MIN_SIMILARITY, 0).sum(1)
+    return found
 
 
 def relative_pose_pnp(

@@ -22,7 +22,7 @@ from scopemap.engine.tracking.features import (
     RelativePose,
     points_at,
     relative_pose_pnp,
-    similarity,
+    similarities,
 )
 from scopemap.engine.tracking.keyframe_alignment import Keyframe
 from scopemap.engine.tracking.rtdl import Alignment
@@ -200,9 +200,10 @@ class Relocaliser:
     def _most_similar(self, keyframes: Iterable[Keyframe], current: Features) -> list[Keyframe]:
         """Return the keyframes whose strongest features are most like those of a frame, most similar first."""
         strongest = current.descriptors[:_STRONGEST]
-        alike = [(similarity(strongest, self._known(k).descriptors[:_STRONGEST]), k) for k in keyframes]
-        likely = [pair for pair in alike if pair[0] >= _LEAST_SIMILARITY]
-        return [keyframe for _, keyframe in sorted(likely, key=lambda pair: -pair[0])[:_CANDIDATES]]
+        known = list(keyframes)
+        alike = similarities(strongest, [self._known(k).descriptors[:_STRONGEST] for k in known])
+        likely = [k for k in np.argsort(-alike, kind="stable") if alike[k] >= _LEAST_SIMILARITY]
+        return [known[k] for k in likely[:_CANDIDATES]]
 
     def _known(self, keyframe: Keyframe) -> Features:
         """Return the features of a keyframe, detected on first use: most clips never need them."""
