@@ -267,7 +267,7 @@ def test_a_map_that_returns_to_an_older_one_is_merged_with_it(
     # Features would find the camera at once: no map would begin.
     monkeypatch.setattr(Relocaliser, "find", lambda *_, **__: None)
     light = {key.replace("__", "."): value for key, value in LIGHT.items()}
-    config = Config.load(settings=light | {"tracking.keyframe_every": 3, "fusion.every": 1})
+    config = Config.load(settings=light | {"tracking.keyframe_every": 3})
     result = reconstruct(open_sequence(cut), config, out=tmp_path / "out")
     status = result.frames["status"].tolist()
     assert status == ["initial"] + ["ok"] * 53

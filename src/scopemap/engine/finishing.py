@@ -26,6 +26,7 @@ from scopemap.engine.fusion.finish import finished, with_normals_alone
 from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.fusion.free_space import FreeSpace, views_among
 from scopemap.engine.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
+from scopemap.engine.fusion.new_views import NewViews
 from scopemap.engine.fusion.reference_state import SurfaceState
 from scopemap.engine.fusion.surface_fusion import FusedSurface, depth_notices
 from scopemap.engine.mapping.multiview_depth import KeyframeDepths
@@ -120,15 +121,16 @@ class SubmapFinishing:
         return self._final.frames(triangulated, self._free_space.without)
 
     def as_fused(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Yield final frames as they are fused; note where tissue moves in them, and some for `check`."""
-        self._seen_at = self._at_second()
+        """Yield final frames that are fused, as they are; note where tissue moves in all, and some for `check`."""
+        self._seen_at, views = self._at_second(), NewViews(self._fusion.settings.every)
         for frame in frames:
             if frame.nonrigidity is not None and frame.T_world_camera is not None:
                 usable_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
                 self._moving.put(usable_mm, frame.nonrigidity, frame.camera, frame.T_world_camera)
             self._checked.put(frame)
-            in_state = frame if self._state is None else self._state.fused(frame)
-            yield in_state if self._seen_at is None else self._seen_at.fused(in_state)
+            if (chosen := views.chosen(frame)) is not None:
+                in_state = chosen if self._state is None else self._state.fused(chosen)
+                yield in_state if self._seen_at is None else self._seen_at.fused(in_state)
 
     def fuse(self, frames: Iterable[Frame]) -> FusedSurface:
         """Return the surface of the frames that `as_fused` yields, or of those that were fused at once."""

@@ -44,7 +44,7 @@ class Frame:
     depth_sigma_mm : (H, W) float32, one standard deviation of `depth_mm`, NaN = unknown; None: not estimated.
     highlights : (H, W) bool, True where `valid` is False for a specular highlight alone; None: not looked for.
     nonrigidity : `REGIONS` float32, as `Track` has it; None: not measured.
-    weight : (H, W) float32, 0..1, by which its pixels count in fusion; None: fully.
+    weight : (H, W) float32, by which its pixels count in fusion, also for frames that are left out; None: 1.
     quality : what the picture is worth beside those of recent frames, 0..1, as `PictureQuality` has it.
     instruments : (H, W) bool, where the depth network found some, which `valid` leaves out; None: not looked for.
     views : both views of a stereo pair as in the input, left first, each (h, w, 3) uint8; None: one view, or depth is

@@ -23,6 +23,7 @@ from scopemap.engine.fusion.agreement import FrameAgreement, agreement_figures, 
 from scopemap.engine.fusion.finish import finished
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.free_space import FreeSpace, views_among
+from scopemap.engine.fusion.new_views import NewViews
 from scopemap.engine.fusion.reference_state import in_surface_state
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion
 from scopemap.engine.geometry.rendering import Rendering, render_mesh, render_points
@@ -96,11 +97,13 @@ class RunFrames:
         (sequence, mask), depth = open_input(run, source), folder.depth
         if not depth.present:
             raise InputError(f"the run {run} kept no depth maps")
-        self._run, self._fusion, self._store = run, fusion.model_copy(update={"every": 1}), FrameStore(run)
+        self._run, self._store = run, FrameStore(run)
+        # Of those that are read here.
+        self._fusion = fusion.model_copy(update={"every": fusion.every and 1})
         self.states = folder.states
         self.indices: list[int] = []
         """Numbers of the frames: the tracked ones that are fused."""
-        tracked = folder.frames.rows[folder.frames.tracked][:: fusion.every]
+        tracked = folder.frames.rows[folder.frames.tracked][:: fusion.every or 1]
         pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
         by_network = folder.config.mask.instruments == "auto"
         for frame in map(mask, sequence.frames()):
@@ -122,7 +125,7 @@ class RunFrames:
         """Return the surface of all frames but those with the given numbers."""
         fused = set(self.indices) - set(without)
         fusion = SurfaceFusion(self._fusion, self._store, corrected=True)
-        frames = self.frames(fused)
+        frames = NewViews(self._fusion.every).among(self.frames(fused))
         if (states := self.states) is not None:
             frames = (in_surface_state(frame, states) for frame in frames)
         surface = fusion.fuse(frames, self._store.median_depth_mm(fused))

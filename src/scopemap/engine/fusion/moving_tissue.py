@@ -139,15 +139,16 @@ class SeenAt:
         return Notice("fusion-at-one-moment", {"second": self._at_s, "where": where})
 
     def fused(self, frame: Frame) -> Frame:
-        """Return a frame with depth and pose with the weights of its pixels, 0..1, (H, W) float32; None: all 1."""
+        """Return a frame with depth and pose, its pixels (H, W) weighted by 0..1 where tissue moves."""
         assert frame.depth_mm is not None
         assert frame.T_world_camera is not None
         place, moves = self._blocks_of(frame.depth_mm[_SOME], frame.camera, frame.T_world_camera)
         if not moves.any():
-            return replace(frame, weight=None)
+            return frame
         later_s = np.maximum(abs(frame.time_s - self._at_s) - self._gap_s[place], 0.0)
         weight = np.where(moves, np.exp(-0.5 * (later_s / _WINDOW_S) ** 2), 1.0).astype(np.float32)
-        return replace(frame, weight=cv2.resize(weight, frame.depth_mm.shape[::-1]))
+        of_pixels = cv2.resize(weight, frame.depth_mm.shape[::-1])
+        return replace(frame, weight=of_pixels if frame.weight is None else of_pixels * frame.weight)
 
     def _blocks_of(
         self, some_mm: np.ndarray, camera: PinholeCamera, T_world_camera: np.ndarray

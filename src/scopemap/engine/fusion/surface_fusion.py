@@ -19,6 +19,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.albedo import AlbedoPainter
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.mesh import extract_mesh
+from scopemap.engine.fusion.new_views import NewViews
 from scopemap.engine.fusion.tsdf import (
     BLOCK,
     KEY_OFFSET,
@@ -206,7 +207,7 @@ class SurfaceFusion:
 
     store: Kept[FrameStore]
     _volumes: Kept[dict[int, TsdfVolume]]
-    _tracked_frames: Kept[int] = 0
+    _views: Kept[NewViews]
 
     def __init__(self, settings: FusionSettings, store: FrameStore, *, corrected: bool) -> None:
         self.settings, self.store = settings, store
@@ -217,6 +218,7 @@ class SurfaceFusion:
         self.coarser_beyond: int | None = None
         """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
         self._volumes = defaultdict(partial(TsdfVolume, settings))
+        self._views = NewViews(settings.every)
 
     @property
     def at_once(self) -> bool:
@@ -243,15 +245,14 @@ class SurfaceFusion:
         self._volumes.pop(map_number, None)
 
     def put(self, frame: Frame, map_number: int = 0) -> None:
-        """Store a frame, or fuse it in its map's volume if it has a pose and is an n-th one (`settings.every`)."""
+        """Store a frame, or fuse it in its map's volume if it has a pose and `NewViews` chooses it."""
         if self.at_end:
             self.store.put(frame)
         elif self.at_once and frame.T_world_camera is not None:
             volume = self._volumes[map_number]
-            if self._tracked_frames % self.settings.every == 0 and not self.is_full:
-                volume.integrate(frame)
+            if not self.is_full and (chosen := self._views.chosen(frame, map_number)) is not None:
+                volume.integrate(chosen)
                 self._coarsen(list(self._volumes.values()))
-            self._tracked_frames += 1
 
     def _coarsen(self, volumes: list[TsdfVolume]) -> None:
         """Make the voxels of the largest volume larger until all are within the limit."""
@@ -259,15 +260,16 @@ class SurfaceFusion:
             max(volumes, key=lambda volume: volume.block_count).coarsen()
 
     def fuse(self, frames: Iterable[Frame], median_mm: float | None, map_number: int = 0) -> FusedSurface:
-        """Return the surface of every n-th of the stored frames, all of which are consumed, or of those fused at once.
+        """Return the surface of stored frames, as `NewViews` chose them, or of those fused at once.
 
-        median_mm : of the depth of those that the TSDF parameters follow. map_number : of those fused at once.
+        frames : all are consumed. median_mm : of the depth of those that the TSDF parameters follow. map_number : of
+        those fused at once.
         """
         volume, settings = self._volumes.get(map_number), self.settings
         if self.at_end and settings.enabled and (median_mm or settings.voxel_mm):
             volume = TsdfVolume(settings, choose_parameters(settings, median_mm))
-        for number, frame in enumerate(frames):
-            if volume is not None and number % settings.every == 0:
+        for frame in frames:
+            if volume is not None:
                 volume.integrate(frame)
                 self._coarsen([volume])
         if volume is None:
