@@ -99,7 +99,7 @@ def record(page: Any) -> Film:
     page.wait_for_timeout(1500)
     for place in REFERENCE:
         click(page, place)
-    page.get_by_label("Its length, mm").fill("10")
+    page.get_by_label(re.compile("Length of this line")).fill("10")
     page.keyboard.press("Enter")
     page.wait_for_timeout(1000)
     film.take(2000)

@@ -156,7 +156,8 @@ def _inside(folder: Path) -> list[Path]:
 
 def made_and_word(folder: Path) -> str:
     """Return when a finished result was made, and its verdict: "2026-11-28 08:15, good"."""
-    made = datetime.fromtimestamp((folder / _MARK).stat().st_mtime)  # noqa: DTZ006: the person's own time
+    # In the person's own time.
+    made = datetime.fromtimestamp((folder / _MARK).stat().st_mtime)
     run = Result(folder)
     return f"{made:%Y-%m-%d %H:%M}, {WORDS[level_of_submap(run)]}"
 
