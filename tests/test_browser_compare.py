@@ -18,9 +18,9 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 import trimesh
-from browser_parts import element, elements, press, until, words
 from drawn_run import FRAMES, IN_RESULT, changed, draw_run, tube
 from front_door import call, refused
+from window_without_browser import element, elements, press, until, words
 
 from scopemap.apps.browser.compare_page import ComparePage
 from scopemap.apps.browser.two_results import apart_of, compare_results, is_alone, is_same_input

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -14,6 +12,7 @@ from scopemap.apps.browser.beside import LIVE_BUTTONS
 from scopemap.apps.browser.pages import start_page
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
+from scopemap.apps.browser.runs import end_of, started
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.engine.errors import InputError
 from scopemap.result.run_view import view_folder
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
 
 _LOG = "live.log"
-_MOST_LOG = 20_000
 
 
 class LiveRun:
@@ -33,26 +31,13 @@ class LiveRun:
 
     def __init__(self, source: str, out: Path, log: Path) -> None:
         self.status, self.out, self._log = "running", out, log
-        command = [sys.executable, "-m", "scopemap", "live", "--watched", "--out", str(out), "--", source]
-        log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("wb") as printed:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=printed,
-                stderr=subprocess.STDOUT,
-                env=os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "120"},
-                # Ctrl-C in the window's terminal is the window's.
-                start_new_session=True,
-            )
+        words = ["live", "--watched", "--out", str(out), "--", source]
+        self._process = started(words, log, subprocess.PIPE)
 
     @property
     def printed(self) -> str:
         """What it has printed so far, the end of it."""
-        try:
-            return self._log.read_text(encoding="utf-8", errors="replace")[-_MOST_LOG:]
-        except OSError:
-            return ""
+        return end_of(self._log)
 
     @property
     def sentence(self) -> str:

@@ -45,10 +45,7 @@ class BrowserRun:
     @property
     def printed(self) -> str:
         """What it has printed so far, the end of it."""
-        try:
-            return self.log.read_text(encoding="utf-8", errors="replace")[-_MOST_LOG:]
-        except OSError:
-            return ""
+        return end_of(self.log)
 
     @property
     def sentence(self) -> str:
@@ -62,18 +59,8 @@ class BrowserRun:
 
     def start(self) -> None:
         """Start the process."""
-        command = [sys.executable, "-m", "scopemap", "run", str(self.source), "--out", str(self.out)]
-        self.log.parent.mkdir(parents=True, exist_ok=True)
-        with self.log.open("wb") as log:
-            self._process = subprocess.Popen(
-                [*command, *self.arguments, "--watched"],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "120"},
-                # Ctrl-C in the window's terminal is the window's.
-                start_new_session=True,
-            )
+        words = ["run", str(self.source), "--out", str(self.out), *self.arguments, "--watched"]
+        self._process = started(words, self.log, subprocess.DEVNULL)
         self.status = "running"
 
     def poll(self) -> None:
@@ -147,3 +134,26 @@ class RunQueue:
         self._waiting.clear()
         for run in self.runs:
             run.kill()
+
+
+def started(words: Sequence[str], log: Path, stdin: int) -> subprocess.Popen[bytes]:
+    """Return the process of `scopemap WORDS`, which prints to a file; stdin : as of `subprocess.Popen`."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("wb") as printed:
+        return subprocess.Popen(
+            [sys.executable, "-m", "scopemap", *words],
+            stdin=stdin,
+            stdout=printed,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"PYTHONUNBUFFERED": "1", "COLUMNS": "120"},
+            # Ctrl-C in the window's terminal is the window's.
+            start_new_session=True,
+        )
+
+
+def end_of(log: Path) -> str:
+    """Return the end of what a process has printed to a file."""
+    try:
+        return log.read_text(encoding="utf-8", errors="replace")[-_MOST_LOG:]
+    except OSError:
+        return ""
