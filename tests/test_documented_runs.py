@@ -23,7 +23,7 @@ ONLY_PARSED = {
     r"^bench (?!speed my)|^datasets|^climb|SCARED|CLIMB|CLIP|FOLDER|/archive/": "data sets and benchmarks are not here",
     r"^models pull": "downloads",
     r"^demo|^phantom|^run (?:colon|laparoscopy)/": "takes minutes; the tests of these commands run smaller ones",
-    r"^live (?:0|rtsp)|^view result$": "needs a camera, or ends by Ctrl-C",
+    r"^live (?:0|rtsp)|^view \w+(?: --compare \w+)?$|^app|--app": "needs a camera, or ends by Ctrl-C",
     r"--engine ray": "needs a cluster",
     r"--stereo use": "needs a stereo endoscope",
     r"766\.3|--frame 68|--charuco": "belongs to another endoscope, clip or board",
