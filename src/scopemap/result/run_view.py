@@ -18,7 +18,10 @@ import numpy as np
 
 from scopemap.result.result_folder import UNFINISHED, VIEW
 
-_STATE, _PICTURE, _DEPTH, _MAP = "state.json", "picture.jpg", "depth.jpg", "map.npz"
+_STATE = "state.json"
+_PICTURE = "picture.jpg"
+_DEPTH = "depth.jpg"
+_MAP = "map.npz"
 _COVERAGE = "coverage.png"
 
 

@@ -20,14 +20,14 @@ _CROSS = 0.8
 _RIM_MM = 0.25
 _MELT_PER_MM = 4.0
 _HEIGHT = {"sessile": 0.45, "flat": 0.0, "pedunculated": 1.1}  # of the diameter
-_FLAT_MM, _STALK, _STALK_MM, _HEAD, _BEHIND, _BEHIND_MM = (
-    1.5,
-    0.18,
-    1.0,
-    0.35,
-    0.3,
-    2.0,
-)  # a head's half height, a stalk's radius, of the diameter
+# Half the height of a flat one, mm.
+_FLAT_MM = 1.5
+# Radius of a stalk, and of its head, over the diameter.
+_STALK = 0.18
+_STALK_MM = 1.0
+_HEAD = 0.35
+_BEHIND = 0.3
+_BEHIND_MM = 2.0
 _REDDER = np.array([1.0, 0.6, 0.6], np.float32)
 # Where they grow: share of the picture's sides that stays free, and what the camera keeps away from them.
 _MARGIN = 0.06

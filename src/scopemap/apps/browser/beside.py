@@ -18,7 +18,8 @@ from scopemap.apps.browser.serving import check_installed
 
 LIVE_BUTTONS = {"Pause or go on": "pause", "Forget all and start again": "reset", "Write a snapshot": "snapshot"}
 """Of a live stream: names of what they do by what is written on them."""
-_DONE, _FAILED = "done", "failed: "
+_DONE = "done"
+_FAILED = "failed: "
 
 
 @contextmanager

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 _MOST = 12
 _MARK_SHARE = 0.02
 _MARK = (255, 208, 0)
-_CHANGED, _PICTURE = "what changed", "picture"
+_CHANGED = "what changed"
+_PICTURE = "picture"
 _COMPARED = "compared"
 """Attribute of a vertex, as in `ExamComparison`."""
 

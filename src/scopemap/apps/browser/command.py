@@ -26,7 +26,10 @@ def app(
     ] = Path(),
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0: any free port.")] = 0,
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="Address to serve at; others than this machine's reach it then.")
+        str,
+        typer.Option(
+            metavar="ADDRESS", help="Address to serve at; any but the default is reachable from other machines."
+        ),
     ] = "127.0.0.1",
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
     anonymous: Annotated[bool, typer.Option("--anonymous", help="Show no names of files.")] = False,

@@ -25,8 +25,12 @@ from scopemap.result.result import Result
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
 
-_FIRST, _SECOND = "#466ec8", "#e07b1a"
-_DISTANCE, _ALONE, _PICTURE, _PLAIN = "distance to the other", "in one alone", "picture", "one colour each"
+_FIRST = "#466ec8"
+_SECOND = "#e07b1a"
+_DISTANCE = "distance to the other"
+_ALONE = "in one alone"
+_PICTURE = "picture"
+_PLAIN = "one colour each"
 _STOPS = 9
 
 

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
 
 _UNKNOWN = "not known"
-_ESTIMATED, _BY_FOV = "estimated from the video", "by its field of view"
+_ESTIMATED = "estimated from the video"
+_BY_FOV = "by its field of view"
 _PRESETS = {"default: best quality": PRESETS[0], "realtime: about twice as fast": PRESETS[1]}
 _LAYOUTS = {"found by itself": LAYOUTS[0], "one view": LAYOUTS[1], "left and right": LAYOUTS[2], "above": LAYOUTS[3]}
 _NEXT_LINE = " \\\n  "

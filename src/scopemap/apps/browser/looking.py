@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
@@ -36,8 +36,11 @@ _LEAST_S = 10.0
 _CALIBRATIONS = {".yaml", ".yml", ".json", ".txt"}
 _NAME_OF_CAMERA = re.compile("cam|calib|intrin")
 """What the name of a file holds that is taken for the camera unasked."""
-_MOST_FILES, _MOST_CALIBRATIONS, _MOST_BYTES = 200, 20, 1_000_000
-_MINUTE_S, _HOUR_S = 90.0, 5400.0
+_MOST_FILES = 200
+_MOST_CALIBRATIONS = 20
+_MOST_BYTES = 1_000_000
+_MINUTE_S = 90.0
+_HOUR_S = 5400.0
 
 
 class LeftEarlier(Exception):
@@ -74,7 +77,7 @@ class Look:
         one = self.calibrations[0] if len(self.calibrations) == 1 else None
         camera = one if one is not None and _NAME_OF_CAMERA.search(one.stem.lower()) else None
         choice = suggested(self.spread, self.findings, whole=self.whole)
-        return choice if camera is None else RunChoice(**(vars(choice) | {"camera": camera, "scope": ""}))
+        return choice if camera is None else replace(choice, camera=camera, scope="")
 
     @property
     def facts(self) -> str:
@@ -92,7 +95,7 @@ class Look:
     def kind(self) -> str:
         """Which kinds of endoscope the pictures are typical of, in words."""
         found = next((one for one in self.findings if one.code == "scope"), None)
-        return "the kind of endoscope cannot be told from the pictures" if found is None else found.message
+        return "the pictures are typical of no one kind" if found is None else found.message
 
     @property
     def trackable(self) -> str:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 PRESETS = ("default", "realtime")
 LAYOUTS = ("auto", "none", "left-right", "top-bottom")
-MOST_FOV_DEG, LEAST_FOV_DEG = 170.0, 5.0
+MOST_FOV_DEG = 170.0
+LEAST_FOV_DEG = 5.0
 _MOST_BOXES = 20
 _OUTSIDE = {"black", "one-colour", "not-tissue"}
 """Codes of findings about frames that show no tissue."""

@@ -14,7 +14,8 @@ PATH_COLOUR = (70, 110, 200)
 _MOST_POSITIONS = 2000
 _BACK_SHARE = 0.9
 # Inside of a tube, and all of a colon.
-_NEAR_MM, _FAR_MM = 0.2, 20_000.0
+_NEAR_MM = 0.2
+_FAR_MM = 20_000.0
 
 
 def quaternion(pose: np.ndarray) -> np.ndarray:

@@ -25,7 +25,8 @@ _HELLO = """### A surface from an endoscope video
 
 scopemap finds how the camera moved and reconstructs the tissue surface. Everything stays on this machine."""
 _CHOOSE = "choose ..."
-_LOOK, _STOP = "Look at it", "Stop"
+_LOOK = "Look at it"
+_STOP = "Stop"
 _CLIP = ("colon.mp4", "camera.yaml")
 _MOST_RUNS = 6
 _BACKENDS = "scopemap.apps.browser"

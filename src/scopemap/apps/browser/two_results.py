@@ -19,7 +19,8 @@ from scopemap.result.result import Result
 _ALONE_SHARE = 0.15
 """Of the distance to the camera: walls that are farther apart are not the same one, as in `compare_exams`."""
 
-_APART, _ALONE = "apart", "alone"
+_APART = "apart"
+_ALONE = "alone"
 """Attributes of a vertex: its distance to the other surface, and 1 where it is in its own alone."""
 
 _LOOKED_AT = 25  # frames, for the median depth
