@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import plane_scene
@@ -13,8 +14,9 @@ from plane_scene import CAMERA
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.corners import normalised_brightness, refined_corners
 from scopemap.engine.flow.dis import DisFlow
-from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.flow.estimator import FlowEstimator, NoFlow
 from scopemap.engine.geometry.se3 import inverse
+from scopemap.engine.mapping import feature_tracks
 from scopemap.engine.mapping.bundle_adjustment import adjust
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Priors
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
@@ -26,18 +28,6 @@ class _Biased(DisFlow):
     def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         forth, back = super().estimate_both(rgb_a, rgb_b)
         return forth + np.float32([0.8, 0]), back - np.float32([0.8, 0])
-
-
-class _FromZero(DisFlow):
-    """DIS flow that takes no start; started : how often one was given."""
-
-    started = 0
-
-    def estimate_both_from(
-        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        self.started += 1
-        return self.estimate_both(rgb_a, rgb_b)
 
 
 def _errors_px(flow: FlowEstimator, gap: int, step_mm: float, nearer_mm: float = 0.0) -> np.ndarray:
@@ -72,8 +62,8 @@ def test_patches_do_not_lag_where_the_camera_comes_nearer() -> None:
 
 def test_distant_keyframes_are_matched_along_those_between() -> None:
     # 66 px in steps of 11: more than a quarter of the picture, which a search from zero hardly finds.
-    along, from_zero = (_errors_px(flow, 6, 11.0 / 3.0) for flow in (DisFlow(), _FromZero()))
-    good, without = (int((away < 0.5).sum()) for away in (along, from_zero))
+    along, at_once = _errors_px(DisFlow(), 6, 11.0 / 3.0), _errors_px(DisFlow(), 1, 22.0)
+    good, without = (int((away < 0.5).sum()) for away in (along, at_once))
     assert good > 100
     assert good > 1.5 * without
     assert np.median(along) < 0.25
@@ -91,21 +81,25 @@ def test_a_map_that_the_camera_leaves_goes_on_when_it_comes_back() -> None:
 
 def test_keyframes_that_are_far_apart_are_matched_from_depth_and_poses_as_tracked() -> None:
     # 72 px in twelve steps; and four times as much, with nothing in common.
-    along, from_zero = (_errors_px(flow, 12, 2.0) for flow in (DisFlow(), _FromZero()))
-    good, without = (int((away < 0.5).sum()) for away in (along, from_zero))
+    along, at_once = _errors_px(DisFlow(), 12, 2.0), _errors_px(DisFlow(), 1, 24.0)
+    good, without = (int((away < 0.5).sum()) for away in (along, at_once))
     assert good > 80
     assert good > 1.5 * without
     assert np.median(along) < 0.25
     assert not len(_errors_px(DisFlow(), 12, 8.0))
 
 
-@pytest.mark.parametrize(("step_mm", "tried"), [(2.0, 3), (80.0, 0)])
-def test_farther_keyframes_are_tried_only_where_nearer_ones_have_corners_in_common(step_mm: float, tried: int) -> None:
-    flow = _FromZero()
-    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2, 3)), flow)
+@pytest.mark.parametrize(("step_mm", "tried"), [(2.0, 6), (None, 3)])
+def test_farther_keyframes_are_tried_only_where_nearer_ones_have_corners_in_common(
+    step_mm: float | None, tried: int
+) -> None:
+    tracks, rng, pairs = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2, 3)), DisFlow()), np.random.default_rng(0), 0
     for number in range(4):
-        tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(step_mm * number, 0.0, 0.0)), number))
-    assert flow.started == tried
+        frame = plane_scene.frame(plane_scene.pose(at_mm=((step_mm or 0.0) * number, 0.0, 0.0)), number)
+        if step_mm is None:  # each another picture
+            frame = replace(frame, rgb=rng.integers(0, 255, frame.rgb.shape, np.uint8))
+        pairs += len(tracks.add(frame).pairs)
+    assert pairs == tried
 
 
 def test_patches_that_differ_are_no_observations() -> None:
@@ -148,32 +142,20 @@ def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
     assert np.array_equal(np.bincount(fewer.point, minlength=len(fewer_points.host)), counts[::every])
 
 
-class _Counted(DisFlow):
-    """DIS flow; pairs : how often flow between two pictures was found."""
-
-    pairs = 0
-
-    def estimate_both(self, rgb_a: np.ndarray, rgb_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        self.pairs += 1
-        return super().estimate_both(rgb_a, rgb_b)
-
-    def estimate_both_from(
-        self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        self.pairs += 1
-        return super().estimate_both_from(rgb_a, rgb_b, start)
-
-
-def test_what_windows_have_matched_is_not_matched_again() -> None:
+def test_what_windows_have_matched_is_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    matched, both_ways = Mock(wraps=feature_tracks._matched), 2
     frames = [plane_scene.frame(plane_scene.pose(at_mm=(1.5 * n, 0.5 * n, 0.0)), n) for n in range(5)]
-    settings, shared = MappingSettings(keyframe_gaps=(1, 2, 3)), _Counted()
-    alone, far = FeatureTracks(settings, DisFlow()), FeatureTracks(settings, shared)
+    settings, no_flow = MappingSettings(keyframe_gaps=(1, 2, 3)), NoFlow()
+    alone, far = FeatureTracks(settings, DisFlow()), FeatureTracks(settings, no_flow)
     near = FeatureTracks(settings, DisFlow(), gaps=(1, 2))
     for frame in frames:
         alone.add(frame)
-        far.add(frame, known=near.add(frame))
+        known = near.add(frame)
+        with monkeypatch.context() as patched:
+            patched.setattr(feature_tracks, "_matched", matched)
+            far.add(frame, known=known)
     for one, other in zip(alone.collected(), far.collected(), strict=True):
         for name in vars(one):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     # Only keyframes three apart are left: 0 and 3, 1 and 4.
-    assert shared.pairs == 2
+    assert matched.call_count == 2 * both_ways

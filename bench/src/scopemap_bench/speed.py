@@ -48,8 +48,9 @@ STAGES: dict[str, tuple[str, ...]] = {
         "engine.depth.perceptual:LpipsAlex.compare",
     ),
     "flow": (
-        *("engine.flow.dis:DisFlow.estimate", "engine.flow.dis:DisFlow.estimate_small"),
-        *("engine.flow.dis:DisFlow.estimate_checked", "engine.flow.dis:DisFlow.estimate_both_from"),
+        "engine.flow.dis:DisFlow.estimate",
+        "engine.flow.dis:DisFlow.estimate_small",
+        "engine.flow.dis:DisFlow.estimate_checked",
         *("engine.flow.raft:RaftFlow.estimate", "engine.flow.raft:RaftFlow.estimate_both"),
     ),
     "tracking": ("engine.tracking.tracker:Tracker.track",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -34,19 +35,27 @@ _LEAST_CONTRAST = 0.02  # by hand: smaller contrast is noise
 _LOW_RESOLUTION = 4  # by hand: at which the surround is computed: what it leaves out is as smooth
 _LEAST_EIGENVALUE = 1e-4  # OpenCV's default, minEigThreshold
 _MAX_STEP_PX = 1.5  # by hand: from where flow has it
+_MAX_COMPOSED_STEP_PX = 3.0  # by hand: from where composed flows have it
 _WARP_SMOOTHING_PX = 10.0  # by hand: of the flow by which patches are warped
 _PATCH_CONSISTENCY_PX = 0.5  # by hand: largest forward-backward error
 
 
 class _Search(NamedTuple):
-    """How a patch is aligned: its side, most steps, and the step that ends it."""
+    """How a patch is aligned: its side, most steps, the step that ends it, how often it is halved to begin with.
+
+    most_difference : grey levels, mean over the patch, above which it is another one.
+    """
 
     patch_px: int
     steps: int
     last_step_px: float
+    halvings: int = 0
+    most_difference: float = math.inf
 
 
-_THOROUGH = _Search(15, 20, 0.01)  # by hand
+# By hand. The difference is half a local deviation: patches of real clips differ by 20 at most, those of noise by 25.
+_THOROUGH = _Search(15, 20, 0.01, halvings=1, most_difference=_CONTRAST / 2)
+_BACK = _Search(15, 20, 0.01)  # by hand
 _QUICK = _Search(11, 10, 0.03)  # a third of the time, and poses of the same error
 
 
@@ -104,26 +113,24 @@ class KeyframeMatcher:
         """Return the corners of the keyframe that are matched in a frame; None where the keyframe has none."""
         if self._keyframe is None or not len(self._corners):
             return None
-        enough_px = self.flow.enough_px
-        downscale = 1 if enough_px is None else max(1, max(frame.valid.shape) // enough_px)
-        matched = np.zeros(0, int)
-        if downscale > 1 and self._usual_coverage >= _SMALL_COVERAGE:
-            matched, pixels = self._aligned_in(frame, *self._matched_in(frame, downscale))
+        size = frame.valid.shape[::-1]
+        small, matched = small_flow_size(self.flow, size), np.zeros(0, int)
+        if small != size and self._usual_coverage >= _SMALL_COVERAGE:
+            matched, pixels = self._aligned_in(frame, *self._matched_in(frame, small))
         if len(matched) < _SMALL_COVERAGE * len(self._corners):
-            matched, pixels = self._matched_in(frame, 1)
+            matched, pixels = self._matched_in(frame, size)
         coverage = len(matched) / len(self._corners)
         self._usual_coverage += (coverage - self._usual_coverage) / _FRAMES_BEFORE
         if coverage < _START_COVERAGE:
             self._flows = None
         return Correspondences2D3D(self._points_mm[matched], pixels, coverage, self._keyframe.index)
 
-    def _matched_in(self, frame: Frame, downscale: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return which corners (m,) flow between smaller images matches, and their pixels (m, 2) in the frame."""
+    def _matched_in(self, frame: Frame, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return which corners (m,) flow between images of a size matches, and their pixels (m, 2) in the frame."""
         assert self._keyframe is not None
         height, width = frame.valid.shape
-        size = (width // downscale, height // downscale)
         start = None if self._flows is None else (flow_at(self._flows[0], size), flow_at(self._flows[1], size))
-        keyframe, current = _resized(self._keyframe.rgb, size), _resized(frame.rgb, size)
+        keyframe, current = resized(self._keyframe.rgb, size), resized(frame.rgb, size)
         self._flows = self.flow.estimate_checked(keyframe, current, start)
         whole = (flow_at(self._flows[0], (width, height)), flow_at(self._flows[1], (width, height)))
         return match_corners(self._corners, whole, frame.valid, _CONSISTENCY_PX)
@@ -154,7 +161,14 @@ def expected_flow(frame: Frame, T_other_frame: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(flow), flow, np.nanmedian(flow, 0)).reshape(height, width, 2).astype(np.float32)
 
 
-def _resized(rgb: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def small_flow_size(flow: FlowEstimator, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the size (width, height) of images, `size` or smaller, between which flow starts to align patches."""
+    downscale = 1 if flow.enough_px is None else max(1, max(size) // flow.enough_px)
+    return size[0] // downscale, size[1] // downscale
+
+
+def resized(rgb: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return an image (H, W, 3) uint8 at a size (width, height) not larger."""
     return rgb if size == rgb.shape[1::-1] else cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
 
 
@@ -163,7 +177,10 @@ def flow_at(flow: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     height, width = flow.shape[:2]
     if size == (width, height):
         return flow
-    return cv2.resize(flow, size) * np.array([size[0] / width, size[1] / height], np.float32)
+    # In rows of x and y: numpy takes four times as long over pairs.
+    factors = np.tile(np.array([size[0] / width, size[1] / height], np.float32), size[0])
+    rows = cv2.resize(flow, size).reshape(size[1], -1) * factors
+    return rows.reshape(size[1], size[0], 2)
 
 
 def detect_corners(frame: Frame, cell_px: int) -> np.ndarray:
@@ -234,7 +251,7 @@ def refined_corners(
     """Return which corners (m,) int have a similar patch in the other image, and their pixels (m, 2) float64 there.
 
     image_from, image_to : (H, W) uint8, `normalised_brightness`. corners : (n, 2) x, y in the first. pixels : (n, 2)
-    in the second, as matched by flow (H, W, 2), px, from the first.
+    in the second, as matched by flow (H, W, 2), px, from the first, which may be composed.
     """
     if not len(corners):
         return np.zeros(0, int), np.zeros((0, 2))
@@ -245,8 +262,8 @@ def refined_corners(
     warped = cv2.remap(image_to, seen[..., 0], seen[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     start = corners + pixels - seen[corners[:, 1], corners[:, 0]]
     there, found = _aligned(image_from, warped, corners, start, _THOROUGH)
-    back, found_back = _aligned(warped, image_from, there, corners, _THOROUGH)
-    good = found & found_back & (np.linalg.norm(there - start, axis=1) <= _MAX_STEP_PX)
+    back, found_back = _aligned(warped, image_from, there, corners, _BACK)
+    good = found & found_back & (np.linalg.norm(there - start, axis=1) <= _MAX_COMPOSED_STEP_PX)
     kept = np.flatnonzero(good & (np.linalg.norm(back - corners, axis=1) <= _PATCH_CONSISTENCY_PX))
     return kept, bilinear(seen, there[kept].astype(np.float64))
 
@@ -256,15 +273,15 @@ def _aligned(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where patches around places (n, 2) are in another image, searched from `start` (n, 2), and whether found (n,)."""
     first, last = (np.ascontiguousarray(p, np.float32).reshape(-1, 1, 2).copy() for p in (places, start))
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+    moved, status, difference = cv2.calcOpticalFlowPyrLK(
         image_from,
         image_to,
         first,
         last,
         winSize=(search.patch_px, search.patch_px),
-        maxLevel=0,
+        maxLevel=search.halvings,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, search.steps, search.last_step_px),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=_LEAST_EIGENVALUE,
     )
-    return moved.reshape(-1, 2), status.ravel() > 0
+    return moved.reshape(-1, 2), (status.ravel() > 0) & (difference.ravel() <= search.most_difference)

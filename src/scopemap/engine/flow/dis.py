@@ -41,10 +41,6 @@ class DisFlow(FlowEstimator):
         there, back = (None, None) if start is None else start
         return _computed(self._near, rgb_from, rgb_to, there), _computed(self._check, rgb_to, rgb_from, back)
 
-    def estimate_both_from(self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair) -> FlowPair:
-        """Return the flows a to b and b to a; the coarsest scale begins at `start`."""
-        return _computed(self._near, rgb_a, rgb_b, start[0]), _computed(self._near, rgb_b, rgb_a, start[1])
-
     def provenance(self) -> dict[str, str]:
         """Return the name and OpenCV's version."""
         return {"flow": self.name, "opencv": cv2.__version__}

@@ -41,10 +41,6 @@ class FlowEstimator(Protocol):
         """Return the flow from one image to another, and one back that serves only to check it."""
         return self.estimate_both(rgb_from, rgb_to)
 
-    def estimate_both_from(self, rgb_a: np.ndarray, rgb_b: np.ndarray, start: FlowPair) -> FlowPair:
-        """Return the flows a to b and b to a, searched from `start`; an estimator that has no start ignores it."""
-        return self.estimate_both(rgb_a, rgb_b)
-
     def provenance(self) -> dict[str, str]:
         """Return what the result depends on, as text: names, versions, hashes."""
         ...

@@ -1,7 +1,8 @@
-"""Feature tracks: corners of keyframes, matched in others by flow, aligned patches, and loops.
+"""Feature tracks: corners of keyframes, matched in others by aligned patches, and loops.
 
-Flow between near keyframes is searched from the composed flows of those between; that between distant ones, whose
-parallax outweighs what flow lags behind, from where their depth and poses as tracked have it.
+Flow is computed between successive keyframes only, and between small images. Patches in near keyframes are searched
+from the composed flows of those between; those in distant ones, whose parallax outweighs what flow lags behind, from
+where depth and poses as tracked have them.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from scopemap.engine.flow.corners import (
     match_corners,
     normalised_brightness,
     refined_corners,
+    resized,
+    small_flow_size,
 )
 from scopemap.engine.flow.estimator import FlowEstimator, FlowPair
 from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
@@ -36,10 +39,9 @@ from scopemap.engine.mapping.loop_closure import MOST_RECENT, Loop
 _CELL_PX = 16  # by hand: one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.
 _MOST_MAPS = 20  # by hand
-_DOWNSCALE = 2  # by hand: of flow that only starts a search
-_CONSISTENCY_PX = 1.0  # by hand: largest forward-backward error of flow
+_CONSISTENCY_PX = 2.0  # by hand: largest forward-backward error of flow, about one of its own pixels
 _LEAST_IN_COMMON = 0.15  # by hand: of either picture, by depth and poses as tracked
-_LEAST_MATCHED = 0.05  # of the corners of both (chance gives 0.03); below, keyframes before are tried no more
+_LEAST_MATCHED = 0.05  # of the corners of both (chance gives 0.03 on real clips); below, keyframes before are tried no more
 
 
 @dataclass
@@ -152,21 +154,17 @@ class FeatureTracks:
         if not recent:
             return known
         latest, size = recent[-1], new.frame.valid.shape[::-1]
-        step: FlowPair | None = None
         coarse = known.coarse if known.latest == latest.frame.index else None
         if coarse is None:
-            step = self._flow.estimate_both(latest.frame.rgb, new.frame.rgb)
-            coarse = _resized(step, (size[0] // _DOWNSCALE, size[1] // _DOWNSCALE))
+            small = small_flow_size(self._flow, size)
+            coarse = self._flow.estimate_both(resized(latest.frame.rgb, small), resized(new.frame.rgb, small))
         pairs, overlaps = dict(known.pairs), True
         for past in reversed(recent):
             gap, number = new.number_in_map - past.number_in_map, past.frame.index
             wanted = overlaps and gap in self._gaps
-            start = self._start(past, new, coarse, gap, wanted=wanted, overlaps=overlaps)
+            start = self._start(past, new, coarse, gap, wanted=wanted)
             if wanted and number not in pairs and start is not None:
-                both = past.frame.rgb, new.frame.rgb
-                flows = step if past is latest else None
-                if flows is None:
-                    flows = self._flow.estimate_both_from(*both, _resized(start, size))
+                flows = flow_at(start[0], size), flow_at(start[1], size)
                 pairs[number] = PairMatches(_matched(past, new, flows), _matched(new, past, flows[::-1]))
             if wanted and number in pairs:
                 found = pairs[number]
@@ -176,23 +174,19 @@ class FeatureTracks:
         return KeyframeMatches(known.corners, pairs, latest.frame.index, coarse)
 
     def _start(
-        self, past: _FlowKeyframe, new: _FlowKeyframe, coarse: FlowPair, gap: int, *, wanted: bool, overlaps: bool
+        self, past: _FlowKeyframe, new: _FlowKeyframe, coarse: FlowPair, gap: int, *, wanted: bool
     ) -> FlowPair | None:
         """Return flows between a keyframe and a new one to search from; None where nothing is to be searched.
 
         coarse : flows between the latest keyframe and the new one, with which those of earlier ones are composed.
         """
-        if gap > MOST_RECENT:
-            past.composed = None
-            return _expected_flows(past.frame, new.frame) if wanted else None
         if gap == 1:
             past.composed = coarse
-        elif past.composed is not None:
+        elif past.composed is not None and gap <= MOST_RECENT:
             past.composed = _composed(past.composed[0], coarse[0]), _composed(coarse[1], past.composed[1])
-        elif overlaps:
-            start = self._flow.estimate_both(past.frame.rgb, new.frame.rgb)
-            past.composed = _resized(start, coarse[0].shape[1::-1])
-            return start
+        else:
+            past.composed = None
+            return _expected_flows(past.frame, new.frame) if wanted else None
         return past.composed
 
     def add_loop(self, loop: Loop) -> None:
@@ -292,10 +286,6 @@ def _expected_flows(past: Frame, new: Frame) -> FlowPair | None:
     if min(_share_inside(flow) for flow in flows) < _LEAST_IN_COMMON:
         return None
     return flows
-
-
-def _resized(flows: FlowPair, size: tuple[int, int]) -> FlowPair:
-    return flow_at(flows[0], size), flow_at(flows[1], size)
 
 
 def _share_inside(flow: np.ndarray) -> float:
