@@ -89,6 +89,7 @@ class KeyframeMatcher:
 
     def __init__(self, flow: FlowEstimator) -> None:
         self.flow = flow
+        self._small = np.zeros((0, 0, 3), np.uint8)  # the keyframe's picture at the size that was matched last
         self._patterns = np.zeros((0, 0), np.uint8)
         self._corners = np.zeros((0, 2), dtype=int)
         self._points_mm = np.zeros((0, 3))
@@ -103,7 +104,7 @@ class KeyframeMatcher:
         if keyframe is None or same:
             return
         assert keyframe.depth_mm is not None
-        self._patterns = normalised_brightness(keyframe.rgb)
+        self._patterns, self._small = normalised_brightness(keyframe.rgb), keyframe.rgb
         self._corners = detect_corners(keyframe, _CELL_PX)
         depth_mm = keyframe.depth_mm[self._corners[:, 1], self._corners[:, 0]]
         rays = keyframe.camera.unproject(self._corners.astype(np.float64))
@@ -130,8 +131,9 @@ class KeyframeMatcher:
         assert self._keyframe is not None
         height, width = frame.valid.shape
         start = None if self._flows is None else (flow_at(self._flows[0], size), flow_at(self._flows[1], size))
-        keyframe, current = resized(self._keyframe.rgb, size), resized(frame.rgb, size)
-        self._flows = self.flow.estimate_checked(keyframe, current, start)
+        if self._small.shape[1::-1] != size:
+            self._small = resized(self._keyframe.rgb, size)
+        self._flows = self.flow.estimate_checked(self._small, resized(frame.rgb, size), start)
         whole = (flow_at(self._flows[0], (width, height)), flow_at(self._flows[1], (width, height)))
         return match_corners(self._corners, whole, frame.valid, _CONSISTENCY_PX)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -41,7 +41,8 @@ _CELL_PX = 16  # by hand: one corner in each cell of that size
 _MOST_MAPS = 20  # by hand
 _CONSISTENCY_PX = 2.0  # by hand: largest forward-backward error of flow, about one of its own pixels
 _LEAST_IN_COMMON = 0.15  # by hand: of either picture, by depth and poses as tracked
-_LEAST_MATCHED = 0.05  # of the corners of both (chance gives 0.03 on real clips); below, keyframes before are tried no more
+# Of the corners of both (chance gives 0.03 on real clips); below it keyframes before are tried no more.
+_LEAST_MATCHED = 0.05  # by hand
 
 
 @dataclass
@@ -58,11 +59,8 @@ class _FlowKeyframe:
     frame: Frame
     corners: np.ndarray
     first_point: int
-    pattern: np.ndarray = field(init=False)
+    pattern: np.ndarray
     composed: FlowPair | None = None
-
-    def __post_init__(self) -> None:
-        self.pattern = normalised_brightness(self.frame.rgb)
 
 
 class PairMatches(NamedTuple):
@@ -80,11 +78,13 @@ class PairMatches(NamedTuple):
 class KeyframeMatches(NamedTuple):
     """What was matched of a new keyframe, so that nobody does it again.
 
-    corners : (n, 2) int px. pairs : its matches with earlier keyframes, by the numbers of their frames. latest : number
-    of the frame of the keyframe before. coarse : small flows from that one, and back; None: they are unknown.
+    corners : (n, 2) int px. pattern : (H, W) uint8, `normalised_brightness`. pairs : its matches with earlier
+    keyframes, by the numbers of their frames. latest : number of the frame of the keyframe before. coarse : small flows
+    from that one, and back; None: they are unknown.
     """
 
     corners: np.ndarray
+    pattern: np.ndarray
     pairs: Mapping[int, PairMatches] = MappingProxyType({})
     latest: int = -1
     coarse: FlowPair | None = None
@@ -126,7 +126,9 @@ class FeatureTracks:
         known : what was matched of it elsewhere. Returns what is known now.
         """
         assert keyframe.depth_mm is not None
-        corners = detect_corners(keyframe, _CELL_PX) if known is None else known.corners
+        if known is None:
+            known = KeyframeMatches(detect_corners(keyframe, _CELL_PX), normalised_brightness(keyframe.rgb))
+        corners = known.corners
         rows, columns = corners[:, 1], corners[:, 0]
         self._camera = keyframe.camera
         log_depth = np.log(keyframe.depth_mm[rows, columns].astype(np.float64))
@@ -143,8 +145,8 @@ class FeatureTracks:
             for past in others:
                 past.composed = None
         number_in_map = recent[-1].number_in_map + 1 if recent else 0
-        new = _FlowKeyframe(self.keyframe_count, number_in_map, _slim(keyframe), corners, first)
-        matches = self._match_with(recent, new, known or KeyframeMatches(corners))
+        new = _FlowKeyframe(self.keyframe_count, number_in_map, _slim(keyframe), corners, first, known.pattern)
+        matches = self._match_with(recent, new, known)
         recent.append(new)
         self.keyframe_count += 1
         return matches
@@ -171,7 +173,7 @@ class FeatureTracks:
                 self._add_matches(past.first_point + found.of_past[0], new.number, found.of_past[1])
                 self._add_matches(new.first_point + found.of_new[0], past.number, found.of_new[1])
                 overlaps = found.corners >= _LEAST_MATCHED * (len(past.corners) + len(new.corners))
-        return KeyframeMatches(known.corners, pairs, latest.frame.index, coarse)
+        return known._replace(pairs=pairs, latest=latest.frame.index, coarse=coarse)
 
     def _start(
         self, past: _FlowKeyframe, new: _FlowKeyframe, coarse: FlowPair, gap: int, *, wanted: bool

@@ -123,7 +123,7 @@ class LocalAdjustment:
             if not (is_seen and found.sigma_px <= RIGID_SIGMA_PX) or shape.refuses_window:
                 self._refused[map_number] += int(is_seen)
                 self._begin()
-                self._take(keyframe, reference)
+                self._take(keyframe, reference, matches)
             else:
                 self._adjusted[map_number] += 1
                 self._test_lens(points, observations, found.state, keyframe.camera.fx)
@@ -167,10 +167,10 @@ class LocalAdjustment:
     def _correction(self, reference: int) -> KeyframeCorrection:
         return self._corrections.get(reference, KeyframeCorrection())
 
-    def _take(self, keyframe: Frame, reference: int) -> KeyframeMatches:
-        """Put a keyframe in the window, as tracked; return its matches."""
+    def _take(self, keyframe: Frame, reference: int, known: KeyframeMatches | None = None) -> KeyframeMatches:
+        """Put a keyframe in the window, as tracked; return its matches. known : what was matched of it before."""
         assert keyframe.T_world_camera is not None
-        matches = self._tracks.add(keyframe)
+        matches = self._tracks.add(keyframe, known=known)
         points, _ = self._tracks.collected([self._tracks.keyframe_count - 1])
         log_scale = self._correction(reference).log_scale
         state = log_scale, points.log_depth + log_scale, np.full(len(points.host), np.inf)
