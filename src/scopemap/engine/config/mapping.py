@@ -113,7 +113,7 @@ class FusionSettings(StageSettings):
     max_depth_mm: float | None = Field(
         None, gt=0, le=1e6, description="depth beyond this is not fused, mm; default: 200 voxels"
     )
-    every: int = Field(1, ge=0, description="fuse every n-th tracked frame; 0: those that show tissue anew")
+    every: int = Field(0, ge=0, description="fuse every n-th tracked frame; 0: those that show tissue anew")
     surface_at_s: float | None = Field(
         None,
         description="the surface as seen at this second, by the time stamps, where tissue moves on its own "

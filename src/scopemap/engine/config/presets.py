@@ -17,6 +17,7 @@ _PAPER: dict[str, Any] = {
     "tracking.keyframe_every": 2,
     "smoothing.method": "wema",
     "mapping.method": "none",
+    "fusion.every": 1,
     "fusion.voxel_mm": 1.0,
     "fusion.truncation_mm": 5.0,
     "fusion.max_depth_mm": 100.0,
@@ -48,7 +49,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fusion.voxel_mm": 1.5,
         "fusion.truncation_mm": 5.0,
         "fusion.max_depth_mm": 100.0,
-        "fusion.every": 2,
         "mapping.method": "local",
     },
 }

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 
 import cv2
 import numpy as np
@@ -46,6 +46,7 @@ _LEVEL_PERCENTILES = (1, 99)  # by hand
 _DEPTH_ERROR = 0.05  # by hand
 _MAX_DEPTH_FACTOR = 1.1  # by hand: depths of keyframes that disagree by less than so much more agree as well as before
 _GRID_PX = 8  # by hand: between the pixels whose depth is compared between keyframes
+_F32 = np.float32
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,9 @@ class DepthCorrectionField:
 
     def log_factor(self, depth_mm: np.ndarray) -> np.ndarray:
         """Return ln of the factor (H, W) float32 for estimated depth (H, W) mm; NaN where that is unknown."""
-        x, y = _pixel_coordinates(*depth_mm.shape)
-        flat = cv2.remap(self.values.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         with np.errstate(divide="ignore", invalid="ignore"):
             log_depth = np.log(depth_mm, dtype=np.float32)
-        return _between_levels(flat, log_depth, self.nearest, self.farthest)
+        return _interpolated(self.values.astype(np.float32), log_depth, self.nearest, self.farthest)
 
 
 def fit_depth_correction(
@@ -177,26 +176,31 @@ def _log_ratios(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _between_levels(flat: np.ndarray, log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
-    """Interpolate values (H, W, levels) at ln depth (H, W), (H, W) float32; NaN where that is NaN."""
+def _interpolated(values: np.ndarray, log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
+    """Return a field's values (6, 7, 4) at each pixel's ln depth (H, W), (H, W) float32; NaN where that is NaN."""
     height, width = log_depth.shape
-    found, per_level = np.full((height, width), np.nan, np.float32), (LEVELS - 1) / (farthest - nearest)
+    found = np.empty((height, width), np.float32)
+    # In single precision and without branches, so that it is compiled to vector instructions.
+    first, per_level = _F32(nearest), _F32((LEVELS - 1) / (farthest - nearest))
+    per_column, last = _F32((COLUMNS - 1) / width), _F32(LEVELS - 1)
+    line = np.empty((COLUMNS, LEVELS), np.float32)
     for row in range(height):
+        y = (row + 0.5) / height * (ROWS - 1)
+        above = min(int(y), ROWS - 2)
+        for k in range(COLUMNS):
+            for level in range(LEVELS):
+                low, high = values[above, k, level], values[above + 1, k, level]
+                line[k, level] = low + _F32(y - above) * (high - low)
         for col in range(width):
-            if not np.isnan(log_depth[row, col]):
-                level = min(max((log_depth[row, col] - nearest) * per_level, 0.0), LEVELS - 1.0)
-                below = min(int(level), LEVELS - 2)
-                low, high = flat[row, col, below], flat[row, col, below + 1]
-                found[row, col] = low + (level - below) * (high - low)
+            x, z = (_F32(col) + _F32(0.5)) * per_column, (log_depth[row, col] - first) * per_level
+            z = z if z > _F32(0) else _F32(0)  # unknown depth, too
+            z = z if z < last else last
+            left, below = min(int(x), COLUMNS - 2), min(int(z), LEVELS - 2)
+            s, t = x - _F32(left), z - _F32(below)
+            near = line[left, below] + s * (line[left + 1, below] - line[left, below])
+            far = line[left, below + 1] + s * (line[left + 1, below + 1] - line[left, below + 1])
+            found[row, col] = near + t * (far - near) if log_depth[row, col] == log_depth[row, col] else _F32(np.nan)
     return found
-
-
-@lru_cache(4)
-def _pixel_coordinates(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return column and row of each pixel, in nodes, (H, W) float32 each."""
-    sides = ((width, COLUMNS), (height, ROWS))
-    x, y = np.meshgrid(*(((np.arange(n) + 0.5) / n * (nodes - 1)).astype(np.float32) for n, nodes in sides))
-    return x, y
 
 
 def _interpolation(position: np.ndarray, level: np.ndarray) -> sparse.csr_matrix:

@@ -155,21 +155,23 @@ class FrameCorrection:
 
     def depth_factor(self, index: int) -> float:
         """Return the factor of the whole depth of the frame with this number, without its depth correction field."""
-        before, after, share = self._between(index)
-        log_scale = (1 - share) * self._log_scale(before, index) + share * self._log_scale(after, index)
-        return float(np.exp(log_scale)) * self._world(index).scale
+        return self._factor(index, *self._between(index))
 
     def depth_factors(self, index: int, depth_mm: np.ndarray) -> np.ndarray:
         """Return the factors (H, W) float32 of depth (H, W) mm; NaN where depth is unknown."""
-        factor = np.float32(self.depth_factor(index))
+        before, after, share = self._between(index)
+        factor = np.float32(self._factor(index, before, after, share))
         if not self.depth_fields:
             return np.full(depth_mm.shape, factor, np.float32)
-        before, after, share = self._between(index)
         depth_mm = depth_mm * np.float32(self._world(index).scale)
         log = self.depth_fields[before].log_factor(depth_mm)
         if after != before:
             log = (1 - share) * log + share * self.depth_fields[after].log_factor(depth_mm)
         return factor * np.exp(log.astype(np.float32))
+
+    def _factor(self, index: int, before: int, after: int, share: float) -> float:
+        log_scale = (1 - share) * self._log_scale(before, index) + share * self._log_scale(after, index)
+        return float(np.exp(log_scale)) * self._world(index).scale
 
     def _T_world_world(self, k: int, index: int) -> np.ndarray:
         """Return the correction (4, 4) of a frame near keyframe k, which it follows or leads to."""

@@ -110,8 +110,9 @@ def choose_neighbours(
     order, chosen = sorted(T_world_camera), list[int]()
     far, size = points[:, 2] >= np.percentile(points[:, 2], _FAR_PERCENTILE), np.array([camera.width, camera.height])
     for side in ([number for number in order if number < index], [number for number in order if number > index]):
-        motions = [inverse(T_world_camera[number]) @ T_world_camera[index] for number in side] or np.zeros((0, 4, 4))
-        parallax = parallax_px(points, far, np.array(motions), _intrinsics(camera), size)
+        poses = np.array([T_world_camera[number] for number in side]).reshape(-1, 4, 4)
+        motions = inverse(poses) @ T_world_camera[index]
+        parallax = parallax_px(points, far, motions, _intrinsics(camera), size)
         for kind, wanted in ((0, _PARALLAX_PX), (1, _FAR_PARALLAX_PX)):
             for wanted_px in wanted:
                 offset = np.abs(np.log(np.maximum(parallax[:, kind], 1e-9) / wanted_px))

@@ -238,10 +238,7 @@ def corrected_frame(frame: Frame, correction: FrameCorrection | None) -> Frame:
         return frame
     if frame.T_world_camera is None or frame.depth_mm is None:
         raise ValueError("a frame to be corrected needs a pose and a depth")
-    pose = correction.pose(frame.index, frame.T_world_camera)
-    factors = correction.depth_factors(frame.index, frame.depth_mm)
-    sigma_mm = None if frame.depth_sigma_mm is None else frame.depth_sigma_mm * factors
-    return replace(frame, T_world_camera=pose, depth_mm=frame.depth_mm * factors, depth_sigma_mm=sigma_mm)
+    return replace(_with_depth(frame, correction), T_world_camera=correction.pose(frame.index, frame.T_world_camera))
 
 
 class FinalFrames:
@@ -255,7 +252,7 @@ class FinalFrames:
 
     def __init__(self, submap: Submap, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]) -> None:
         """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
-        self._stored, self._tracked, self._correction = read, T_world_camera, submap.correction
+        self._stored, self._correction = read, submap.correction
         correction = submap.correction
         moves = correction is not None and correction.tissue is not None and not correction.tissue.deformation.has_core
         rigid = correction is not None and not correction.refused and not moves
@@ -275,7 +272,7 @@ class FinalFrames:
         without : returns a frame without the pixels that show no tissue. among : numbers of the frames; None: all.
         """
         for index in self.T_world_camera if among is None else among:
-            frame = corrected_frame(self._read(index), self._correction)
+            frame = self._corrected(index)
             found = None if triangulated is None else triangulated(index, _usable_depth_mm(frame))
             frame = without(frame)
             if found is not None:
@@ -285,13 +282,22 @@ class FinalFrames:
                 frame = replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma * depth_mm)
             yield frame
 
-    def _read(self, index: int) -> Frame:
-        return replace(self._stored(index), T_world_camera=self._tracked[index])
+    def _corrected(self, index: int) -> Frame:
+        frame = replace(self._stored(index), T_world_camera=self.T_world_camera[index])
+        return frame if self._correction is None else _with_depth(frame, self._correction)
 
     def view(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Return picture (H, W, 3) and corrected usable depth (H, W) mm of a frame, from any thread."""
-        frame = corrected_frame(self._read(index), self._correction)
+        frame = self._corrected(index)
         return frame.rgb, _usable_depth_mm(frame)
+
+
+def _with_depth(frame: Frame, correction: FrameCorrection) -> Frame:
+    """Return a frame with its depth and the standard deviation of that corrected."""
+    assert frame.depth_mm is not None
+    factors = correction.depth_factors(frame.index, frame.depth_mm)
+    sigma_mm = None if frame.depth_sigma_mm is None else frame.depth_sigma_mm * factors
+    return replace(frame, depth_mm=frame.depth_mm * factors, depth_sigma_mm=sigma_mm)
 
 
 def _usable_depth_mm(frame: Frame) -> np.ndarray:
