@@ -3,20 +3,16 @@
 Powell's dog-leg, equations 7 to 9 of arXiv 2508.11282: the Gauss-Newton step (7) if within radius rho; else the
 steepest descent step (8) cut to rho if h |p_sd| > rho, h = |p_sd|^2 / |J p_sd|^2 (the paper compares |p_sd|); else
 where the line from the Cauchy point to the Gauss-Newton step leaves the ball (9). Radius: Nocedal and Wright,
-"Numerical Optimization", algorithm 4.1. `SchurModel` eliminates points (Lourakis and Argyros, ICCV 2005; Triggs et al.,
-"Bundle Adjustment", 2000, 6.1).
+"Numerical Optimization", algorithm 4.1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation over the median absolute value of a normal variable."""
@@ -168,102 +164,3 @@ def minimise(problem: Problem[State], start: State, options: Options) -> Solutio
             if small:
                 return Solution(state, model.cost, iteration, True)
     return Solution(state, model.cost, options.max_iterations, False)
-
-
-_RIDGE = 1e-9  # guard: of the diagonal
-
-
-class PointBlock(NamedTuple):
-    """Normal equations of n points that touch the same m camera unknowns.
-
-    columns : (m,) numbers of these. A : (m, m) their second derivative, b : (m,) the first. points : numbers of the
-    points. h, g : (n,) second and first derivative of the points. E : (n, m) of both.
-    """
-
-    columns: np.ndarray
-    A: np.ndarray
-    b: np.ndarray
-    points: slice
-    h: np.ndarray
-    g: np.ndarray
-    E: np.ndarray
-
-
-class CameraBlock(NamedTuple):
-    """Normal equations of camera unknowns alone: numbers (m,), second derivative (m, m), first derivative (m,)."""
-
-    columns: np.ndarray
-    A: np.ndarray
-    b: np.ndarray
-
-
-@dataclass(frozen=True)
-class SchurModel:
-    """Model of a cost of camera unknowns and points, in this order.
-
-    cost : at the state. build : returns the blocks, called once and only where a step is needed. free : (F,) numbers
-    of the camera unknowns that may change. cameras, points : how many unknowns there are of either.
-    """
-
-    cost: float
-    build: Callable[[], tuple[list[PointBlock], list[CameraBlock]]]
-    free: np.ndarray
-    cameras: int
-    points: int
-
-    @cached_property
-    def blocks(self) -> tuple[list[PointBlock], list[CameraBlock]]:
-        """The normal equations, block by block."""
-        return self.build()
-
-    @cached_property
-    def gradient(self) -> np.ndarray:
-        """First derivative (cameras + points,); 0 for fixed unknowns."""
-        cameras, points = np.zeros(self.cameras), np.zeros(self.points)
-        for block in self.blocks[0]:
-            cameras[block.columns] += block.b
-            points[block.points] = block.g
-        for prior in self.blocks[1]:
-            cameras[prior.columns] += prior.b
-        free = np.zeros(self.cameras)
-        free[self.free] = cameras[self.free]
-        return np.concatenate([free, points])
-
-    def gauss_newton_step(self) -> np.ndarray:
-        """Return the step (cameras + points,) to the minimum."""
-        matrix, rhs = self.reduced()
-        step = np.zeros(self.cameras + self.points)
-        step[self.free] = splu(sparse.csc_matrix(matrix)).solve(rhs)
-        for block in self.blocks[0]:
-            points = slice(self.cameras + block.points.start, self.cameras + block.points.stop)
-            step[points] = -(block.g + block.E @ step[block.columns]) / block.h
-        return step
-
-    def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the matrix (F, F) of the free camera unknowns without the points, and the right-hand side (F,)."""
-        rhs, matrix = np.zeros(self.cameras), np.zeros((len(self.free),) * 2)
-        place = np.full(self.cameras, -1)
-        place[self.free] = np.arange(len(self.free))
-
-        def add(columns: np.ndarray, A: np.ndarray, b: np.ndarray) -> None:
-            rhs[columns] -= b
-            kept = np.flatnonzero(place[columns] >= 0)
-            free = place[columns[kept]]
-            matrix[np.ix_(free, free)] += A[np.ix_(kept, kept)]
-
-        for prior in self.blocks[1]:
-            add(*prior)
-        for block in self.blocks[0]:
-            shrunk = block.E / block.h[:, None]
-            add(block.columns, block.A - block.E.T @ shrunk, block.b - shrunk.T @ block.g)
-        matrix[np.diag_indices_from(matrix)] *= 1 + _RIDGE
-        return matrix, rhs[self.free]
-
-    def curvature(self, step: np.ndarray) -> float:
-        """Return step^T H step."""
-        cameras, points = step[: self.cameras], step[self.cameras :]
-        total = sum(float(cameras[prior.columns] @ prior.A @ cameras[prior.columns]) for prior in self.blocks[1])
-        for block in self.blocks[0]:
-            own, some = cameras[block.columns], points[block.points]
-            total += float(own @ block.A @ own + 2 * some @ (block.E @ own) + some @ (block.h * some))
-        return total
