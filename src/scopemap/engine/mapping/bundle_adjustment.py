@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scopemap.engine.geometry import least_squares
-from scopemap.engine.geometry.least_squares import cauchy, minimise, robust_sigma_2d
+from scopemap.engine.geometry.least_squares import Linear, Prior, ReducedModel, cauchy, minimise, robust_sigma_2d
 from scopemap.engine.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
 from scopemap.engine.mapping.bundle_problem import (
     BundleProblem,
@@ -39,7 +39,6 @@ from scopemap.engine.mapping.bundle_problem import (
     reproject,
     reprojection_errors,
 )
-from scopemap.engine.mapping.reduced_model import Linear, Prior, ReducedModel
 
 PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 CAUCHY = 2.0  # by hand: residuals of that many standard deviations get half the weight
@@ -184,7 +183,8 @@ def linearised(problem: BundleProblem, state: State) -> ReducedModel:
     held += [np.arange(6), np.arange(PER_KEYFRAME * problem.held)]
     unknowns = PER_KEYFRAME * count + lens
     return ReducedModel(
-        problem,
+        problem.first_seen,
+        problem.parts,
         cost(problem, state, seen, edges),
         partial(derivatives, problem, state),
         camera_priors(problem, state, edges),

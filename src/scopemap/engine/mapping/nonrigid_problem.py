@@ -15,7 +15,7 @@ import numpy as np
 from scipy import sparse
 
 from scopemap.engine.geometry import least_squares
-from scopemap.engine.geometry.least_squares import minimise, robust_sigma_2d
+from scopemap.engine.geometry.least_squares import Linear, Prior, ReducedModel, minimise, robust_sigma_2d
 from scopemap.engine.geometry.skinning import Skin
 from scopemap.engine.mapping.bundle_adjustment import (
     PER_KEYFRAME,
@@ -27,7 +27,6 @@ from scopemap.engine.mapping.bundle_adjustment import (
     retract,
 )
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Moved, State, reprojection_errors
-from scopemap.engine.mapping.reduced_model import Linear, Prior, ReducedModel
 
 # Of nodes that move step by step only the curve is needed, which is found long before them.
 _MAX_ITERATIONS = 20  # by hand
@@ -130,7 +129,7 @@ def linearised(problem: NonRigidProblem, state: NonRigidState) -> ReducedModel:
         total += 0.5 * float(off @ off) * _CURVE_SIGMA**2
     held = held_depths(rigid, state.rigid)
     linear, free = partial(_derivatives, problem, state), np.arange(6, unknowns)
-    return ReducedModel(rigid, total, linear, priors, *held, free=free, unknowns=unknowns)
+    return ReducedModel(rigid.first_seen, rigid.parts, total, linear, priors, *held, free=free, unknowns=unknowns)
 
 
 def _derivatives(problem: NonRigidProblem, state: NonRigidState, some: slice) -> Linear:
