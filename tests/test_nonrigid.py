@@ -25,7 +25,7 @@ from scopemap.engine.mapping.deformation_graph import (
 )
 from scopemap.engine.mapping.frame_correction import TissueMotion
 from scopemap.engine.mapping.nonrigid_adjustment import NonRigidSolution, adjust_moving_tissue
-from scopemap.engine.mapping.nonrigid_problem import NonRigidModel, NonRigidProblem, NonRigidState, retracted
+from scopemap.engine.mapping.nonrigid_problem import NonRigidProblem, NonRigidState, linearised, retracted
 
 KEYFRAMES, PER_KEYFRAME, GAPS = 16, 120, (1, 2, 3, 5)
 BREATH = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(KEYFRAMES) / 9)
@@ -228,18 +228,18 @@ def _small(free: bool) -> tuple[NonRigidProblem, NonRigidState]:
 @pytest.mark.parametrize("free", [False, True])
 def test_the_gradient_is_that_of_the_cost(free: bool) -> None:
     problem, state = _small(free)
-    model, rng = NonRigidModel(problem, state), np.random.default_rng(3)
+    model, rng = linearised(problem, state), np.random.default_rng(3)
     bounds = np.cumsum([6, PER_KEYFRAME_UNKNOWNS * KEYFRAMES - 6, 72, problem.curve_unknowns])  # then points
     for first, end in zip(bounds, [*bounds[1:], None], strict=True):
         step = np.zeros(len(model.gradient))
         step[first:end] = rng.normal(size=len(step[first:end]))
-        ahead, behind = (NonRigidModel(problem, retracted(problem, state, s * step)).cost for s in (1e-6, -1e-6))
+        ahead, behind = (linearised(problem, retracted(problem, state, s * step)).cost for s in (1e-6, -1e-6))
         assert (ahead - behind) / 2e-6 == pytest.approx(model.gradient @ step, rel=1e-4)
 
 
 @pytest.mark.parametrize("free", [False, True])
 def test_the_step_without_points_solves_the_normal_equations_of_all_unknowns(free: bool) -> None:
-    model = NonRigidModel(*_small(free))
+    model = linearised(*_small(free))
     step, rng = model.gauss_newton_step(), np.random.default_rng(4)
     assert model.curvature(step) == pytest.approx(-model.gradient @ step, rel=1e-5)
     other = rng.normal(size=len(step)) * np.abs(step).max()

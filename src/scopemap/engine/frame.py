@@ -7,7 +7,7 @@ every frame of a run is in `Rows`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,6 +22,7 @@ REGIONS = 6, 8  # by hand
 """Rows and columns of the regions of a picture whose tissue is looked at for motion of its own."""
 
 _CONSTANT_RANGE = 4  # by hand: grey levels by which a picture of one colour varies, for lossy coding
+_ROWS_AT_ONCE = 100_000  # by hand
 # Width of the box filter that leaves little of a sensor's noise.
 _NOISE_WIDTH_PX = 9  # by hand
 TruthQuality = Literal["exact", "registered", "kinematic", "sfm", "stereo", "predicted"]
@@ -158,6 +159,11 @@ class Rows:
         end = self._count if count is None else first + count
         found: np.ndarray = self._bytes[first:end].reshape(-1).view(self._kind).copy()
         return found
+
+    def parts(self) -> Iterator[np.ndarray]:
+        """Yield all rows in parts, since in one piece those of a long clip would fill memory."""
+        for first in range(0, self._count, _ROWS_AT_ONCE):
+            yield self.read(first, min(_ROWS_AT_ONCE, self._count - first))
 
     def keep(self, kept: np.ndarray) -> None:
         """Forget the rows where `kept`, (N,) bool, is False."""

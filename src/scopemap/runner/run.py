@@ -203,6 +203,7 @@ class _Finishing:
         clock.timed("track backwards", track_backwards, pipeline, frames)
         if pipeline.config.mapping.at_end:
             self.run.progress("adjusting keyframes", 0, 0)
+        trim_memory()
         submaps, notices = clock.timed("back end", pipeline.mapper.submaps)
         results = [self._submap_result(number, submaps) for number in range(len(submaps))]
         submapped = {index for submap in submaps for index in submap.frames}

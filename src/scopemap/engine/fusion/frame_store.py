@@ -149,6 +149,14 @@ class StoredRows(Rows):
         size = (self._count - first if count is None else count) * self._kind.itemsize
         return np.frombuffer(bytearray(self._file.read(first * self._kind.itemsize, size)), self._kind)
 
+    def parts(self) -> Iterator[np.ndarray]:
+        """Yield all rows in parts. Raises `InputError` after the last one where they are damaged."""
+        crc = 0
+        for part in super().parts():
+            crc = zlib.crc32(part.tobytes(), crc)
+            yield part
+        self._file.check(crc == self._file.crc or not len(self))
+
 
 class FrameStore:
     """Stores frames with depth in one file, which is created with the first frame, and tables in files beside it.

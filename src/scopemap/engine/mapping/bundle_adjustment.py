@@ -23,26 +23,21 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from scopemap.engine.geometry import least_squares
-from scopemap.engine.geometry.least_squares import (
-    CameraBlock,
-    PointBlock,
-    SchurModel,
-    cauchy,
-    minimise,
-    robust_sigma_2d,
-)
+from scopemap.engine.geometry.least_squares import Linear, Prior, ReducedModel, cauchy, minimise, robust_sigma_2d
 from scopemap.engine.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
 from scopemap.engine.mapping.bundle_problem import (
     BundleProblem,
+    Errors,
+    Moved,
     Observations,
     Points,
     Reprojection,
     State,
     jacobians,
     reproject,
+    reprojection_errors,
 )
 
 PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
@@ -154,7 +149,7 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
         return BundleSolution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
 
     def rescaled(state: State) -> State:
-        reprojection = reproject(problem, state)
+        reprojection = reprojection_errors(problem, state)
         lengths = np.linalg.norm(reprojection.error[reprojection.ahead], axis=1)
         return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
 
@@ -171,34 +166,54 @@ def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
     """Return the lengths of the reprojection errors (N,) of a state, px; infinite behind a camera."""
     if not len(problem.observations.point):
         return np.zeros(0)
-    reprojection = reproject(problem, state)
+    reprojection = reprojection_errors(problem, state)
     return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
 
 
-def weights(state: State, seen: Reprojection) -> np.ndarray:
+def weights(state: State, seen: Errors | Reprojection) -> np.ndarray:
     """Return the robust weights (N,) of the observations, 1/px^2."""
     return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, CAUCHY)[1], 0) / state.sigma_px**2
 
 
-def linearised(problem: BundleProblem, state: State) -> SchurModel:
+def linearised(problem: BundleProblem, state: State) -> ReducedModel:
     """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
     count, lens = len(state.T_camera_world), 0 if problem.lens_sigma is None else 3
-    seen = reproject(problem, state)
-    edges = odometry_edges(problem, state)
+    seen, edges = reprojection_errors(problem, state), odometry_edges(problem, state)
     held = [6 + PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
     held += [np.arange(6), np.arange(PER_KEYFRAME * problem.held)]
     unknowns = PER_KEYFRAME * count + lens
-    free = np.setdiff1d(np.arange(unknowns), np.concatenate(held))
+    return ReducedModel(
+        problem.first_seen,
+        problem.parts,
+        cost(problem, state, seen, edges),
+        partial(derivatives, problem, state),
+        camera_priors(problem, state, edges),
+        *held_depths(problem, state),
+        free=np.setdiff1d(np.arange(unknowns), np.concatenate(held)),
+        unknowns=unknowns,
+    )
 
-    def build() -> tuple[list[PointBlock], list[CameraBlock]]:
-        parts = _Rows(seen.error, weights(state, seen) / problem.correlated, *jacobians(problem, state, seen))
-        hosts = [_host_block(problem, state, host, parts) for host in np.unique(problem.points.host)]
-        return hosts, camera_blocks(problem, state, edges)
 
-    return SchurModel(cost(problem, state, seen, edges), build, free, unknowns, len(state.log_depth))
+def held_depths(problem: BundleProblem, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how far ln depth of the points (P,) is from the estimate, its weight, and the unknown of its scale."""
+    points = problem.points
+    off = state.log_depth - points.log_depth - state.log_scale[points.host]
+    return off, cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2, PER_KEYFRAME * points.host + 6
 
 
-def cost(problem: BundleProblem, state: State, seen: Reprojection, edges: list[OdometryEdge]) -> float:
+def derivatives(problem: BundleProblem, state: State, points: slice, moved: Moved | None = None) -> Linear:
+    """Return the derivatives of the observations of some points by the keyframes and the lens."""
+    seen = reproject(problem, state, points, moved)
+    by_camera, by_host, by_depth, by_lens = jacobians(problem, state, seen)
+    number, observer, _ = (part[problem.seen(points)] for part in problem.observations.columns)
+    first = PER_KEYFRAME * np.column_stack([observer, problem.points.host[number]])
+    of_lens = PER_KEYFRAME * len(state.T_camera_world) + np.tile(np.arange(by_lens.shape[2]), (len(number), 1))
+    columns = np.hstack([first[:, :1] + np.arange(6), first[:, 1:] + np.arange(6), of_lens])
+    by = np.concatenate([by_camera, by_host, by_lens], -1)
+    return Linear(columns, by, by_depth, seen.error, weights(state, seen) / problem.correlated)
+
+
+def cost(problem: BundleProblem, state: State, seen: Errors, edges: list[OdometryEdge]) -> float:
     """Return what is minimised, at a state."""
     points, priors = problem.points, problem.priors
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
@@ -231,121 +246,49 @@ def odometry_edges(problem: BundleProblem, state: State) -> list[OdometryEdge]:
     ]
 
 
-def camera_blocks(problem: BundleProblem, state: State, edges: list[OdometryEdge]) -> list[CameraBlock]:
+def camera_priors(problem: BundleProblem, state: State, edges: list[OdometryEdge]) -> list[Prior]:
     """Return the normal equations of the priors of keyframes, and of the lens."""
     T, unit, blocks = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), []
     for i, j, error, information in edges:
         own = np.append(PER_KEYFRAME * i + np.arange(6), PER_KEYFRAME * j + np.arange(6))
         J = np.hstack([-_adjoint(T[j] @ inverse(T[i])), np.eye(6)]) * np.tile(unit, 2)
-        blocks.append(CameraBlock(own, J.T @ (information[:, None] * J), J.T @ (information * error)))
+        blocks.append(Prior(own, J.T @ (information[:, None] * J), J.T @ (information * error)))
     if problem.priors.scale > 0:
         information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + PER_KEYFRAME * np.arange(len(T))
-        blocks.append(CameraBlock(own, np.diag(information), information * state.log_scale))
+        blocks.append(Prior(own, np.diag(information), information * state.log_scale))
     if problem.lens_sigma is not None:
         information, own = problem.lens_sigma**-2.0, PER_KEYFRAME * len(T) + np.arange(3)
         change = state.lens - problem.tracked.lens
-        blocks.append(CameraBlock(own, np.diag(information), information * change))
+        blocks.append(Prior(own, np.diag(information), information * change))
     return blocks
 
 
-class _Rows(NamedTuple):
-    """What is summed over observations: derivatives by the observing camera, the host, ln depth and the lens."""
-
-    error: np.ndarray  # (N, 2)
-    weight: np.ndarray  # (N,)
-    by_camera: np.ndarray  # (N, 2, 6)
-    by_host: np.ndarray  # (N, 2, 6)
-    by_depth: np.ndarray  # (N, 2)
-    by_lens: np.ndarray  # (N, 2, 3), or (N, 2, 0)
-
-
-def _host_block(problem: BundleProblem, state: State, host: int, parts: _Rows) -> PointBlock:
-    """Return the normal equations of the points of one host."""
-    points, observations = problem.points, problem.observations
-    here = slice(*np.searchsorted(points.host, (host, host + 1)))
-    some = slice(*np.searchsorted(observations.point, (here.start, here.stop)))
-    keyframes = np.union1d(observations.keyframe[some], host)
-    count, at = here.stop - here.start, int(np.searchsorted(keyframes, host))
-    number, observer = observations.point[some] - here.start, np.searchsorted(keyframes, observations.keyframe[some])
-    A, b, E, h, g = _summed(_Rows(*(part[some] for part in parts)), number, observer, at, count, len(keyframes))
-    # The prior of the estimated depth, up to the host's scale.
-    off, column = state.log_depth[here] - points.log_depth[here] - state.log_scale[host], PER_KEYFRAME * at + 6
-    held = cauchy((off / points.sigma[here]) ** 2, CAUCHY)[1] / points.sigma[here] ** 2
-    E[:, column] -= held
-    A[column, column] += held.sum()
-    b[column] -= (held * off).sum()
-    columns = (PER_KEYFRAME * keyframes[:, None] + np.arange(PER_KEYFRAME)).ravel()
-    columns = np.append(columns, PER_KEYFRAME * len(state.T_camera_world) + np.arange(parts.by_lens.shape[2]))
-    return PointBlock(columns, A, b, here, h + held, g + held * off, E)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _summed(
-    rows: _Rows, point: np.ndarray, observer: np.ndarray, host: int, points: int, keyframes: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return A, b, E, h and g of a `PointBlock`, summed over the observations of a host's points."""
-    error, weight, by_camera, by_host, by_depth, by_lens = rows
-    lens = by_lens.shape[2]
-    last = PER_KEYFRAME * keyframes
-    size = last + lens
-    A = np.zeros((size, size))
-    b, E = np.zeros(size), np.zeros((points, size))
-    h, g = np.zeros(points), np.zeros(points)
-    # Element by element: numba takes seconds to compile sums of arrays.
-    touched = np.empty(12 + lens, np.int64)
-    for i in range(6):
-        touched[6 + i] = PER_KEYFRAME * host + i
-    for i in range(lens):
-        touched[12 + i] = last + i
-    rows_of, weighed = np.empty((2, 12 + lens)), np.empty((2, 12 + lens))
-    for k in range(len(weight)):
-        for i in range(6):
-            touched[i] = PER_KEYFRAME * observer[k] + i
-        for axis in range(2):
-            own = weight[k] * by_depth[k, axis]
-            for i in range(6):
-                rows_of[axis, i], rows_of[axis, 6 + i] = by_camera[k, axis, i], by_host[k, axis, i]
-            for i in range(lens):
-                rows_of[axis, 12 + i] = by_lens[k, axis, i]
-            for i in range(12 + lens):
-                weighed[axis, i] = weight[k] * rows_of[axis, i]
-            h[point[k]] += own * by_depth[k, axis]
-            g[point[k]] += own * error[k, axis]
-        for i in range(12 + lens):
-            one, other, at = weighed[0, i], weighed[1, i], touched[i]
-            E[point[k], at] += one * by_depth[k, 0] + other * by_depth[k, 1]
-            b[at] += one * error[k, 0] + other * error[k, 1]
-            for j in range(i, 12 + lens):
-                A[at, touched[j]] += one * rows_of[0, j] + other * rows_of[1, j]
-    # Of each pair of unknowns one product was added; an observer is never the host.
-    for i in range(size):
-        for j in range(i):
-            A[i, j] += A[j, i]
-            A[j, i] = A[i, j]
-    return A, b, E, h, g
-
-
-def with_points(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> State:
+def with_points(problem: BundleProblem, state: State, moved: Moved | None = None) -> State:
     """Return the state with the points where all observations place them, keyframes and motion of tissue held."""
-    points, number = problem.points, problem.observations.point
     for _ in range(_POINT_STEPS):
-        seen = reproject(problem, state, moved)
-        by_depth, weight = jacobians(problem, state, seen)[2], weights(state, seen)
-        h, g = (np.bincount(number, weight * (by_depth * by).sum(1), len(points.host)) for by in (by_depth, seen.error))
-        off = state.log_depth - points.log_depth - state.log_scale[points.host]
-        held = cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2
+        h, g = _by_points(problem, state, moved)
+        off, held, _ = held_depths(problem, state)
         step = -(g + held * off) / (h + held)
         state = state._replace(log_depth=state.log_depth - np.log(np.clip(1 - step, *_INVERSE_DEPTH_STEP)))
     return state
 
 
-def log_depth_sigma(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> np.ndarray:
+def log_depth_sigma(problem: BundleProblem, state: State, moved: Moved | None = None) -> np.ndarray:
     """Return the standard deviation of ln depth (P,) by the observations alone; infinite without any."""
-    seen = reproject(problem, state, moved)
-    by_depth = jacobians(problem, state, seen)[2]
-    information = weights(state, seen) * (by_depth**2).sum(1)
     with np.errstate(divide="ignore"):
-        return 1 / np.sqrt(np.bincount(problem.observations.point, information, len(state.log_depth)))
+        return 1 / np.sqrt(_by_points(problem, state, moved)[0])
+
+
+def _by_points(problem: BundleProblem, state: State, moved: Moved | None) -> np.ndarray:
+    """Return the second and the first derivatives (2, P) of the observations by ln depth of the points."""
+    found, number = np.zeros((2, len(problem.points.host))), problem.observations.point
+    for points in problem.parts:
+        seen = reproject(problem, state, points, moved)
+        by_depth, weight = jacobians(problem, state, seen)[2], weights(state, seen)
+        own, count = number[problem.seen(points)] - points.start, points.stop - points.start
+        for row, by in zip(found, (by_depth, seen.error), strict=True):
+            row[points] = np.bincount(own, weight * (by_depth * by).sum(1), count)
+    return found
 
 
 def _adjoint(T: np.ndarray) -> np.ndarray:

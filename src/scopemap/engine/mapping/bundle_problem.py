@@ -6,8 +6,10 @@ keyframe t observes it at project(T_t T_h^-1 exp(u_p) ray_p).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +17,7 @@ import numpy as np
 from scopemap.engine.geometry.se3 import inverse
 
 _LEAST_Z = 1e-3  # guard: points nearer to the camera's plane, over their distance, are behind it
+_AT_ONCE = 20_000  # guard: observations whose derivatives are in memory at once, 1 kB each
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,15 @@ class Observations:
     point: np.ndarray
     keyframe: np.ndarray
     pixel: np.ndarray
+
+    @property
+    def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All three."""
+        return self.point, self.keyframe, self.pixel
+
+
+Moved = Callable[[slice], np.ndarray]
+"""Returns by how much (n, 3) mm the points of some observations have moved in the world since their hosts saw them."""
 
 
 class Priors(NamedTuple):
@@ -89,12 +101,29 @@ class BundleProblem:
         pairs, which = np.unique(host * count + self.observations.keyframe, return_inverse=True)
         return pairs, which
 
+    @cached_property
+    def first_seen(self) -> np.ndarray:
+        """First observation of each point, and their number (P + 1,)."""
+        first: np.ndarray = np.searchsorted(self.observations.point, np.arange(len(self.points.host) + 1))
+        return first
+
+    @cached_property
+    def parts(self) -> list[slice]:
+        """The points, in parts that are observed so often that the derivatives of one are in memory."""
+        inner = np.searchsorted(self.first_seen, np.arange(_AT_ONCE, self.first_seen[-1], _AT_ONCE))
+        ends = np.unique(np.concatenate([[0], inner, [len(self.points.host)]])).tolist()
+        return [slice(*both) for both in pairwise(ends)]
+
+    def seen(self, points: slice) -> slice:
+        """Return the observations of successive points."""
+        return slice(*self.first_seen[[points.start, points.stop]].tolist())
+
     @property
     def begin(self) -> State:
         """The state to begin with: `start`, or as tracked."""
         return self.tracked if self.start is None else self.start
 
-    @property
+    @cached_property
     def unit_mm(self) -> float:
         """Typical depth, the unit of translations."""
         return self.points.median_mm
@@ -119,35 +148,54 @@ class State(NamedTuple):
     sigma_px: float = float("nan")
 
 
+class Errors(NamedTuple):
+    """Errors of all observations (N, 2) px, 0 behind the camera, and which are ahead of it (N,) bool."""
+
+    error: np.ndarray
+    ahead: np.ndarray
+
+
 class Reprojection(NamedTuple):
-    """Errors of all observations, and what their derivatives need."""
+    """Errors of n observations as in `Errors`, and what their derivatives need."""
 
-    error: np.ndarray  # (N, 2) px, 0 behind the camera
-    ahead: np.ndarray  # (N,) bool
-    point: np.ndarray  # (N, 3) in the observing camera
-    in_host: np.ndarray  # (N, 3) in the host's
-    R: np.ndarray  # (N, 3, 3) from the host to the observing camera
-    pixel: np.ndarray  # (N, 2) px from the principal point
+    error: np.ndarray  # (n, 2) px
+    ahead: np.ndarray  # (n,) bool
+    point: np.ndarray  # (n, 3) in the observing camera
+    in_host: np.ndarray  # (n, 3) in the host's
+    R: np.ndarray  # (n, 3, 3) from the host to the observing camera
+    pixel: np.ndarray  # (n, 2) px from the principal point
 
 
-def reproject(problem: BundleProblem, state: State, moved: np.ndarray | None = None) -> Reprojection:
-    """Return where the points of a state are projected, against where they were observed.
+def reprojection_errors(problem: BundleProblem, state: State, moved: Moved | None = None) -> Errors:
+    """Return the errors of all observations; moved : as `reproject` takes it."""
+    error, ahead = np.zeros((len(problem.observations.point), 2)), np.zeros(len(problem.observations.point), bool)
+    for points in problem.parts:
+        some = problem.seen(points)
+        error[some], ahead[some] = reproject(problem, state, points, moved)[:2]
+    return Errors(error, ahead)
 
-    moved : (N, 3) mm, by how much a point has moved in the world when it is observed; None: tissue is rigid.
+
+def reproject(problem: BundleProblem, state: State, points: slice, moved: Moved | None = None) -> Reprojection:
+    """Return where some points of a state are projected, against where they were observed.
+
+    moved : None where tissue is rigid.
     """
-    points, observations, T = problem.points, problem.observations, state.T_camera_world
-    focal = np.exp(state.lens[0])
-    rays = np.column_stack([(points.pixel - state.lens[1:]) / focal, np.ones(len(points.host))])
-    in_host = (np.exp(state.log_depth)[:, None] * rays)[observations.point]
-    pairs, which = problem.pairs
+    some, T, focal = problem.seen(points), state.T_camera_world, np.exp(state.lens[0])
+    number, observer, seen_at = (part[some] for part in problem.observations.columns)
+    pixel = (problem.points.pixel[points] - state.lens[1:]) / focal
+    rays = np.column_stack([pixel, np.ones(len(pixel))])
+    in_host = (np.exp(state.log_depth[points])[:, None] * rays)[number - points.start]
+    pairs, which = problem.pairs[0], problem.pairs[1][some]
+    least = int(which.min(initial=len(pairs)))  # pairs are sorted by host, too
+    pairs, which = pairs[least : which.max(initial=0) + 1], which - least
     between = T[pairs % len(T)] @ inverse(T)[pairs // len(T)]
     R = between[which, :3, :3]
     seen = np.einsum("nij,nj->ni", R, in_host) + between[which, :3, 3]
     if moved is not None:
-        seen += np.einsum("nij,nj->ni", T[observations.keyframe, :3, :3], moved)
+        seen += np.einsum("nij,nj->ni", T[observer, :3, :3], moved(some))
     ahead = seen[:, 2] > _LEAST_Z * np.linalg.norm(seen, axis=1)
     pixel = focal * seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
-    error = np.where(ahead[:, None], pixel - (observations.pixel - state.lens[1:]), 0.0)
+    error = np.where(ahead[:, None], pixel - (seen_at - state.lens[1:]), 0.0)
     return Reprojection(error, ahead, seen, in_host, R, pixel)
 
 
@@ -165,7 +213,7 @@ def jacobians(
     by_point[:, :, 2] = -seen.pixel / z[:, None]
     by_lens = np.zeros((len(z), 2, 0))
     if problem.lens_sigma is not None:
-        in_host = problem.points.pixel[problem.observations.point] - state.lens[1:]
+        in_host = focal * seen.in_host[:, :2] / seen.in_host[:, 2:]
         by_corner = (by_point @ seen.R)[..., :2] * (seen.in_host[:, 2] / focal)[:, None, None]
         by_focal = seen.pixel[..., None] - by_corner @ in_host[..., None]
         by_lens = np.concatenate([by_focal, np.eye(2) - by_corner], -1)

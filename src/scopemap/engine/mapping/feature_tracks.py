@@ -212,20 +212,23 @@ class FeatureTracks:
         new_number = np.full(self.keyframe_count, -1)
         chosen = range(self.keyframe_count) if keyframes is None else keyframes
         new_number[list(chosen)] = np.arange(len(chosen))
-        points, matches = self._points.read(), self._matches.read()
-        point, keyframe = matches["point"], new_number[matches["keyframe"]]
+        points = self._points.read()
         host = new_number[points["host"]]
         by_host = np.argsort(host, kind="stable")[np.count_nonzero(host < 0) :]
         if most_observations is not None:
-            found = np.count_nonzero((host[point] >= 0) & (keyframe >= 0))
+            found = sum(len(_among(part, host, new_number)) for part in self._matches.parts())
             by_host = by_host[:: max(-(-found // most_observations), 1)]
         place = np.full(len(host), -1)
         place[by_host] = np.arange(len(by_host))
-        order = np.argsort(place[point], kind="stable")
-        order = order[(place[point] >= 0)[order] & (keyframe >= 0)[order]]
+        matches = np.concatenate(
+            [np.zeros(0, _MATCH), *(_among(part, place, new_number) for part in self._matches.parts())]
+        )
+        matches = matches[np.argsort(place[matches["point"]], kind="stable")]
         pixel, log_depth, sigma = (points[name][by_host] for name in ("pixel", "log_depth", "sigma"))
-        observed = Observations(place[point][order], keyframe[order], self._centred(matches["pixel"][order]))
-        return Points(host[by_host], pixel, log_depth, sigma), observed
+        point, keyframe = place[matches["point"]], new_number[matches["keyframe"]]
+        return Points(host[by_host], pixel, log_depth, sigma), Observations(
+            point, keyframe, self._centred(matches["pixel"])
+        )
 
     def keep_last(self, count: int) -> None:
         """Forget the points of all keyframes but the last `count`, not fewer than are matched with the next one."""
@@ -260,6 +263,12 @@ class FeatureTracks:
             return pixel
         centred: np.ndarray = (pixel - [camera.cx, camera.cy]) * [1.0, camera.fx / camera.fy]
         return centred
+
+
+def _among(matches: np.ndarray, place: np.ndarray, new_number: np.ndarray) -> np.ndarray:
+    """Return the observations of points with a place (P,), not -1, in keyframes with a new number (K,)."""
+    chosen: np.ndarray = matches[(place[matches["point"]] >= 0) & (new_number[matches["keyframe"]] >= 0)]
+    return chosen
 
 
 def _matched(host: _FlowKeyframe, other: _FlowKeyframe, flows: FlowPair) -> tuple[np.ndarray, np.ndarray]:

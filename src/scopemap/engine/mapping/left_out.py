@@ -8,7 +8,14 @@ import numpy as np
 
 from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.mapping.bundle_adjustment import with_points
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, State, reproject
+from scopemap.engine.mapping.bundle_problem import (
+    BundleProblem,
+    Moved,
+    Observations,
+    Points,
+    State,
+    reprojection_errors,
+)
 
 _RESCALINGS = 3  # by hand: of the robust standard deviation
 
@@ -26,14 +33,14 @@ def part_of(problem: BundleProblem, chosen: np.ndarray) -> BundleProblem:
     )
 
 
-def placed(part: BundleProblem, keyframes: State, moved: np.ndarray | None = None) -> State:
+def placed(part: BundleProblem, keyframes: State, moved: Moved | None = None) -> State:
     """Return the state of points that their own observations place in the keyframes of a solution.
 
     moved : as `reproject` takes it.
     """
     state = keyframes._replace(log_depth=part.points.log_depth + keyframes.log_scale[part.points.host])
     for _ in range(_RESCALINGS):
-        seen = reproject(part, state, moved)
+        seen = reprojection_errors(part, state, moved)
         sigma_px = robust_sigma_2d(np.linalg.norm(seen.error, axis=1), part.least_sigma_px)
         state = with_points(part, state._replace(sigma_px=sigma_px), moved)
     return state

@@ -108,7 +108,7 @@ def lens_evidence(problem: BundleProblem, solution: State) -> LensEvidence | Non
     free = replace(_loosely(problem), start=solution, lens_sigma=_RESIDUAL_SIGMA * unit)
     state = adjust(free, max_iterations=_ITERATIONS, min_decrease=_MIN_DECREASE).state
     try:
-        covariance = np.linalg.pinv(linearised(free, state).reduced()[0], hermitian=True)[-3:, -3:]
+        covariance = np.linalg.pinv(linearised(free, state).matrix, hermitian=True)[-3:, -3:]
         information = np.linalg.inv(covariance / np.outer(unit, unit))
     except np.linalg.LinAlgError:
         return None

@@ -20,7 +20,7 @@ import numpy as np
 from scopemap.engine.geometry.se3 import inverse, orthonormalised
 from scopemap.engine.geometry.skinning import skin_of
 from scopemap.engine.mapping.bundle_adjustment import BundleSolution, errors_px, log_depth_sigma, with_points
-from scopemap.engine.mapping.bundle_problem import BundleProblem, State, reproject
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Moved, State, reprojection_errors
 from scopemap.engine.mapping.deformation_graph import (
     Deformation,
     MotionPrior,
@@ -209,15 +209,13 @@ def _compared(part: BundleProblem, rigid: State, state: NonRigidState, nodes: _N
     if len(part.observations.point) < _LEAST_LEFT_OUT:
         return None
     moving = _problem(part, nodes, state.basis, _ONE_CURVE).moved(state.modes, state.basis)
-    (rigid_px, rigid_wrong), (px, wrong) = (
-        _errors(part, keyframes, moved) for keyframes, moved in ((rigid, np.zeros_like(moving)), (state.rigid, moving))
-    )
+    (rigid_px, rigid_wrong), (px, wrong) = _errors(part, rigid, None), _errors(part, state.rigid, moving)
     return LeftOutTracks(rigid_px, px, rigid_wrong, wrong)
 
 
-def _errors(part: BundleProblem, keyframes: State, moved: np.ndarray) -> tuple[float, float]:
+def _errors(part: BundleProblem, keyframes: State, moved: Moved | None) -> tuple[float, float]:
     """Return root mean square, px, and share above 2 px of the errors of points placed by their own observations."""
-    seen = reproject(part, placed(part, keyframes, moved), moved)
+    seen = reprojection_errors(part, placed(part, keyframes, moved), moved)
     lengths_px = np.where(seen.ahead, np.minimum(np.linalg.norm(seen.error, axis=1), _FALSE_PX), _FALSE_PX)
     return float(np.sqrt((lengths_px**2).mean())), float((lengths_px > _WRONG_PX).mean())
 
