@@ -139,6 +139,8 @@ class Odometry:
 
     def _refine(self, preprocessed: PreprocessedFrame, T_current_previous: np.ndarray | None) -> RefinedDepth:
         raw = preprocessed.small
+        if preprocessed.anchored:
+            self._mapis.rescale(1.0)  # a metric depth starts a new chain of scales
         return self._mapis.refine(
             np.asarray(raw.depth_mm),
             preprocessed.kind,
@@ -146,7 +148,7 @@ class Odometry:
             preprocessed.correspondence,
             T_current_previous,
             sigma_mm=raw.depth_sigma_mm,
-            anchored=preprocessed.anchored,
+            propagated=preprocessed.propagated,
         )
 
     def _reset(self) -> None:
@@ -169,7 +171,9 @@ class Odometry:
         """
         if track.status == "lost":
             return track, frame
-        kind, due, number = preprocessed.kind, self._tracker.needs_keyframe(), track.keyframe
+        # Many frames are tracked against a keyframe, so it waits for one that the network looks at.
+        waits = preprocessed.propagated and track.status != "initial"
+        kind, due, number = preprocessed.kind, self._tracker.needs_keyframe() and not waits, track.keyframe
         keyframe, matches, step = replace(frame, T_world_camera=track.T_world_camera), None, None
         if self._local is not None and kind != "measured":
             if due:

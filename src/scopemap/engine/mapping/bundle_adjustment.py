@@ -148,15 +148,26 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     if not len(problem.observations.point) or len(problem.T_camera_world) < 2:
         return BundleSolution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
 
+    # Where only the kernel's scale changes, the errors do not.
+    found_at: tuple[np.ndarray, Errors] | None = None
+
+    def seen_at(state: State) -> Errors:
+        nonlocal found_at
+        if found_at is None or found_at[0] is not state.log_depth:
+            found_at = state.log_depth, reprojection_errors(problem, state)
+        return found_at[1]
+
     def rescaled(state: State) -> State:
-        reprojection = reprojection_errors(problem, state)
-        lengths = np.linalg.norm(reprojection.error[reprojection.ahead], axis=1)
+        seen = seen_at(state)
+        lengths = np.linalg.norm(seen.error[seen.ahead], axis=1)
         return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
 
     options = least_squares.Options(np.inf, max_iterations, min_step=0.0, min_decrease=min_decrease)
-    search = least_squares.Problem(partial(linearised, problem), partial(retract, problem), rescaled)
+    search = least_squares.Problem(
+        lambda state: linearised(problem, state, seen_at(state)), partial(retract, problem), rescaled
+    )
     found = minimise(search, rescaled(start), options)
-    state = found.state._replace(T_camera_world=np.stack([orthonormalised(T) for T in found.state.T_camera_world]))
+    state = found.state._replace(T_camera_world=orthonormalised(found.state.T_camera_world))
     if problem.correlated > 1:
         state = with_points(problem, state)
     return BundleSolution(state, log_depth_sigma(problem, state), found.iterations)
@@ -175,10 +186,13 @@ def weights(state: State, seen: Errors | Reprojection) -> np.ndarray:
     return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, CAUCHY)[1], 0) / state.sigma_px**2
 
 
-def linearised(problem: BundleProblem, state: State) -> ReducedModel:
-    """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points."""
+def linearised(problem: BundleProblem, state: State, seen: Errors | None = None) -> ReducedModel:
+    """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points.
+
+    seen : the errors of the observations, where they are known.
+    """
     count, lens = len(state.T_camera_world), 0 if problem.lens_sigma is None else 3
-    seen, edges = reprojection_errors(problem, state), odometry_edges(problem, state)
+    seen, edges = seen or reprojection_errors(problem, state), odometry_edges(problem, state)
     held = [6 + PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
     held += [np.arange(6), np.arange(PER_KEYFRAME * problem.held)]
     unknowns = PER_KEYFRAME * count + lens
@@ -204,7 +218,7 @@ def held_depths(problem: BundleProblem, state: State) -> tuple[np.ndarray, np.nd
 def derivatives(problem: BundleProblem, state: State, points: slice, moved: Moved | None = None) -> Linear:
     """Return the derivatives of the observations of some points by the keyframes and the lens."""
     seen = reproject(problem, state, points, moved)
-    by_camera, by_host, by_depth, by_lens = jacobians(problem, state, seen)
+    by_camera, by_host, by_depth, by_lens = jacobians(problem, state, points, seen)
     number, observer, _ = (part[problem.seen(points)] for part in problem.observations.columns)
     first = PER_KEYFRAME * np.column_stack([observer, problem.points.host[number]])
     of_lens = PER_KEYFRAME * len(state.T_camera_world) + np.tile(np.arange(by_lens.shape[2]), (len(number), 1))
@@ -213,13 +227,13 @@ def derivatives(problem: BundleProblem, state: State, points: slice, moved: Move
     return Linear(columns, by, by_depth, seen.error, weights(state, seen) / problem.correlated)
 
 
-def cost(problem: BundleProblem, state: State, seen: Errors, edges: list[OdometryEdge]) -> float:
+def cost(problem: BundleProblem, state: State, seen: Errors, edges: OdometryEdges) -> float:
     """Return what is minimised, at a state."""
     points, priors = problem.points, problem.priors
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
     depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
     cost = cauchy(square, CAUCHY)[0].sum() / problem.correlated + cauchy(depth**2, CAUCHY)[0].sum()
-    cost += 0.5 * sum(float(edge.error @ (edge.information * edge.error)) for edge in edges)
+    cost += 0.5 * (edges.information * edges.error**2).sum()
     if priors.scale > 0:
         cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
     if problem.lens_sigma is not None:
@@ -227,40 +241,42 @@ def cost(problem: BundleProblem, state: State, seen: Errors, edges: list[Odometr
     return float(cost)
 
 
-class OdometryEdge(NamedTuple):
-    """Deviation of two keyframes from the tracked motion between them."""
+class OdometryEdges(NamedTuple):
+    """Deviations of C pairs of keyframes from the tracked motion between them.
 
-    i: int
-    j: int
-    error: np.ndarray  # (6,) twist
-    information: np.ndarray  # (6,)
+    pairs : (C, 2). error : (C, 6) twists. information : (6,) of each.
+    """
+
+    pairs: np.ndarray
+    error: np.ndarray
+    information: np.ndarray
 
 
-def odometry_edges(problem: BundleProblem, state: State) -> list[OdometryEdge]:
+def odometry_edges(problem: BundleProblem, state: State) -> OdometryEdges:
     """Deviations from the tracked motion between neighbours."""
     priors, tracked, T = problem.priors, problem.T_camera_world, state.T_camera_world
     information = np.repeat([priors.rotation_rad, priors.translation_share * problem.unit_mm], 3) ** -2.0
-    return [
-        OdometryEdge(i, j, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
-        for i, j in problem.neighbours
-    ]
+    pairs = problem.neighbours.reshape(-1, 2)
+    i, j = pairs.T
+    return OdometryEdges(pairs, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
 
 
-def camera_priors(problem: BundleProblem, state: State, edges: list[OdometryEdge]) -> list[Prior]:
+def camera_priors(problem: BundleProblem, state: State, edges: OdometryEdges) -> list[Prior]:
     """Return the normal equations of the priors of keyframes, and of the lens."""
-    T, unit, blocks = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), []
-    for i, j, error, information in edges:
-        own = np.append(PER_KEYFRAME * i + np.arange(6), PER_KEYFRAME * j + np.arange(6))
-        J = np.hstack([-_adjoint(T[j] @ inverse(T[i])), np.eye(6)]) * np.tile(unit, 2)
-        blocks.append(Prior(own, J.T @ (information[:, None] * J), J.T @ (information * error)))
+    T, unit, (i, j) = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), edges.pairs.T
+    own = PER_KEYFRAME * np.repeat(edges.pairs, 6, axis=1) + np.tile(np.arange(6), 2)
+    by_i = -_adjoint(T[j] @ inverse(T[i]))
+    J = np.concatenate([by_i, np.broadcast_to(np.eye(6), by_i.shape)], -1) * np.tile(unit, 2)
+    weighted = J.swapaxes(1, 2) * edges.information
+    priors = list(map(Prior, own, weighted @ J, (weighted @ edges.error[..., None])[..., 0]))
     if problem.priors.scale > 0:
         information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + PER_KEYFRAME * np.arange(len(T))
-        blocks.append(Prior(own, np.diag(information), information * state.log_scale))
+        priors.append(Prior(own, np.diag(information), information * state.log_scale))
     if problem.lens_sigma is not None:
         information, own = problem.lens_sigma**-2.0, PER_KEYFRAME * len(T) + np.arange(3)
         change = state.lens - problem.tracked.lens
-        blocks.append(Prior(own, np.diag(information), information * change))
-    return blocks
+        priors.append(Prior(own, np.diag(information), information * change))
+    return priors
 
 
 def with_points(problem: BundleProblem, state: State, moved: Moved | None = None) -> State:
@@ -284,7 +300,7 @@ def _by_points(problem: BundleProblem, state: State, moved: Moved | None) -> np.
     found, number = np.zeros((2, len(problem.points.host))), problem.observations.point
     for points in problem.parts:
         seen = reproject(problem, state, points, moved)
-        by_depth, weight = jacobians(problem, state, seen)[2], weights(state, seen)
+        by_depth, weight = jacobians(problem, state, points, seen)[2], weights(state, seen)
         own, count = number[problem.seen(points)] - points.start, points.stop - points.start
         for row, by in zip(found, (by_depth, seen.error), strict=True):
             row[points] = np.bincount(own, weight * (by_depth * by).sum(1), count)
@@ -292,10 +308,10 @@ def _by_points(problem: BundleProblem, state: State, moved: Moved | None) -> np.
 
 
 def _adjoint(T: np.ndarray) -> np.ndarray:
-    """Adjoint (6, 6) of a pose for twists of rotation first."""
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = T[:3, :3]
-    adjoint[3:, :3] = hat(T[:3, 3]) @ T[:3, :3]
+    """Adjoints (..., 6, 6) of poses for twists of rotation first."""
+    adjoint = np.zeros((*T.shape[:-2], 6, 6))
+    adjoint[..., :3, :3] = adjoint[..., 3:, 3:] = T[..., :3, :3]
+    adjoint[..., 3:, :3] = hat(T[..., :3, 3]) @ T[..., :3, :3]
     return adjoint
 
 
@@ -304,7 +320,7 @@ def retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
     count = PER_KEYFRAME * len(state.T_camera_world)
     own = step[:count].reshape(-1, PER_KEYFRAME)
     twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
-    T = np.stack([se3_exp(twist) @ pose for twist, pose in zip(twists, state.T_camera_world, strict=True)])
+    T = se3_exp(twists) @ state.T_camera_world
     lens = state.lens if problem.lens_sigma is None else state.lens + step[count : count + 3]
     by_points = step[len(step) - len(state.log_depth) :]
     log_depth = state.log_depth - np.log(np.clip(1 - by_points, *_INVERSE_DEPTH_STEP))

@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from scopemap.engine.geometry.se3 import inverse
 
@@ -34,7 +35,7 @@ class Points:
     log_depth: np.ndarray
     sigma: np.ndarray
 
-    @property
+    @cached_property
     def median_mm(self) -> float:
         """Median of the estimated depths, mm."""
         return float(np.exp(np.median(self.log_depth)))
@@ -156,14 +157,21 @@ class Errors(NamedTuple):
 
 
 class Reprojection(NamedTuple):
-    """Errors of n observations as in `Errors`, and what their derivatives need."""
+    """Errors of n observations as in `Errors`, and what their derivatives need.
 
-    error: np.ndarray  # (n, 2) px
-    ahead: np.ndarray  # (n,) bool
-    point: np.ndarray  # (n, 3) in the observing camera
-    in_host: np.ndarray  # (n, 3) in the host's
-    R: np.ndarray  # (n, 3, 3) from the host to the observing camera
-    pixel: np.ndarray  # (n, 2) px from the principal point
+    seen : (n, 3) points in the observing camera. pixel : (n, 2) px, from the principal point. in_host : (p, 3) points
+    in their hosts' cameras, point : (n,) which of them is observed. between : (q, 4, 4) motions from a host to an
+    observing camera, pair : (n,) which of them applies.
+    """
+
+    error: np.ndarray
+    ahead: np.ndarray
+    seen: np.ndarray
+    pixel: np.ndarray
+    in_host: np.ndarray
+    point: np.ndarray
+    between: np.ndarray
+    pair: np.ndarray
 
 
 def reprojection_errors(problem: BundleProblem, state: State, moved: Moved | None = None) -> Errors:
@@ -180,50 +188,92 @@ def reproject(problem: BundleProblem, state: State, points: slice, moved: Moved 
 
     moved : None where tissue is rigid.
     """
-    some, T, focal = problem.seen(points), state.T_camera_world, np.exp(state.lens[0])
-    number, observer, seen_at = (part[some] for part in problem.observations.columns)
-    pixel = (problem.points.pixel[points] - state.lens[1:]) / focal
-    rays = np.column_stack([pixel, np.ones(len(pixel))])
-    in_host = (np.exp(state.log_depth[points])[:, None] * rays)[number - points.start]
+    some, T, focal = problem.seen(points), state.T_camera_world, float(np.exp(state.lens[0]))
+    number, observer, pixel = (part[some] for part in problem.observations.columns)
+    rays = np.column_stack([_corners(problem, state, points) / focal, np.ones(points.stop - points.start)])
+    in_host, point = np.exp(state.log_depth[points])[:, None] * rays, number - points.start
     pairs, which = problem.pairs[0], problem.pairs[1][some]
     least = int(which.min(initial=len(pairs)))  # pairs are sorted by host, too
-    pairs, which = pairs[least : which.max(initial=0) + 1], which - least
+    pairs, pair = pairs[least : which.max(initial=0) + 1], which - least
     between = T[pairs % len(T)] @ inverse(T)[pairs // len(T)]
-    R = between[which, :3, :3]
-    seen = np.einsum("nij,nj->ni", R, in_host) + between[which, :3, 3]
-    if moved is not None:
-        seen += np.einsum("nij,nj->ni", T[observer, :3, :3], moved(some))
-    ahead = seen[:, 2] > _LEAST_Z * np.linalg.norm(seen, axis=1)
-    pixel = focal * seen[:, :2] / np.where(ahead, seen[:, 2], 1.0)[:, None]
-    error = np.where(ahead[:, None], pixel - (seen_at - state.lens[1:]), 0.0)
-    return Reprojection(error, ahead, seen, in_host, R, pixel)
+    shift = np.zeros((0, 3)) if moved is None else np.einsum("nij,nj->ni", T[observer, :3, :3], moved(some))
+    observed = pixel - state.lens[1:]
+    error, ahead, seen, projected = _projected(between, pair, in_host, point, observed, shift, focal)
+    return Reprojection(error, ahead, seen, projected, in_host, point, between, pair)
 
 
 def jacobians(
-    problem: BundleProblem, state: State, seen: Reprojection
+    problem: BundleProblem, state: State, points: slice, at: Reprojection
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the derivatives of pixels by twists of the observing camera and of the host (N, 2, 6), ln depth and lens.
+    """Return the derivatives of pixels by twists of the observing camera and of the host (n, 2, 6), ln depth and lens.
 
-    By ln depth (N, 2); by the lens (N, 2, 3), (N, 2, 0) where it is known. Translations are in units of the typical
-    depth.
+    By ln depth (n, 2); by the lens (n, 2, 3), (n, 2, 0) where it is known. Translations are in units of the typical
+    depth. at : what `reproject` returned for these points.
     """
-    focal, z = np.exp(state.lens[0]), np.where(seen.ahead, seen.point[:, 2], 1.0)
-    by_point = np.zeros((len(z), 2, 3))
-    by_point[:, 0, 0] = by_point[:, 1, 1] = focal / z
-    by_point[:, :, 2] = -seen.pixel / z[:, None]
-    by_lens = np.zeros((len(z), 2, 0))
-    if problem.lens_sigma is not None:
-        in_host = focal * seen.in_host[:, :2] / seen.in_host[:, 2:]
-        by_corner = (by_point @ seen.R)[..., :2] * (seen.in_host[:, 2] / focal)[:, None, None]
-        by_focal = seen.pixel[..., None] - by_corner @ in_host[..., None]
-        by_lens = np.concatenate([by_focal, np.eye(2) - by_corner], -1)
-    by_host = by_point @ seen.R
-    by_depth = np.einsum("nij,nj->ni", by_host, seen.in_host)
-    unit_mm = problem.unit_mm
-    return _by_twist(by_point, seen.point, unit_mm), -_by_twist(by_host, seen.in_host, unit_mm), by_depth, by_lens
+    lens = 0 if problem.lens_sigma is None else 3
+    corners, focal = _corners(problem, state, points), float(np.exp(state.lens[0]))
+    return _derivatives(at, corners, focal, problem.unit_mm, lens)
 
 
-def _by_twist(by_point: np.ndarray, points: np.ndarray, unit_mm: float) -> np.ndarray:
-    """Derivative (N, 2, 6) by a twist (rotation, translation) of points (N, 3), from that by the points (N, 2, 3)."""
-    # d(exp(w) X)/dw = -hat(X), and a row vector times -hat(X) is the cross product X x row.
-    return np.concatenate([np.cross(points[:, None], by_point), unit_mm * by_point], -1)
+def _corners(problem: BundleProblem, state: State, points: slice) -> np.ndarray:
+    """Return the pixels (p, 2) of some points in their hosts, from the principal point of a state."""
+    pixels: np.ndarray = problem.points.pixel[points] - state.lens[1:]
+    return pixels
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _projected(between, pair, in_host, point, observed, shift, focal):  # type: ignore[no-untyped-def]
+    """Return error, ahead, seen and pixel of a `Reprojection`; observed : (n, 2); shift : of `seen`, (0, 3): none."""
+    count = len(point)
+    error, pixel, seen = np.zeros((count, 2)), np.empty((count, 2)), np.empty((count, 3))
+    ahead = np.zeros(count, np.bool_)
+    for n in range(count):
+        q, p, square = pair[n], point[n], 0.0
+        for i in range(3):
+            place = between[q, i, 3]
+            for j in range(3):
+                place += between[q, i, j] * in_host[p, j]
+            if len(shift):
+                place += shift[n, i]
+            seen[n, i] = place
+            square += place * place
+        ahead[n] = seen[n, 2] > _LEAST_Z * np.sqrt(square)
+        z = seen[n, 2] if ahead[n] else 1.0
+        for i in range(2):
+            pixel[n, i] = focal * seen[n, i] / z
+            if ahead[n]:
+                error[n, i] = pixel[n, i] - observed[n, i]
+    return error, ahead, seen, pixel
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _derivatives(at, corners, focal, unit_mm, lens):  # type: ignore[no-untyped-def]
+    """Return what `jacobians` does; corners : (p, 2) of the points, px from the principal point. lens : 3, 0: known."""
+    count, row, turned, X = len(at.point), np.zeros(3), np.zeros(3), np.zeros(3)
+    by_camera, by_host = np.empty((count, 2, 6)), np.empty((count, 2, 6))
+    by_depth, by_lens = np.zeros((count, 2)), np.empty((count, 2, lens))
+    for n in range(count):
+        z = at.seen[n, 2] if at.ahead[n] else 1.0
+        q, p = at.pair[n], at.point[n]
+        for j in range(3):
+            X[j] = at.in_host[p, j]
+        for axis in range(2):
+            # By the point in the observing camera, and in the host's.
+            row[0], row[1], row[2] = 0.0, 0.0, -at.pixel[n, axis] / z
+            row[axis] = focal / z
+            for j in range(3):
+                turned[j] = row[0] * at.between[q, 0, j] + row[1] * at.between[q, 1, j] + row[2] * at.between[q, 2, j]
+                by_depth[n, axis] += turned[j] * X[j]
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                # d(exp(w) X)/dw = -hat(X), and a row vector times -hat(X) is the cross product X x row.
+                by_camera[n, axis, i] = at.seen[n, j] * row[k] - at.seen[n, k] * row[j]
+                by_host[n, axis, i] = turned[j] * X[k] - turned[k] * X[j]
+                by_camera[n, axis, 3 + i], by_host[n, axis, 3 + i] = unit_mm * row[i], -unit_mm * turned[i]
+            if lens:
+                scale = X[2] / focal
+                by_lens[n, axis, 0] = at.pixel[n, axis]
+                for j in range(2):
+                    by_lens[n, axis, 0] -= scale * turned[j] * corners[p, j]
+                    by_lens[n, axis, 1 + j] = (1.0 if j == axis else 0.0) - scale * turned[j]
+    return by_camera, by_host, by_depth, by_lens

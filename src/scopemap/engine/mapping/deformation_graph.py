@@ -11,7 +11,6 @@ manipulation", SIGGRAPH 2007, with translations alone.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -157,9 +156,7 @@ def camera_without_curve(
     twist = _common_twist(T_world_camera, time_s, curve_change, nodes, mode / size_mm, size_mm)
     T_world_centre = np.eye(4)
     T_world_centre[:3, 3] = centre
-    T_world_world = np.stack(
-        [T_world_centre @ se3_exp(change * twist) @ inverse(T_world_centre) for change in curve_change]
-    )
+    T_world_world = T_world_centre @ se3_exp(curve_change[:, None] * twist) @ inverse(T_world_centre)
     return T_world_world, mode + np.cross(twist[:3], nodes - centre) + twist[3:]
 
 
@@ -188,16 +185,14 @@ def _common_twist(
     root_s = np.sqrt((gaps_s[1:] + gaps_s[:-1]) / 2)[:, None]
     acceleration = np.diff(velocity, axis=0) / root_s  # (K - 2, K), takes values at the keyframes to it
     R, position, centre = T_world_camera[:, :3, :3], T_world_camera[:, :3, 3], nodes.mean(0)
-    angular_velocity = np.stack([so3_log(after @ before.T) for before, after in pairwise(R)])
-    angular_velocity /= gaps_s[:, None]
+    angular_velocity = so3_log(R[1:] @ R[:-1].swapaxes(1, 2)) / gaps_s[:, None]
     r_rotation, r_translation = np.diff(angular_velocity, axis=0) / root_s, acceleration @ position
     # The twist moves a camera by its rotation x (position - centre) + its translation, times the curve.
     by_translation = np.einsum("j,ab->jab", acceleration @ curve_change, np.eye(3))
-    cross = -np.stack([hat(x) for x in position - centre])
-    by_rotation = np.einsum("jk,k,kab->jab", acceleration, curve_change, cross)
+    by_rotation = np.einsum("jk,k,kab->jab", acceleration, curve_change, -hat(position - centre))
     J_rotation = np.concatenate([by_translation, np.zeros((len(acceleration), 3, 3))], axis=2)
     J_translation = np.concatenate([by_rotation, by_translation], axis=2)
-    J_nodes = np.stack([np.hstack([-hat(x), np.eye(3)]) for x in nodes - centre]) / size_mm
+    J_nodes = np.concatenate([-hat(nodes - centre), np.tile(np.eye(3), (len(nodes), 1, 1))], axis=2) / size_mm
     blocks = [(J_rotation, r_rotation), (J_translation, r_translation), (J_nodes, displacement)]
     stacked = [(J.reshape(-1, 6), r.ravel()) for J, r in blocks]
     twist = np.zeros(6)

@@ -124,7 +124,7 @@ def adjust_moving_tissue(problem: BundleProblem, rigid: State, time_s: np.ndarra
     modes = np.zeros((1, _NODES, 3))
     modes[:, nodes.moving] = state.modes
     moved = _problem(problem, nodes, state.basis, _ONE_CURVE).moved(state.modes, state.basis)
-    T = np.stack([orthonormalised(pose) for pose in state.rigid.T_camera_world])
+    T = orthonormalised(state.rigid.T_camera_world)
     final = with_points(problem, state.rigid._replace(T_camera_world=T), moved)
     motion = Deformation(_carried(place, problem, final), state.basis, modes)
     return NonRigidSolution(BundleSolution(final, log_depth_sigma(problem, final, moved), 0), motion, left_out)

@@ -28,7 +28,7 @@ from scipy.sparse.linalg import splu, spsolve
 from scipy.spatial.transform import Rotation
 
 from scopemap.engine.geometry.least_squares import Options, Problem, cauchy, minimise
-from scopemap.engine.geometry.se3 import inverse, se3
+from scopemap.engine.geometry.se3 import hat, inverse, se3
 from scopemap.engine.mapping.frame_correction import TrackedPose
 from scopemap.engine.mapping.loop_closure import Loop
 
@@ -185,10 +185,10 @@ def optimise_pose_graph(
     for tolerance in _TOLERANCES:
         x = minimise(Problem(partial(linearise, tolerance), np.add), x, _OPTIONS).state
     R, p, s = state(x)
-    poses = [se3(rotation, depth_mm * position) for rotation, position in zip(R.as_matrix(), p, strict=True)]
+    poses = se3(R.as_matrix(), depth_mm * p)
     loop_error = np.linalg.norm(errors(x).reshape(-1, _UNKNOWNS)[len(neighbours) :], axis=1) / np.sqrt(_UNKNOWNS)
     ends = np.array([(loop.past, loop.new) for loop in loops], dtype=int).reshape(-1, 2)
-    return PoseGraph(np.stack(poses), s, ends[loop_error < _MAX_LOOP_ERROR])
+    return PoseGraph(poses, s, ends[loop_error < _MAX_LOOP_ERROR])
 
 
 def _explained_by_drift(T_world_camera: np.ndarray, loop: Loop, depth_mm: float) -> bool:
@@ -222,7 +222,7 @@ def _jacobian(edges: _Edges, R: Rotation, p: np.ndarray, s: np.ndarray, turns: n
     by_turn = np.linalg.inv(_right_jacobian(error.as_rotvec()))
     by_i, by_j = np.zeros((2, len(edges.i), _UNKNOWNS, _UNKNOWNS))
     by_i[:, :3, :3] = -by_turn @ (R[edges.j].inv() * R[edges.i]).as_matrix() @ turned[edges.i]
-    by_i[:, 3:6, :3] = _hat(seen) @ turned[edges.i]
+    by_i[:, 3:6, :3] = hat(seen) @ turned[edges.i]
     by_i[:, 3:6, 3:6] = -shrink[:, None] * to_i
     by_i[:, 3:6, 6] = -seen
     by_i[:, 6, 6] = -1
@@ -237,13 +237,8 @@ def _jacobian(edges: _Edges, R: Rotation, p: np.ndarray, s: np.ndarray, turns: n
     return (i + j).tocsr()[:, _UNKNOWNS:]  # the first keyframe is held
 
 
-def _hat(vectors: np.ndarray) -> np.ndarray:
-    """Return the matrices (N, 3, 3) whose products are the cross products with vectors (N, 3)."""
-    return np.cross(np.eye(3), vectors[:, None])
-
-
 def _right_jacobian(turns: np.ndarray) -> np.ndarray:
     """Return (N, 3, 3): exp(turn + d) is exp(turn) exp(jacobian d) to first order (Sola et al., eq. 143)."""
-    angle, K = np.maximum(np.linalg.norm(turns, axis=1), 1e-5)[:, None, None], _hat(turns)
+    angle, K = np.maximum(np.linalg.norm(turns, axis=1), 1e-5)[:, None, None], hat(turns)
     jacobian: np.ndarray = np.eye(3) - (1 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * K @ K
     return jacobian

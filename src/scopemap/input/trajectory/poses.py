@@ -30,7 +30,7 @@ def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
             f"{np.linalg.det(R[wrong[0]]):.3g}); poses must be without scale"
         )
     # Files hold six digits or so, and the inverse by transposition needs exact rotations.
-    return np.stack([orthonormalised(pose) for pose in T])
+    return orthonormalised(T)
 
 
 def from_quaternions(xyzw: np.ndarray, positions: np.ndarray, where: list[str]) -> np.ndarray:
