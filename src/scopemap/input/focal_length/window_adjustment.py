@@ -113,30 +113,32 @@ def adjusted(scene: Scene, begin: Start, most: int, min_decrease: float) -> Wind
 @njit(cache=True, nogil=True, error_model="numpy")
 def _errors(scene: Scene, state: Start) -> np.ndarray:
     """Return the reprojection errors (N, K, 2), px; NaN where not observed, infinite behind a camera."""
+    # Outside the loop: numba counts references of arrays that are read from a tuple.
+    start, seen, T, log_depth = scene.start, scene.seen, state.T, state.log_depth
     focal, b, w2 = np.exp(state.lens[0]), state.lens[1], scene.half_width_px**2
-    error = np.full(scene.seen.shape, np.nan)
-    for n in range(len(scene.start)):
-        x, y = scene.start[n]
-        bent, depth = 1 + b * (x * x + y * y) / w2, np.exp(state.log_depth[n])
+    error = np.empty_like(seen)
+    for n in range(seen.shape[0]):
+        x, y = start[n, 0], start[n, 1]
+        bent, depth = 1 + b * (x * x + y * y) / w2, np.exp(log_depth[n])
         x, y = depth * bent * x / focal, depth * bent * y / focal
-        for k in range(scene.seen.shape[1]):
-            if np.isnan(scene.seen[n, k, 0]):
-                continue
-            X, Y, Z = _moved(state.T[k], x, y, depth)
-            if _LEAST_Z * np.sqrt(X * X + Y * Y + Z * Z) >= Z:
-                error[n, k] = np.inf
-                continue
-            u, v = focal * X / Z, focal * Y / Z
-            factor = _bend(np.sqrt((u * u + v * v) / w2), b)
-            error[n, k, 0], error[n, k, 1] = factor * u - scene.seen[n, k, 0], factor * v - scene.seen[n, k, 1]
+        for k in range(seen.shape[1]):
+            X, Y, Z = _moved(T, k, x, y, depth)
+            if np.isnan(seen[n, k, 0]):
+                error[n, k, 0], error[n, k, 1] = np.nan, np.nan
+            elif _LEAST_Z * np.sqrt(X * X + Y * Y + Z * Z) >= Z:
+                error[n, k, 0], error[n, k, 1] = np.inf, np.inf
+            else:
+                u, v = focal * X / Z, focal * Y / Z
+                factor = _bend(np.sqrt((u * u + v * v) / w2), b)
+                error[n, k, 0], error[n, k, 1] = factor * u - seen[n, k, 0], factor * v - seen[n, k, 1]
     return error
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _moved(T: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    X = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-    Y = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-    return X, Y, T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+def _moved(T: np.ndarray, k: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    X = T[k, 0, 0] * x + T[k, 0, 1] * y + T[k, 0, 2] * z + T[k, 0, 3]
+    Y = T[k, 1, 0] * x + T[k, 1, 1] * y + T[k, 1, 2] * z + T[k, 1, 3]
+    return X, Y, T[k, 2, 0] * x + T[k, 2, 1] * y + T[k, 2, 2] * z + T[k, 2, 3]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -165,9 +167,9 @@ def _robust_sigma(error: np.ndarray) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cost(scene: Scene, state: Start, error: np.ndarray, sigma_px: float) -> float:
-    cost = 0.0
+    cost, log_depth, expected, sigma = 0.0, state.log_depth, scene.expected, scene.sigma
     for n in range(error.shape[0]):
-        off = (state.log_depth[n] - scene.expected[n]) / scene.sigma[n]
+        off = (log_depth[n] - expected[n]) / sigma[n]
         cost += np.log1p(off * off / _CAUCHY2)
         for k in range(error.shape[1]):
             if not np.isnan(error[n, k, 0]):
@@ -175,7 +177,9 @@ def _cost(scene: Scene, state: Start, error: np.ndarray, sigma_px: float) -> flo
                 cost += np.log1p((square if np.isfinite(square) else _BEHIND) / _CAUCHY2)
     cost *= 0.5 * _CAUCHY2
     if scene.lens_sigma[0] > 0:
-        cost += 0.5 * (((state.lens - scene.lens) / scene.lens_sigma) ** 2).sum()
+        focal_off = (state.lens[0] - scene.lens[0]) / scene.lens_sigma[0]
+        bend_off = (state.lens[1] - scene.lens[1]) / scene.lens_sigma[1]
+        cost += 0.5 * (focal_off * focal_off + bend_off * bend_off)
     return cost
 
 
@@ -183,23 +187,24 @@ def _cost(scene: Scene, state: Start, error: np.ndarray, sigma_px: float) -> flo
 def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution:
     """Return the normal equations at a state; A with the prior of the lens."""
     points, partners, sigma_px = error.shape[0], error.shape[1], _robust_sigma(error)
-    known = scene.lens_sigma[0] == 0
-    size = 6 * partners + (0 if known else 2)
+    start, seen, T, log_depth = scene.start, scene.seen, state.T, state.log_depth
+    expected, sigma, lens_sigma = scene.expected, scene.sigma, scene.lens_sigma
+    count = 6 if lens_sigma[0] == 0 else 8
+    size = 6 * partners + count - 6
     A, scores, E = np.zeros((size, size)), np.zeros((points, size)), np.zeros((points, size))
-    h, g, row, by_point = np.zeros(points), np.zeros(points), np.zeros((2, 8)), np.zeros((2, 3))
+    h, g, row = np.zeros(points), np.zeros(points), np.zeros((2, 8))
     focal, b, w2 = np.exp(state.lens[0]), state.lens[1], scene.half_width_px**2
-    count = 6 if known else 8
     for n in range(points):
-        x, y = scene.start[n]
+        x, y = start[n, 0], start[n, 1]
         square = (x * x + y * y) / w2
-        bent, depth = (1 + b * square) / focal, np.exp(state.log_depth[n])
-        host = np.array([depth * bent * x, depth * bent * y, depth])
+        bent, depth = (1 + b * square) / focal, np.exp(log_depth[n])
+        host_x, host_y = depth * bent * x, depth * bent * y
         for k in range(partners):
-            if not np.isfinite(error[n, k, 0]):
+            ex, ey = error[n, k, 0], error[n, k, 1]
+            if not np.isfinite(ex):
                 continue
-            T, ex, ey = state.T[k], error[n, k, 0], error[n, k, 1]
-            X, Y, Z = _moved(T, host[0], host[1], host[2])
-            u, v, px, py = focal * X / Z, focal * Y / Z, ex + scene.seen[n, k, 0], ey + scene.seen[n, k, 1]
+            X, Y, Z = _moved(T, k, host_x, host_y, depth)
+            u, v, px, py = focal * X / Z, focal * Y / Z, ex + seen[n, k, 0], ey + seen[n, k, 1]
             # The inverse of the derivative of p (1 + b |p|^2 / w^2).
             bend = b * (px * px + py * py) / w2
             one = max(1 + bend, _LEAST_SLOPE)
@@ -207,20 +212,18 @@ def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution
             for axis in range(2):
                 p = px if axis == 0 else py
                 dx, dy = ((axis == 0) - outer * p * px) / one, ((axis == 1) - outer * p * py) / one
-                by_point[axis, 0], by_point[axis, 1] = dx * focal / Z, dy * focal / Z
-                by_point[axis, 2] = -(dx * u + dy * v) / Z
-                ax, ay, az = by_point[axis]
+                ax, ay, az = dx * focal / Z, dy * focal / Z, -(dx * u + dy * v) / Z
                 row[axis, 0], row[axis, 1], row[axis, 2] = Y * az - Z * ay, Z * ax - X * az, X * ay - Y * ax
                 row[axis, 3], row[axis, 4], row[axis, 5] = ax, ay, az
-                if not known:
-                    hx, hy = ax * T[0, 0] + ay * T[1, 0] + az * T[2, 0], ax * T[0, 1] + ay * T[1, 1] + az * T[2, 1]
-                    row[axis, 6] = dx * u + dy * v - hx * host[0] - hy * host[1]
-                    row[axis, 7] = (hx * x + hy * y) * depth * square / focal
-                    row[axis, 7] -= (dx * px + dy * py) * (px * px + py * py) / w2
+                hx = ax * T[k, 0, 0] + ay * T[k, 1, 0] + az * T[k, 2, 0]
+                hy = ax * T[k, 0, 1] + ay * T[k, 1, 1] + az * T[k, 2, 1]
+                row[axis, 6] = dx * u + dy * v - hx * host_x - hy * host_y
+                row[axis, 7] = (hx * x + hy * y) * depth * square / focal
+                row[axis, 7] -= (dx * px + dy * py) * (px * px + py * py) / w2
             weight = 1 / (1 + (ex * ex + ey * ey) / sigma_px**2 / _CAUCHY2) / sigma_px**2
-            x0, y0, z0 = X - T[0, 3], Y - T[1, 3], Z - T[2, 3]
-            deep0 = weight * (by_point[0, 0] * x0 + by_point[0, 1] * y0 + by_point[0, 2] * z0)
-            deep1 = weight * (by_point[1, 0] * x0 + by_point[1, 1] * y0 + by_point[1, 2] * z0)
+            x0, y0, z0 = X - T[k, 0, 3], Y - T[k, 1, 3], Z - T[k, 2, 3]
+            deep0 = weight * (row[0, 3] * x0 + row[0, 4] * y0 + row[0, 5] * z0)
+            deep1 = weight * (row[1, 3] * x0 + row[1, 4] * y0 + row[1, 5] * z0)
             h[n] += (deep0 * deep0 + deep1 * deep1) / weight
             g[n] += ex * deep0 + ey * deep1
             for i in range(count):
@@ -229,51 +232,48 @@ def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution
                 by0, by1 = weight * by0, weight * by1
                 scores[n, to] += ex * by0 + ey * by1
                 # Poses of two partners have no derivative in common.
-                for j in range(min(i + 1, 6)):
-                    A[to, 6 * k + j] += by0 * row[0, j] + by1 * row[1, j]
-                for j in range(6, i + 1):
-                    A[to, 6 * partners + j - 6] += by0 * row[0, j] + by1 * row[1, j]
-        off = (state.log_depth[n] - scene.expected[n]) / scene.sigma[n]
-        held = 1 / (1 + off * off / _CAUCHY2) / scene.sigma[n] ** 2
+                for j in range(i + 1):
+                    A[to, 6 * k + j if j < 6 else 6 * partners + j - 6] += by0 * row[0, j] + by1 * row[1, j]
+        off = (log_depth[n] - expected[n]) / sigma[n]
+        held = 1 / (1 + off * off / _CAUCHY2) / sigma[n] ** 2
         h[n] += held
-        g[n] += held * off * scene.sigma[n]
-    for i in range(size - 6 * partners):
-        A[6 * partners + i, 6 * partners + i] += 1 / scene.lens_sigma[i] ** 2
+        g[n] += held * off * sigma[n]
+    for i in range(6 * partners, size):
+        A[i, i] += 1 / lens_sigma[i - 6 * partners] ** 2
     return WindowSolution(state, error, sigma_px, A, scores, E, h, g)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _stepped(scene: Scene, found: WindowSolution, damping: float) -> Start:
     """Return the state after a damped Gauss-Newton step; points move in inverse depth, which parallax is linear in."""
-    state, A, E, g, h = found.state, found.A, found.E, found.g, found.h
-    size, partners = len(A), len(state.T)
-    matrix, step, depths = A.copy(), np.zeros(size), state.log_depth.copy()
-    for i in range(6 * partners, size):
-        step[i] = (scene.lens[i - 6 * partners] - state.lens[i - 6 * partners]) / scene.lens_sigma[
-            i - 6 * partners
-        ] ** 2
+    state, A, E, g, h, scores = found.state, found.A, found.E, found.g, found.h, found.scores
+    size, partners, T = A.shape[0], state.T.shape[0], state.T
+    matrix, step, turned = np.empty_like(A), np.zeros(size), np.empty_like(T)
+    depths, lens, expected, lens_sigma = np.empty_like(h), np.empty_like(state.lens), scene.lens, scene.lens_sigma
     for i in range(size):
-        matrix[i, i] += (damping + _RIDGE) * A[i, i] + _TINY
-    for n in range(len(h)):
+        for j in range(i):
+            matrix[i, j] = A[i, j]
+        matrix[i, i] = A[i, i] + ((damping + _RIDGE) * A[i, i] + _TINY)
+    for i in range(size - 6 * partners):
+        step[6 * partners + i] = (expected[i] - state.lens[i]) / lens_sigma[i] ** 2
+    for n in range(h.shape[0]):
         for i in range(size):
             shrunk = E[n, i] / (h[n] * (1 + damping))
-            step[i] += shrunk * g[n] - found.scores[n, i]
+            step[i] += shrunk * g[n] - scores[n, i]
             for j in range(i + 1):
                 matrix[i, j] -= shrunk * E[n, j]
     _solve(matrix, step)
-    for n in range(len(h)):
+    for n in range(h.shape[0]):
         along = g[n]
         for i in range(size):
             along += E[n, i] * step[i]
-        depths[n] -= np.log(
-            min(max(1 + along / (h[n] * (1 + damping)), _INVERSE_DEPTH_STEP[0]), _INVERSE_DEPTH_STEP[1])
-        )
-    T, lens = np.empty_like(state.T), state.lens.copy()
+        factor = max(1 + along / (h[n] * (1 + damping)), _INVERSE_DEPTH_STEP[0])
+        depths[n] = state.log_depth[n] - np.log(min(factor, _INVERSE_DEPTH_STEP[1]))
     for k in range(partners):
-        _turn(step[6 * k : 6 * k + 6], state.T[k], T[k])
-    for i in range(6 * partners, size):
-        lens[i - 6 * partners] += step[i]
-    return Start(T, depths, lens)
+        _turn(step, k, T, turned)
+    for i in range(2):
+        lens[i] = state.lens[i] + (step[6 * partners + i] if size > 6 * partners else 0.0)
+    return Start(turned, depths, lens)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -297,15 +297,19 @@ def _solve(matrix: np.ndarray, wanted: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _turn(twist: np.ndarray, T: np.ndarray, turned: np.ndarray) -> None:
-    """Put a pose (3, 4), turned by a rotation vector and then moved, in place of `turned`: Rodrigues' formula."""
-    x, y, z = twist[0], twist[1], twist[2]
+def _turn(step: np.ndarray, k: int, T: np.ndarray, turned: np.ndarray) -> None:
+    """Put pose k (3, 4), turned by a rotation vector and then moved, into `turned`: Rodrigues' formula.
+
+    step : (C,), from 6 k on the rotation vector and the motion. T, turned : poses (K, 3, 4).
+    """
+    x, y, z = step[6 * k], step[6 * k + 1], step[6 * k + 2]
     angle = np.sqrt(x * x + y * y + z * z)
     along, across = (1.0, 0.5) if angle < _SMALL_RAD else (np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2)
     for c in range(4):
-        a, b, d = y * T[2, c] - z * T[1, c], z * T[0, c] - x * T[2, c], x * T[1, c] - y * T[0, c]
-        turned[0, c] = T[0, c] + along * a + across * (y * d - z * b)
-        turned[1, c] = T[1, c] + along * b + across * (z * a - x * d)
-        turned[2, c] = T[2, c] + along * d + across * (x * b - y * a)
+        p, q, r = T[k, 0, c], T[k, 1, c], T[k, 2, c]
+        a, b, d = y * r - z * q, z * p - x * r, x * q - y * p
+        turned[k, 0, c] = p + along * a + across * (y * d - z * b)
+        turned[k, 1, c] = q + along * b + across * (z * a - x * d)
+        turned[k, 2, c] = r + along * d + across * (x * b - y * a)
     for i in range(3):
-        turned[i, 3] += twist[3 + i]
+        turned[k, i, 3] += step[6 * k + 3 + i]
