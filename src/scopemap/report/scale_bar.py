@@ -26,4 +26,3 @@ def draw_scale_bar(picture: np.ndarray, px_per_mm: float, words: str = "") -> No
     sheet.fill((_MARGIN_PX - 4, height - 32, wide + 8, 28), "#101010")
     sheet.fill((_MARGIN_PX, height - 11, length * px_per_mm, 3), "#ffffff")
     sheet.text((_MARGIN_PX, height - 30), text, _TEXT_PX, "#ffffff")
-    picture[:] = sheet.rgb

@@ -61,12 +61,17 @@ class Sheet:
         self, place: tuple[float, float], words: str, size: int = 13, colour: str = INK, anchor: str = "la"
     ) -> None:
         """Write one or more lines at a place; anchor : Pillow's, "la": its left upper corner, "mm": its middle."""
-        image = Image.fromarray(self.rgb)
+        lines, step = words.splitlines(), round(1.25 * size)
+        # Only the rows around it: to copy all of a sheet for each label takes a third of a report's time.
+        top = max(0, int(place[1]) - 2 * step)
+        rows = self.rgb[top : max(top, int(place[1]) + (len(lines) + 2) * step)]
+        if not rows.size:
+            return
+        image = Image.fromarray(rows)
         draw = ImageDraw.Draw(image)
-        step = round(1.25 * size)
-        for row, line in enumerate(words.splitlines()):
-            draw.text((place[0], place[1] + row * step), line, colour, _font(size), anchor=anchor)
-        self.rgb = np.array(image)
+        for row, line in enumerate(lines):
+            draw.text((place[0], place[1] - top + row * step), line, colour, _font(size), anchor=anchor)
+        rows[:] = np.asarray(image)
 
     def line(self, points: np.ndarray, colour: str, width_px: int = 1) -> None:
         """Draw a line through points (n, 2); rows that hold NaN are gaps."""
