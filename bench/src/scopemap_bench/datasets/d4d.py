@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import CalibrationError, InputError, reporting
@@ -67,6 +66,8 @@ class D4dClip(LayoutFolder):
             )
             if named is None or not pose.is_file() or self.camera is None:
                 return None
+            import trimesh  # its import takes longer than that of all readers, and each command loads them
+
             cloud: Any = trimesh.load(session / named, process=False)
             points_m = np.asarray(cloud.vertices, np.float64)
         points = transform(inverse(_read_pose(pose)), points_m[np.isfinite(points_m).all(1)])

@@ -14,7 +14,6 @@ from typing import Self
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from scipy.optimize.elementwise import find_root
 
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 
@@ -259,6 +258,9 @@ def _while_increasing(function: _Function, grid: np.ndarray, most: float = np.in
 
 def _invert_increasing(function: _Function, grid: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return x with function(x) = values (any shape), NaN outside the range of `function` over `grid` (ascending)."""
+    # Its import takes as long as that of scipy's other parts; pinhole cameras need none of it.
+    from scipy.optimize.elementwise import find_root
+
     table = function(grid)
     inside = (values >= table[0]) & (values <= table[-1])
     values = np.where(inside, values, table[0])

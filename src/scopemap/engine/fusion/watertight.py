@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from numba import njit, prange
-from scipy.ndimage import binary_dilation, label
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from scopemap.engine.fusion.mesh import marching_cubes
@@ -99,7 +99,7 @@ def _set_distances(
     vertices, normals = planes
     near = np.zeros(field.shape, bool)
     near[tuple(((vertices - corner) / cell_mm).astype(int).T)] = True
-    near = binary_dilation(near, iterations=_BAND_CELLS)
+    near = ndimage.binary_dilation(near, iterations=_BAND_CELLS)
     points = corner + (np.argwhere(near) + 0.5) * cell_mm
     index = tree.query(points, k=min(_PLANES, len(vertices)))[1].reshape(len(points), -1)
     distance = np.einsum("nkc,nkc->nk", points[:, None] - vertices[index], normals[index]).mean(axis=1)
@@ -126,9 +126,9 @@ def _relax(field: np.ndarray, fixed: np.ndarray, sweeps: int) -> None:
 
 def _one_space(field: np.ndarray) -> np.ndarray:
     """Return the field with the largest positive region alone, and without negative bubbles in it."""
-    regions = label(field > 0)[0]
+    regions = ndimage.label(field > 0)[0]
     sizes = np.bincount(regions.ravel())
     sizes[0] = 0
-    outside = label(regions != np.argmax(sizes))[0]
+    outside = ndimage.label(regions != np.argmax(sizes))[0]
     inside = outside != outside[0, 0, 0]
     return np.where(inside, np.abs(field), -np.abs(field))
