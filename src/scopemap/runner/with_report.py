@@ -9,7 +9,7 @@ from scopemap.input.sequence import Sequence
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import write_report
 from scopemap.result.result import Result
-from scopemap.runner.memory import save_memory, trim_memory
+from scopemap.runner.memory import share_arenas, trim_memory
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Observer, Progress
 
@@ -24,7 +24,7 @@ def reconstruct_with_report(
     progress: Progress = lambda doing, done, total: None,
 ) -> Result:
     """Write the result of a sequence to a folder, with report.html and summary.png; as `reconstruct` otherwise."""
-    save_memory()
+    share_arenas()
     seen: tuple[Observer, ...] = (FramePictures(), *observers)
     result = reconstruct(sequence, config, out=out, overwrite=overwrite, observers=seen, progress=progress)
     trim_memory()
