@@ -31,6 +31,7 @@ NOT_KEPT = {
     "Backend._worker",
     "FramePictures._before",
     "FrameStore._known",
+    "KeyframeMatcher._small",
     "Mapper._read",
     "Relocaliser._features",
     "StoredFile._file",

@@ -214,10 +214,10 @@ class ReducedModel:
     """Model of the cost around a state; steps are the unknowns, then ln depth of the points.
 
     first : first observation of each point, and their number (P + 1,). parts : of the points. linear : returns the
-    derivatives of the observations of a part, found again where a step is tried, since those of all would fill memory.
-    priors : of the unknowns. off, held : (P,)
-    error of each point's ln depth against the estimate, and its weight. scale : (P,) unknown of its host's ln scale,
-    which moves the estimate. free : (F,) numbers of the unknowns that may change. unknowns : their number.
+    derivatives of the observations of a part, those of several found again where a step is tried, since all would fill
+    memory. priors : of the unknowns. off, held : (P,) error of each point's ln depth against the estimate, and its
+    weight. scale : (P,) unknown of its host's ln scale, which moves the estimate. free : (F,) numbers of the unknowns
+    that may change. unknowns : their number.
     """
 
     first: np.ndarray
@@ -232,6 +232,13 @@ class ReducedModel:
     unknowns: int
 
     @cached_property
+    def _of_first(self) -> Linear:
+        return self.linear(self.parts[0])
+
+    def _linear(self, some: slice) -> Linear:
+        return self._of_first if len(self.parts) == 1 else self.linear(some)
+
+    @cached_property
     def _normal(self) -> _Normal:
         free, points, first = len(self.free), len(self.off), self.first
         normal = _Normal(np.zeros((free, free)), *np.zeros((2, free)), *np.zeros((2, points)))
@@ -241,7 +248,7 @@ class ReducedModel:
             own = _Normal(*normal[:3], normal.h[some], normal.g[some])
             start = first[some.start : some.stop + 1] - first[some.start]
             scale, off, held = place[self.scale[some]], self.off[some], self.held[some]
-            linear = self.linear(some)
+            linear = self._linear(some)
             _add_points(own, start, scale, off, held, linear._replace(columns=place[linear.columns]))
         for prior in self.priors:
             kept = np.flatnonzero(place[prior.columns] >= 0)
@@ -273,7 +280,7 @@ class ReducedModel:
     def _changes(self, step: np.ndarray) -> Iterator[tuple[slice, Linear, np.ndarray]]:
         """Yield each part with what a step without its points changes, px."""
         for some in self.parts:
-            linear = self.linear(some)
+            linear = self._linear(some)
             yield some, linear, np.einsum("nau,nu->na", linear.by, step[linear.columns])
 
     def gauss_newton_step(self) -> np.ndarray:
@@ -309,46 +316,45 @@ def _add_points(
     start : first observation of each point and their number (P + 1,). scale : (P,) unknown of its host's ln scale. All
     unknowns are numbered among those that are free; -1: they are not.
     """
-    size = len(normal.gradient)
+    size, most = len(normal.gradient), linear.columns.shape[1]
     # A point touches few unknowns: its sums are made among these, and added to the matrix once.
-    columns, place = np.empty(size, np.int64), np.full(size, -1)
-    most = 0
+    columns, place, b, E = np.empty(size, np.int64), np.full(size, -1), np.zeros(size), np.zeros(size)
+    touched, one, other = np.empty(most, np.int64), np.empty(most), np.empty(most)
     for p in range(len(scale)):
-        most = max(most, start[p + 1] - start[p])
-    rows = np.zeros((2 * most, size))
-    by, error, b, E = np.empty(len(rows)), np.empty(len(rows)), np.zeros(size), np.zeros(size)
-    for p in range(len(scale)):
-        used, count, has_scale = 0, 0, scale[p] >= 0
-        h, g = held[p], held[p] * off[p]
-        if has_scale:
+        count = 0
+        if scale[p] >= 0:
             columns[0], place[scale[p]], count = scale[p], 0, 1
         for k in range(start[p], start[p + 1]):
-            root = np.sqrt(linear.weight[k])
-            for axis in range(2):
-                by[used], error[used] = root * linear.by_depth[k, axis], root * linear.error[k, axis]
-                h += by[used] ** 2
-                g += by[used] * error[used]
-                for i in range(linear.columns.shape[1]):
-                    value, column = root * linear.by[k, axis, i], linear.columns[k, i]
-                    if value == 0 or column < 0:
-                        continue
-                    if place[column] < 0:
-                        place[column], columns[count] = count, column
-                        count += 1
-                    rows[used, place[column]] += value
-                used += 1
-        A = np.zeros((count, count))
-        if has_scale:
+            for i in range(most):
+                column = linear.columns[k, i]
+                if column >= 0 and place[column] < 0:
+                    columns[count], place[column] = column, count
+                    count += 1
+        A, h, g = np.zeros((count, count)), held[p], held[p] * off[p]
+        if scale[p] >= 0:
             A[0, 0], b[0], E[0] = held[p], -held[p] * off[p], -held[p]
-        for row in range(used):
-            for i in range(count):
-                value = rows[row, i]
-                if value == 0:
+        for k in range(start[p], start[p + 1]):
+            weight, used = linear.weight[k], 0
+            depth_x, depth_y = linear.by_depth[k, 0], linear.by_depth[k, 1]
+            error_x, error_y = linear.error[k, 0], linear.error[k, 1]
+            h += weight * (depth_x * depth_x + depth_y * depth_y)
+            g += weight * (depth_x * error_x + depth_y * error_y)
+            for i in range(most):
+                x, y, column = linear.by[k, 0, i], linear.by[k, 1, i], linear.columns[k, i]
+                if column < 0 or (x == 0 and y == 0):
                     continue
-                b[i] += error[row] * value
-                E[i] += by[row] * value
-                for j in range(i + 1):
-                    A[i, j] += value * rows[row, j]
+                at = place[column]
+                b[at] += weight * (x * error_x + y * error_y)
+                E[at] += weight * (x * depth_x + y * depth_y)
+                A[at, at] += weight * (x * x + y * y)
+                for j in range(used):
+                    before, value = touched[j], one[j] * x + other[j] * y
+                    if before == at:
+                        A[at, at] += 2 * value
+                    else:
+                        A[max(at, before), min(at, before)] += value
+                touched[used], one[used], other[used] = at, weight * x, weight * y
+                used += 1
         normal.h[p], normal.g[p] = h, g
         for i in range(count):
             normal.gradient[columns[i]] += b[i]
@@ -356,7 +362,5 @@ def _add_points(
             for j in range(i + 1):
                 row, column = max(columns[i], columns[j]), min(columns[i], columns[j])
                 normal.matrix[row, column] += A[i, j] - E[i] / h * E[j]
-            for row in range(used):
-                rows[row, i] = 0.0
         for i in range(count):
             place[columns[i]], b[i], E[i] = -1, 0.0, 0.0
