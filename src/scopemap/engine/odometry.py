@@ -148,7 +148,6 @@ class Odometry:
             preprocessed.correspondence,
             T_current_previous,
             sigma_mm=raw.depth_sigma_mm,
-            propagated=preprocessed.propagated,
         )
 
     def _reset(self) -> None:
@@ -171,9 +170,7 @@ class Odometry:
         """
         if track.status == "lost":
             return track, frame
-        # Many frames are tracked against a keyframe, so it waits for one that the network looks at.
-        waits = preprocessed.propagated and track.status != "initial"
-        kind, due, number = preprocessed.kind, self._tracker.needs_keyframe() and not waits, track.keyframe
+        kind, due, number = preprocessed.kind, self._tracker.needs_keyframe(), track.keyframe
         keyframe, matches, step = replace(frame, T_world_camera=track.T_world_camera), None, None
         if self._local is not None and kind != "measured":
             if due:

@@ -29,7 +29,7 @@ MEASURED = ("src", "bench/src")
 SCRIPT = "python -m scopemap_bench.scripts"
 PLAN = "env SCOPEMAP_WEIGHTS_DIR=DATA/weights python -m scopemap bench"
 TABLES: dict[str, tuple[str, str]] = {
-    "overview": (f"{SCRIPT}.overview --data DATA --out OUT --repeat 5", ""),
+    "overview": (f"{SCRIPT}.overview --data DATA --out OUT --repeat 3", ""),
     "real": (f"{SCRIPT}.real --data DATA --out OUT/real", ""),
     "inside-out": (f"{SCRIPT}.inside_out --out OUT/inside-out", ""),
     "surface": (f"{SCRIPT}.surface --data DATA --out OUT", ""),

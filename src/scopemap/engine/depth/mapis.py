@@ -109,19 +109,18 @@ class Mapis:
         T_current_previous: np.ndarray | None,
         *,
         sigma_mm: np.ndarray | None = None,
-        propagated: bool = False,
     ) -> RefinedDepth:
         """Return the depth of a frame.
 
         raw_mm : (H, W) float32; sigma_mm : its standard deviation, NaN or None where unknown. correspondence : None for
         the first frame. T_current_previous : transforms the previous depth; None: it is warped unchanged, as in the
-        paper. propagated : whether the raw depth is that of the frame before: blended there, here it only fills gaps.
+        paper.
         """
         check_shape("raw_mm", raw_mm, (camera.height, camera.width))
         sigma = relative_sigma(raw_mm, sigma_mm)
         warped_mm, warped_sigma = self._warped(camera, correspondence, T_current_previous, sigma)
         overlap = float(np.isfinite(warped_mm).mean())
-        if self._scales(kind) and not propagated:
+        if self._scales(kind):
             self._scale = robust_scale(raw_mm, warped_mm, self._scale)
             if correspondence is not None and self._propagated is not None:
                 self._scale = self._pulled_back(self._scale, overlap / max(correspondence.usable_share, 1e-6))
@@ -131,8 +130,6 @@ class Mapis:
         if correspondence is not None and blend != "none":
             weight = np.where(np.isfinite(warped_mm), self._weight(blend, correspondence.distance), np.float32(0.0))
             weight = by_variance(weight, warped_sigma, sigma)
-            if propagated:
-                weight = np.isfinite(warped_mm).astype(np.float32)
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
             refined_sigma = blended_sigma(weight, warped_sigma, sigma)
         self._propagated = (
