@@ -135,7 +135,7 @@ def test_parts_stay_the_objects_they_are_and_only_frames_share_arrays(tmp_path: 
 
 def test_a_volume_that_grows_writes_what_changed(tmp_path: Path) -> None:
     blocks, checkpoint = VoxelBlocks(), SavedState(tmp_path)
-    slots = blocks.slots(np.array([pack(n, 0, 0) for n in range(4000)]))
+    slots = blocks.slots(np.array([pack.py_func(n, 0, 0) for n in range(4000)]))
     blocks.voxels.tsdf[slots] = slots[:, None, None, None]
 
     def files() -> set[str]:
@@ -151,7 +151,7 @@ def test_a_volume_that_grows_writes_what_changed(tmp_path: Path) -> None:
     SavedState(tmp_path).restore("volume", restored)
     for one, other in zip(restored.voxels, blocks.voxels, strict=True):
         np.testing.assert_array_equal(one, other)
-    restored.slots(np.array([pack(n, 1, 0) for n in range(4000)]))  # grows in place
+    restored.slots(np.array([pack.py_func(n, 1, 0) for n in range(4000)]))  # grows in place
     np.testing.assert_array_equal(restored.find(np.array([[7, 0, 0]])), [8])
 
 

@@ -74,8 +74,11 @@ def _is_command(function: Function) -> bool:
 
 def _is_typed_by_use(function: Function) -> bool:
     """Whether numba compiles it for the types that it meets, and a docstring says what these are."""
-    compiled = any(ast.unparse(decorator).startswith("njit") for decorator in function.decorator_list)
-    return compiled and ast.get_docstring(function) is not None
+    return _is_kernel(function, "njit", "kernel", "inner_kernel") and ast.get_docstring(function) is not None
+
+
+def _is_kernel(function: Function, *kinds: str) -> bool:
+    return any(re.match(rf"({'|'.join(kinds)})\b", ast.unparse(one)) for one in function.decorator_list)
 
 
 def _lines(function: Function) -> int:
@@ -141,6 +144,31 @@ def test_no_function_takes_keywords_it_does_not_name() -> None:
     _none([module.at(f) for (module, f), wraps in zip(taking, wrappers, strict=True) if not wraps])
 
 
+def _functions(module: _Module, *kinds: str) -> list[Function]:
+    found = [node for node in ast.walk(module.tree) if isinstance(node, Function)]
+    return [function for function in found if _is_kernel(function, *kinds)]
+
+
+def test_only_kernels_call_inner_kernels() -> None:
+    """Numba compiles no way into them from Python: a call would end the process."""
+    inner = {(module.path.stem, f.name) for module in MODULES for f in _functions(module, "inner_kernel")}
+    assert inner
+    faults = []
+    for module in [*MODULES, *TESTS, *OTHERS]:
+        known = {f.name for f in _functions(module, "inner_kernel")}
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.ImportFrom):
+                stem = str(node.module).rsplit(".", 1)[-1]
+                known |= {alias.name for alias in node.names if (stem, alias.name) in inner}
+        allowed = {node for f in _functions(module, "kernel", "inner_kernel") for node in ast.walk(f)}
+        for node in ast.walk(module.tree):
+            if isinstance(node, ast.Attribute) and node.attr == "py_func":
+                allowed.add(node.value)
+            elif isinstance(node, ast.Name) and node.id in known and node not in allowed:
+                faults.append(f"{module.at(node)}: {node.id} is for kernels only, its py_func is plain Python")
+    _none(faults)
+
+
 # ---- ceilings of ideas: lines in total are not counted, since a ceiling on them bent the code
 
 
@@ -151,7 +179,8 @@ def _advanced_settings() -> int:
 CEILINGS = {
     # 133: with the kernels' own median, which saves 2 s of compiling numba's.
     # 134: which frames are fused.
-    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 134),
+    # 135: how kernels are compiled, in one place.
+    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 135),
     "lines of pipeline.py": (lambda: _read(SOURCE / "engine" / "pipeline.py").lines, 106),
     # 47: a result that does not say which frames it is of cannot be repeated.
     "settings but the advanced ones": (lambda: len(setting_names()) - _advanced_settings(), 47),
@@ -233,9 +262,9 @@ def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.engine.pipeline")
     assert "scopemap.engine.mapping.backend" in closure
     # With notices, causes of losses, local adjustment, its lens, other starts, moving tissue, the skin of its states,
-    # the judging of an adjustment, the parts of all stages, which frames can be tracked and are fused, and what stages
-    # keep.
-    assert len(closure) <= 80, "\n".join(sorted(closure))
+    # the judging of an adjustment, the parts of all stages, which frames can be tracked and are fused, what stages
+    # keep, and how kernels are compiled.
+    assert len(closure) <= 81, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

@@ -16,10 +16,10 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.fusion.tsdf import BLOCK, MeasuredSurface, TsdfCamera, VoxelBlocks, measure_surface
+from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.kept import Kept
 
 _COSINE_POWER = 0.1  # fitted with the next two on three real clips and two phantoms (docs/method.md, Fusion)
@@ -137,7 +137,7 @@ def _mean(values: np.ndarray, known: np.ndarray) -> np.ndarray:
     return cv2.blur(values, window) / np.maximum(cv2.blur(known.astype(np.float32), window), np.float32(1e-6))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _painted(rgb, inverse_depth, light):  # type: ignore[no-untyped-def]
     """Return rgb / light and the weight of each pixel's colour, (H, W, 4) float32; 0 where light is NaN."""
     height, width = light.shape

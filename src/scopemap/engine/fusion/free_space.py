@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
 from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.kernels import inner_kernel, kernel
 from scopemap.engine.geometry.median import median
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.notices import Notice
@@ -173,7 +173,7 @@ def _centres(shape: tuple[int, ...]) -> tuple[slice, slice]:
     return (slice(step_px // 2, None, step_px),) * 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _place(points_mm: np.ndarray, n: int, P: np.ndarray, nearest_mm: np.ndarray) -> tuple[int, int, float]:
     """Return row, column and depth, mm, of a point in the cells of a view; a depth of 0 where that knows nothing."""
     x, y, z_mm = points_mm[n, 0], points_mm[n, 1], points_mm[n, 2]
@@ -188,7 +188,7 @@ def _place(points_mm: np.ndarray, n: int, P: np.ndarray, nearest_mm: np.ndarray)
     return row, column, depth_mm if nearest_mm[row, column] > 0 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _count(points_mm: np.ndarray, colour: np.ndarray, view: _View, counts: np.ndarray) -> None:
     """Add to `counts` (N, 4) whether a view confirms or contradicts points (N, 3), contradicts, clearly contradicts.
 

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from numba import njit
 
 from scopemap.engine.config.mapping import FusionSettings
 from scopemap.engine.fusion.albedo import displayed
 from scopemap.engine.fusion.tsdf import BLOCK, VoxelBlocks, Voxels, unpack
+from scopemap.engine.geometry.kernels import inner_kernel, kernel
 
 _CHUNK_BLOCKS = 8  # by hand, for memory: the result does not depend on it
 _CHUNK = _CHUNK_BLOCKS * BLOCK
@@ -152,7 +152,7 @@ def _all_contours() -> np.ndarray:
     return table
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _march(
     field: np.ndarray, used: np.ndarray, contours: np.ndarray, vertices: np.ndarray, faces: np.ndarray
 ) -> tuple[int, int]:
@@ -204,7 +204,7 @@ def _march(
     return vertex_count, face_count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _contours(corners: np.ndarray) -> np.ndarray:
     """Return the edge (12,) that follows each around the surface in a cell with these corners (8,); -1: not crossed."""
     following: np.ndarray = np.full(len(_EDGES), -1)
@@ -228,7 +228,7 @@ def _contours(corners: np.ndarray) -> np.ndarray:
     return following
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _fan_start(vertices: np.ndarray, loop: np.ndarray, edges: np.ndarray, size: int) -> int:
     """Return where a contour's fan of triangles begins, so that its diagonals are short; -1: not at any vertex.
 

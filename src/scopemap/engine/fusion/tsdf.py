@@ -8,11 +8,12 @@ plane: interpolated and differentiated, a slanted wall stays exact.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
+from scopemap.engine.geometry.kernels import inner_kernel, kernel
 from scopemap.engine.kept import Kept
 
 BLOCK = 8  # voxels along an edge of a block: 8, as Niessner et al. 2013 hash them
@@ -20,6 +21,8 @@ BLOCK = 8  # voxels along an edge of a block: 8, as Niessner et al. 2013 hash th
 KEY_OFFSET = 1 << 20
 _KEY_MASK = (1 << 21) - 1  # 21 bits for each of three numbers of a block
 _RECENT = 1 << 15  # by hand, for time: entries of the table of blocks met last; a power of two
+_PIECES = 16  # by hand, for time: of a ray, whose last blocks are remembered
+_FEW_KEYS = 1 << 14  # by hand, for time: more need a second attempt
 _F32 = np.float32
 _SLOPE_STEP_PX = 3  # by hand: pixels to either side from which a slope is measured
 _COLOUR_BAND_VOXELS = 2.0  # by hand: colours are integrated so near to the surface
@@ -67,7 +70,7 @@ class Grid(NamedTuple):
     full_weight_share: float = 0.2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _slope(before: np.float32, here: np.float32, after: np.float32, most: np.float32) -> np.float32:
     """Change of inverse depth per px, mean of the sides that change by up to `most`; NaN where neither does."""
     back, ahead = here - before, after - here
@@ -76,7 +79,7 @@ def _slope(before: np.float32, here: np.float32, after: np.float32, most: np.flo
     return total / ((_F32(is_back) + _F32(is_ahead)) * _F32(_SLOPE_STEP_PX))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def measure_surface(
     inverse_depth: np.ndarray, camera: TsdfCamera, largest_step: float, min_incidence: float, max_depth_mm: float
 ) -> MeasuredSurface:
@@ -87,9 +90,8 @@ def measure_surface(
     falling with the square of the distance. Pixels without a slope or with cos(incidence) < `min_incidence` become NaN.
     """
     height, width = inverse_depth.shape
-    kept = np.full((height, width), np.nan, np.float32)
-    plane_mm = np.zeros((height, width), np.float32)
-    weight = np.zeros((height, width), np.float32)
+    planes = np.empty((3, height, width), np.float32)
+    kept, plane_mm, weight = planes[0], planes[1], planes[2]
     # In single precision and without branches, so that it is compiled to vector instructions: an eighth of the time.
     fx, fy, cx, cy = _F32(camera.fx), _F32(camera.fy), _F32(camera.cx), _F32(camera.cy)
     share, least, nearness = _F32(_SLOPE_STEP_PX * largest_step), _F32(min_incidence), _F32(2.0 / max_depth_mm)
@@ -106,15 +108,15 @@ def measure_surface(
             nz = here - nx * x - ny * y
             plane = _F32(1) / np.sqrt(nx * nx + ny * ny + nz * nz)
             distance = np.sqrt(x * x + y * y + _F32(1)) / here
-            if here > 0 and plane >= least * distance:
-                kept[row, col] = here
-                plane_mm[row, col] = plane
-                far = nearness * distance
-                weight[row, col] = plane / distance / (_F32(1) + far * far)
+            far = nearness * distance
+            is_kept = here > 0 and plane >= least * distance
+            kept[row, col] = here if is_kept else nan
+            plane_mm[row, col] = plane if is_kept else _F32(0)
+            weight[row, col] = plane / distance / (_F32(1) + far * far) if is_kept else _F32(0)
     return MeasuredSurface(kept, plane_mm, weight)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def pack(x: int, y: int, z: int) -> int:
     """Return the int64 key of a block coordinate."""
     return ((x + KEY_OFFSET) << 42) | ((y + KEY_OFFSET) << 21) | (z + KEY_OFFSET)
@@ -125,14 +127,7 @@ def unpack(keys: np.ndarray) -> np.ndarray:
     return np.stack([(keys >> 42) & _KEY_MASK, (keys >> 21) & _KEY_MASK, keys & _KEY_MASK], -1) - KEY_OFFSET
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _blocks_between(a: float, b: float, wide: float, per_mm: float) -> tuple[int, int]:
-    """Return the first and the last block that the segment a to b, `wide` to either side, touches along an axis."""
-    low, high = (a, b) if a < b else (b, a)
-    return int(np.floor((low - wide) * per_mm)) >> 3, int(np.ceil((high + wide) * per_mm)) >> 3
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _depth_ranges(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
     """Return the nearest and the farthest depth of each 2 by 2 pixels, (4, rows, columns, 2), mm; 0: none."""
     height, width = inverse_depth.shape
@@ -151,25 +146,34 @@ def _depth_ranges(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
     return ranges
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
 def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) -> np.ndarray:
     """Return keys, some of them repeated, of all blocks within the truncation of a measured pixel (H, W).
 
     The rays of 2 by 2 pixels are cut into pieces of half a block; the box around a piece, widened by the footprint of
     these pixels, names the blocks: no voxel that the frame can see near the surface is missed.
     """
-    block_mm = BLOCK * grid.voxel_mm
+    # By the middle of four pixels, col and row of 2 by 2, to the blocks: origin and direction of a ray, in voxels.
+    centre_x, centre_y = (0.5 - camera.cx) / camera.fx, (0.5 - camera.cy) / camera.fy
+    by_pixel = np.array([[2 / camera.fx, 0, centre_x], [0, 2 / camera.fy, centre_y], [0, 0, 1]])
+    rays = np.column_stack([camera.R.T @ by_pixel, -camera.R.T @ camera.t]) / grid.voxel_mm
     # From the middle of the four pixels to the corner of one of them.
-    footprint = 1.5 / min(camera.fx, camera.fy)
-    # Outside the loop: numba counts references of arrays that are read from a tuple.
-    R, t, per_mm = camera.R, camera.t, 1.0 / grid.voxel_mm
-    origin_x = -(R[0, 0] * t[0] + R[1, 0] * t[1] + R[2, 0] * t[2])
-    origin_y = -(R[0, 1] * t[0] + R[1, 1] * t[1] + R[2, 1] * t[2])
-    origin_z = -(R[0, 2] * t[0] + R[1, 2] * t[1] + R[2, 2] * t[2])
-    recent = np.full(_RECENT, -1, np.int64)
-    keys, count = np.empty(4096, np.int64), 0
-    # By piece: the blocks of the pixels before, which are most often these pixels' as well. At first, none.
-    last_box = [(0, -1, 0, -1, 0, -1)]
+    footprint = 1.5 / min(camera.fx, camera.fy) / grid.voxel_mm
+    keys = np.empty(_FEW_KEYS, np.int64)
+    while (count := _touched_blocks(keys, inverse_depth, rays, footprint, grid)) > len(keys):
+        keys = np.empty(count, np.int64)
+    return keys[:count]
+
+
+@kernel
+def _touched_blocks(keys: np.ndarray, inverse_depth: np.ndarray, rays: np.ndarray, footprint: float, grid: Grid) -> int:
+    """Put the keys of the touched blocks into `keys`, as many as it holds; return how many there are.
+
+    rays : (3, 4), directions and origin of the rays of 2 by 2 pixels, in voxels. footprint : of these per mm of depth.
+    """
+    block_mm, truncation_mm, share = BLOCK * grid.voxel_mm, grid.truncation_mm, grid.truncation_share
+    # By piece: the first and the last block of the pixels before, which are most often these pixels' as well.
+    recent, last_box, count = np.zeros(_RECENT, np.int64), np.zeros((_PIECES, 2), np.int64), 0
+    low, high, ray = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3)
     ranges = _depth_ranges(inverse_depth, grid.largest_step)
     for row in range(ranges.shape[1]):
         for n in range(4 * ranges.shape[2]):
@@ -177,41 +181,37 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
             nearest, farthest = ranges[n % 4, row, col, 0], ranges[n % 4, row, col, 1]
             if nearest == 0:
                 continue
-            x, y = (2 * col + 0.5 - camera.cx) / camera.fx, (2 * row + 0.5 - camera.cy) / camera.fy
-            dx, dy = R[0, 0] * x + R[1, 0] * y + R[2, 0], R[0, 1] * x + R[1, 1] * y + R[2, 1]
-            dz = R[0, 2] * x + R[1, 2] * y + R[2, 2]
-            first_mm = nearest - max(grid.truncation_mm, grid.truncation_share * nearest)
-            last_mm = farthest + max(grid.truncation_mm, grid.truncation_share * farthest)
-            pieces = int(np.ceil(2.0 * (last_mm - first_mm) / block_mm))
+            for axis in range(3):
+                ray[axis] = rays[axis, 0] * col + rays[axis, 1] * row + rays[axis, 2]
+            first_mm = nearest - max(truncation_mm, share * nearest)
+            last_mm = farthest + max(truncation_mm, share * farthest)
+            pieces = math.ceil(2.0 * (last_mm - first_mm) / block_mm)
             piece_mm = (last_mm - first_mm) / pieces
             for piece in range(pieces):
-                if piece == len(last_box):
-                    last_box.append((0, -1, 0, -1, 0, -1))
                 near = max(first_mm + piece * piece_mm, 0.0)
                 far = max(near, first_mm + (piece + 1) * piece_mm)
-                wide = footprint * far
-                first_x, last_x = _blocks_between(origin_x + near * dx, origin_x + far * dx, wide, per_mm)
-                first_y, last_y = _blocks_between(origin_y + near * dy, origin_y + far * dy, wide, per_mm)
-                first_z, last_z = _blocks_between(origin_z + near * dz, origin_z + far * dz, wide, per_mm)
-                box = (first_x, last_x, first_y, last_y, first_z, last_z)
-                if box == last_box[piece]:
+                for axis in range(3):
+                    a, b = rays[axis, 3] + near * ray[axis], rays[axis, 3] + far * ray[axis]
+                    low[axis] = math.floor(min(a, b) - footprint * far) >> 3
+                    high[axis] = math.ceil(max(a, b) + footprint * far) >> 3
+                first, last, box = pack(low[0], low[1], low[2]), pack(high[0], high[1], high[2]), piece % _PIECES
+                if first == last_box[box, 0] and last == last_box[box, 1]:
                     continue
-                last_box[piece] = box
-                for i in range(first_x, last_x + 1):
-                    for j in range(first_y, last_y + 1):
-                        for k in range(first_z, last_z + 1):
+                last_box[box, 0], last_box[box, 1] = first, last
+                for i in range(low[0], high[0] + 1):
+                    for j in range(low[1], high[1] + 1):
+                        for k in range(low[2], high[2] + 1):
                             key = pack(i, j, k)
                             place = (i * 73856093 ^ j * 19349663 ^ k * 83492791) & (_RECENT - 1)
                             if recent[place] != key:
                                 recent[place] = key
-                                if count == keys.size:
-                                    keys = np.concatenate((keys, np.empty_like(keys)))
-                                keys[count] = key
+                                if count < len(keys):
+                                    keys[count] = key
                                 count += 1
-    return keys[:count]
+    return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _whole_cells(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
     """Return whether a pixel, its right, its lower and its diagonal neighbour are one surface, (H, W) bool."""
     height, width = inverse_depth.shape
@@ -227,7 +227,7 @@ def _whole_cells(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
     return whole
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _sample(inverse_depth: np.ndarray, whole: np.ndarray, u: float, v: float) -> float:
     """Bilinear inverse depth where the four neighbours are one surface, else the nearest pixel's (NaN: none)."""
     # Clamped, so that the outer half of a border pixel continues the cell inside it.
@@ -240,7 +240,7 @@ def _sample(inverse_depth: np.ndarray, whole: np.ndarray, u: float, v: float) ->
     return inverse_depth[int(v + 0.5), int(u + 0.5)]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _integrate_block(
     voxels: Voxels,
     corner: np.ndarray,
@@ -316,7 +316,7 @@ def integrate_blocks(
     _integrate_blocks(voxels, slots, corners, surface, picture, projection, grid)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+@kernel
 def _integrate_blocks(
     voxels: Voxels,
     slots: np.ndarray,
@@ -327,7 +327,7 @@ def _integrate_blocks(
     grid: Grid,
 ) -> None:
     whole = _whole_cells(surface.inverse_depth, grid.largest_step)
-    for n in prange(len(slots)):
+    for n in range(len(slots)):
         block = Voxels(voxels.tsdf[slots[n]], voxels.weight[slots[n]], voxels.colour[slots[n]])
         _integrate_block(block, corners[n], surface, whole, picture, projection, grid)
 

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numba import njit, prange
+from numba import prange
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from scopemap.engine.fusion.mesh import marching_cubes
+from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.geometry.rendering import vertex_colours
 
 _MOST_CELLS = 160  # by hand: along the longest side of the mesh
@@ -111,7 +112,7 @@ def _set_distances(
     return near
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
+@kernel(parallel=True)  # type: ignore[untyped-decorator]
 def _relax(field: np.ndarray, fixed: np.ndarray, sweeps: int) -> None:
     """Solve the Laplace equation where the field (l, m, n) is not fixed: successive over-relaxation, red and black."""
     for half in range(2 * sweeps):

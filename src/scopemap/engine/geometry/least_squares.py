@@ -15,8 +15,9 @@ from functools import cached_property
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numba import njit
 from scipy.linalg import cho_factor, cho_solve
+
+from scopemap.engine.geometry.kernels import kernel
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation over the median absolute value of a normal variable."""
@@ -307,7 +308,7 @@ class ReducedModel:
         return total + sum(float(step[prior.columns] @ prior.A @ step[prior.columns]) for prior in self.priors)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_points(
     normal: _Normal, start: np.ndarray, scale: np.ndarray, off: np.ndarray, held: np.ndarray, linear: Linear
 ) -> None:

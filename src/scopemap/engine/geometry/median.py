@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from scopemap.engine.geometry.kernels import inner_kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def median(values: np.ndarray) -> float:
     """Return the median of (N,) float64, N > 0, none NaN; it changes their order."""
     half = values.size // 2
@@ -19,7 +20,7 @@ def median(values: np.ndarray) -> float:
     return (lower + upper) / 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _smallest(values: np.ndarray, rank: int) -> float:
     """Return the value of a rank, from 0 on, with no larger one before it: Hoare's selection (CACM 4, 1961, 65)."""
     low, high = 0, values.size - 1

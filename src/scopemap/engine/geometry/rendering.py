@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from numba import njit
 
 from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.geometry.se3 import inverse, transform
 
 _NEAR_MM = 1e-3  # guard: division by z
@@ -81,7 +81,7 @@ def render_points(
     return Rendering(depth_mm, np.round(rgb).astype(np.uint8))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _rasterise(corners, colours, faces, inverse_depth, rgb):  # type: ignore[no-untyped-def]
     """Draw faces (F, 3) of corners (V, 3): u, v, 1 / z, negative behind the camera. Changes both images."""
     height, width = inverse_depth.shape

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numba import njit
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import check_shape
+from scopemap.engine.geometry.kernels import inner_kernel, kernel
 
 
 def pull(image_previous: np.ndarray, to_previous: np.ndarray) -> np.ndarray:
@@ -34,7 +34,7 @@ def _pixel_grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _mean_of_known(neighbours, a, b):  # type: ignore[no-untyped-def]
     """Mean of the known ones of four values by their bilinear weights; NaN where these are below a half."""
     total, share = np.float32(0.0), np.float32(0.0)
@@ -46,16 +46,18 @@ def _mean_of_known(neighbours, a, b):  # type: ignore[no-untyped-def]
     return total / share if share >= 0.5 else np.float32(np.nan)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _sampled(image, to_previous):  # type: ignore[no-untyped-def]
     """Sample floats (H, W, C) as `pull` says; (H, W, C) float32."""
     h, w, channels = image.shape
-    out = np.full((h, w, channels), np.nan, np.float32)
+    out = np.empty((h, w, channels), np.float32)
     for row in range(h):
         for column in range(w):
             x = np.float32(column) + to_previous[row, column, 0]
             y = np.float32(row) + to_previous[row, column, 1]
             if not (0.0 <= x <= w - 1 and 0.0 <= y <= h - 1):
+                for c in range(channels):
+                    out[row, column, c] = np.nan
                 continue
             i, j = int(x), int(y)
             a, b = x - np.float32(i), y - np.float32(j)

@@ -13,8 +13,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.geometry.se3 import inverse
 
 _LEAST_Z = 1e-3  # guard: points nearer to the camera's plane, over their distance, are behind it
@@ -221,7 +221,7 @@ def _corners(problem: BundleProblem, state: State, points: slice) -> np.ndarray:
     return pixels
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _projected(between, pair, in_host, point, observed, shift, focal):  # type: ignore[no-untyped-def]
     """Return error, ahead, seen and pixel of a `Reprojection`; observed : (n, 2); shift : of `seen`, (0, 3): none."""
     count = len(point)
@@ -246,7 +246,7 @@ def _projected(between, pair, in_host, point, observed, shift, focal):  # type: 
     return error, ahead, seen, pixel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _derivatives(at, corners, focal, unit_mm, lens):  # type: ignore[no-untyped-def]
     """Return what `jacobians` does; corners : (p, 2) of the points, px from the principal point. lens : 3, 0: known."""
     count, row, turned, X = len(at.point), np.zeros(3), np.zeros(3), np.zeros(3)

@@ -17,10 +17,10 @@ from functools import cache
 
 import cv2
 import numpy as np
-from numba import njit
 from scipy import sparse
 
 from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.mapping.bundle_problem import Points
 
@@ -175,7 +175,7 @@ def _log_ratios(
     return known
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _interpolated(values: np.ndarray, log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
     """Return a field's values (6, 7, 4) at each pixel's ln depth (H, W), (H, W) float32; NaN where that is NaN."""
     height, width = log_depth.shape

@@ -8,7 +8,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from scopemap.engine.geometry.kernels import inner_kernel, kernel
+from scopemap.engine.geometry.median import median
 
 VIEW_SIGMA = 0.03  # by hand
 """Standard deviation of ln depth from one neighbour that all pixels share: errors of poses."""
@@ -40,7 +42,7 @@ class Projection(NamedTuple):
     usable: np.ndarray
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _seen_from(T: np.ndarray, depth: float, ray_x: float, ray_y: float) -> tuple[float, float, float]:
     """Return the point at `depth` along a ray (x, y, 1), turned into the other camera, without its translation."""
     x = depth * (T[0, 0] * ray_x + T[0, 1] * ray_y + T[0, 2])
@@ -48,7 +50,7 @@ def _seen_from(T: np.ndarray, depth: float, ray_x: float, ray_y: float) -> tuple
     return x, y, depth * (T[2, 0] * ray_x + T[2, 1] * ray_y + T[2, 2])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def project(depth_mm: np.ndarray, known: np.ndarray, T: np.ndarray, camera: Intrinsics) -> Projection:
     """Project a frame's pixels into another; usable: known depth, seen at least 1 px inside, at `known` pixels."""
     height, width = depth_mm.shape
@@ -72,14 +74,14 @@ def project(depth_mm: np.ndarray, known: np.ndarray, T: np.ndarray, camera: Intr
     return Projection(planes[0], planes[1], planes[2], planes[3], planes[4])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _bilinear(image: np.ndarray, i: int, j: int, s: float, t: float) -> float:
     """Return the image between rows i and i + 1, columns j and j + 1, at shares t and s."""
     above = (1 - s) * image[i, j] + s * image[i, j + 1]
     return (1 - t) * above + t * ((1 - s) * image[i + 1, j] + s * image[i + 1, j + 1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def epipolar_error(flow: np.ndarray, seen: Projection) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split the flow (H, W, 2), px, to a neighbour warped by `seen`.
 
@@ -111,7 +113,7 @@ def epipolar_error(flow: np.ndarray, seen: Projection) -> tuple[np.ndarray, np.n
     return log_factor, squared, across
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def combine(log_factor: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Combine (N, H, W) estimates by Cauchy's M-estimator.
 
@@ -148,7 +150,7 @@ def combine(log_factor: np.ndarray, information: np.ndarray) -> tuple[np.ndarray
     return mean, total, scatter, compared
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_comparison(
     total: np.ndarray, depth_mm: np.ndarray, T: np.ndarray, camera: Intrinsics, at_mm: np.ndarray, at_sigma: np.ndarray
 ) -> None:
@@ -180,7 +182,7 @@ def add_comparison(
                 total[1, i, j] += information
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def parallax_px(points: np.ndarray, far: np.ndarray, T: np.ndarray, camera: Intrinsics, size: np.ndarray) -> np.ndarray:
     """Return the median parallax, px per unit of ln depth, of points (n, 3) in each other camera, and of the far ones.
 
@@ -188,6 +190,9 @@ def parallax_px(points: np.ndarray, far: np.ndarray, T: np.ndarray, camera: Intr
     than half of the points.
     """
     found, slope, slope_far = np.zeros((len(T), 2)), np.empty(len(points)), np.empty(len(points))
+    far_points = 0
+    for n in range(len(points)):
+        far_points += far[n]
     for k in range(len(T)):
         seen, seen_far = 0, 0
         for n in range(len(points)):
@@ -206,7 +211,7 @@ def parallax_px(points: np.ndarray, far: np.ndarray, T: np.ndarray, camera: Intr
                 seen_far += 1
             seen += 1
         if 2 * seen > len(points):
-            found[k, 0] = np.median(slope[:seen])
-        if 2 * seen_far > far.sum():
-            found[k, 1] = np.median(slope_far[:seen_far])
+            found[k, 0] = median(slope[:seen])
+        if 2 * seen_far > far_points:
+            found[k, 1] = median(slope_far[:seen_far])
     return found

@@ -14,11 +14,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.flow.corners import Correspondences2D3D
 from scopemap.engine.frame import REGIONS
+from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.geometry.least_squares import (
     RAYLEIGH_TO_SIGMA,
     DenseModel,
@@ -138,7 +138,7 @@ def _projected(
     return focal * xy + [camera.cx, camera.cy], along, in_front
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _normal_equations(T, points_mm, pixels, along, intrinsics, scale, unit_mm):  # type: ignore[no-untyped-def]
     """Summed hessian (6, 6), gradient (6,) and cost of Cauchy-weighted errors; infinite cost behind the camera."""
     fx, fy, cx, cy = intrinsics

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numba import njit
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.tracking.residuals import View
 
@@ -50,7 +50,7 @@ def build_pyramid(
             grey, weight, depth = (p[: 2 * height, : 2 * width] for p in (grey, weight, depth))
             grey, weight = _halve_image(grey, weight, (width, height))
             known = frame.depth_mm is not None
-            depth = _halve_depth(depth) if known else np.full((height, width), np.nan, np.float32)
+            depth = _halve_depth(np.ascontiguousarray(depth)) if known else np.full((height, width), np.nan, np.float32)
             camera = camera.resized(width, height)
         if level >= finest:
             slope = _slope(depth, camera) if use_slope else np.zeros((*depth.shape, 2), np.float32)
@@ -94,23 +94,20 @@ def _halve_image(grey: np.ndarray, weight: np.ndarray, size: tuple[int, int]) ->
     return mean, (share > 0.5).astype(np.float32)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _halve_depth(depth_mm):  # type: ignore[no-untyped-def]
     """Mean of the known depths of four pixels on the nearest of their surfaces (within 5 %)."""
     h, w = depth_mm.shape[0] // 2, depth_mm.shape[1] // 2
-    out = np.full((h, w), np.nan, np.float32)
+    out = np.empty((h, w), np.float32)
     for row in range(h):
         for column in range(w):
-            block = depth_mm[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
-            nearest = np.inf
-            for d in block.flat:
-                if d < nearest:
-                    nearest = d
-            total, count = 0.0, 0
-            for d in block.flat:
-                if d <= 1.05 * nearest:
-                    total += d
-                    count += 1
-            if count > 0:
-                out[row, column] = total / count
+            nearest, total, count = np.inf, 0.0, 0
+            for n in range(4):
+                depth = depth_mm[2 * row + n // 2, 2 * column + n % 2]
+                nearest = depth if depth < nearest else nearest
+            for n in range(4):
+                depth = depth_mm[2 * row + n // 2, 2 * column + n % 2]
+                if depth <= 1.05 * nearest:
+                    total, count = total + depth, count + 1
+            out[row, column] = total / count if count > 0 else np.nan
     return out

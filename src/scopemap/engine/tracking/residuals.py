@@ -26,7 +26,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from scopemap.engine.geometry.kernels import inner_kernel, kernel
 
 PARAMETERS = 8  # of an alignment: rotation, translation, gain and bias
 _MAX_SURFACE_SPREAD = 0.1  # by hand: of four neighbouring depths on one surface, relative
@@ -82,14 +83,14 @@ class NormalEquations(NamedTuple):
     weight: float
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _unprojected(depth_mm, K, row, column):  # type: ignore[no-untyped-def]
     """Point X of a reference pixel; K: intrinsics."""
     depth = float(depth_mm[row, column])
     return depth * (column - K[2]) / K[0], depth * (row - K[3]) / K[1], depth
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _projected(point, T, G, usable):  # type: ignore[no-untyped-def]
     """Return X', its projection (offset in its cell; the cell's column and row), and its weight (0 = outside)."""
     X, Y, Z = point
@@ -108,7 +109,7 @@ def _projected(point, T, G, usable):  # type: ignore[no-untyped-def]
     return (x, y, z), (u - i, v - j, i, j), float(weight)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _bilinear(image, c, place):  # type: ignore[no-untyped-def]
     """Value of channel c and its exact derivatives along x and y."""
     a, b, i, j = place
@@ -118,7 +119,7 @@ def _bilinear(image, c, place):  # type: ignore[no-untyped-def]
     return top + b * (bottom - top), (1 - b) * (i10 - i00) + b * (i11 - i01), bottom - top
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _light(point, moved, slope, T, gamma):  # type: ignore[no-untyped-def]
     """Return L of a point X with slope (a, b) that is now at X', and -d ln L / dX' for translations."""
     (X, Y, Z), (x, y, z), (a, b) = point, moved, slope
@@ -138,7 +139,7 @@ def _light(point, moved, slope, T, gamma):  # type: ignore[no-untyped-def]
     return lamp, (kx, ky, gamma * (3.0 * z / square - mz / lift))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _plane_distance(depth, moved, place, G):  # type: ignore[no-untyped-def]
     """Distance of X' from the tangent plane of the current depth (1, H, W), mm, its derivative; NaN across an edge."""
     (x, y, z), (_, _, i, j) = moved, place
@@ -158,7 +159,7 @@ def _plane_distance(depth, moved, place, G):  # type: ignore[no-untyped-def]
     return (D - z) / length, (gx / length, gy / length, gz / length)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def depth_residuals(reference, current, T_current_reference, unit_mm):  # type: ignore[no-untyped-def]
     """Return the geometric residual (H, W) float32 on the reference's grid, NaN where there is none."""
     # Outside the loop: numba counts references of arrays that are read from a tuple.
@@ -175,7 +176,7 @@ def depth_residuals(reference, current, T_current_reference, unit_mm):  # type: 
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def residual_images(reference, current, T_current_reference, affine, loss):  # type: ignore[no-untyped-def]
     """Return residuals (C, H, W) float32 on the reference's grid, NaN where a pixel is not used."""
     depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
@@ -200,7 +201,7 @@ def residual_images(reference, current, T_current_reference, affine, loss):  # t
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def compared_pixels(reference, current, T_current_reference):  # type: ignore[no-untyped-def]
     """Return the last channel's expected values, residuals (N,) float32, and the number of usable pixels."""
     depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
@@ -222,7 +223,7 @@ def compared_pixels(reference, current, T_current_reference):  # type: ignore[no
     return expected[:count], residuals[:count], usable_count
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _huber(r, s, threshold, weight):  # type: ignore[no-untyped-def]
     """Cost and information of a residual."""
     size, information = abs(r), weight / (s * s)
@@ -231,14 +232,14 @@ def _huber(r, s, threshold, weight):  # type: ignore[no-untyped-def]
     return information * threshold * s * (size - 0.5 * threshold * s), information * threshold * s / size
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _rotation_derivative(moved, g):  # type: ignore[no-untyped-def]
     """Derivative by rotation, x' cross g, from the derivative g by X'."""
     (x, y, z), (gx, gy, gz) = moved, g
     return y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@inner_kernel(fastmath={"reassoc", "contract"})
 def _add(hessian, gradient, J, r, information, count):  # type: ignore[no-untyped-def]
     """Add the first `count` residuals r (N,) with derivatives J (8, N); fastmath vectorises the sums."""
     for k in range(PARAMETERS):
@@ -253,7 +254,7 @@ def _add(hessian, gradient, J, r, information, count):  # type: ignore[no-untype
             hessian[k, m] += total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[no-untyped-def]
     """Sums over all pixels: upper triangle of the hessian (8, 8), gradient (8,), cost, weight."""
     depth_mm, weights, K = reference.depth_mm, reference.weight, reference.intrinsics

@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from scopemap.engine.geometry.kernels import inner_kernel, kernel
 from scopemap.engine.geometry.least_squares import RAYLEIGH_TO_SIGMA
 from scopemap.engine.geometry.median import median
 
@@ -90,7 +90,7 @@ def at_rest(scene: Scene) -> Start:
     return Start(np.tile(np.eye(3, 4), (scene.seen.shape[1], 1, 1)), scene.expected.copy(), scene.lens.copy())
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def adjusted(scene: Scene, begin: Start, most: int, min_decrease: float) -> WindowSolution:
     """Return what is found from a start in `most` iterations, or until one lowers the cost by less than a share."""
     damping, found = 0.0, _linearised(scene, begin, _errors(scene, begin))
@@ -110,7 +110,7 @@ def adjusted(scene: Scene, begin: Start, most: int, min_decrease: float) -> Wind
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _errors(scene: Scene, state: Start) -> np.ndarray:
     """Return the reprojection errors (N, K, 2), px; NaN where not observed, infinite behind a camera."""
     # Outside the loop: numba counts references of arrays that are read from a tuple.
@@ -134,14 +134,14 @@ def _errors(scene: Scene, state: Start) -> np.ndarray:
     return error
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inner_kernel
 def _moved(T: np.ndarray, k: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     X = T[k, 0, 0] * x + T[k, 0, 1] * y + T[k, 0, 2] * z + T[k, 0, 3]
     Y = T[k, 1, 0] * x + T[k, 1, 1] * y + T[k, 1, 2] * z + T[k, 1, 3]
     return X, Y, T[k, 2, 0] * x + T[k, 2, 1] * y + T[k, 2, 2] * z + T[k, 2, 3]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _bend(wanted: float, b: float) -> float:
     """Return the factor of a radius, half widths, that the lens bends a straight one by: Newton's method."""
     if b == 0 or wanted == 0:
@@ -154,7 +154,7 @@ def _bend(wanted: float, b: float) -> float:
     return radius / wanted
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _robust_sigma(error: np.ndarray) -> float:
     lengths, count = np.empty(error.size // 2), 0
     for n in range(error.shape[0]):
@@ -165,7 +165,7 @@ def _robust_sigma(error: np.ndarray) -> float:
     return max(RAYLEIGH_TO_SIGMA * median(lengths[:count]), _MIN_SIGMA_PX) if count else _MIN_SIGMA_PX
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _cost(scene: Scene, state: Start, error: np.ndarray, sigma_px: float) -> float:
     cost, log_depth, expected, sigma = 0.0, state.log_depth, scene.expected, scene.sigma
     for n in range(error.shape[0]):
@@ -183,7 +183,7 @@ def _cost(scene: Scene, state: Start, error: np.ndarray, sigma_px: float) -> flo
     return cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution:
     """Return the normal equations at a state; A with the prior of the lens."""
     points, partners, sigma_px = error.shape[0], error.shape[1], _robust_sigma(error)
@@ -243,7 +243,7 @@ def _linearised(scene: Scene, state: Start, error: np.ndarray) -> WindowSolution
     return WindowSolution(state, error, sigma_px, A, scores, E, h, g)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _stepped(scene: Scene, found: WindowSolution, damping: float) -> Start:
     """Return the state after a damped Gauss-Newton step; points move in inverse depth, which parallax is linear in."""
     state, A, E, g, h, scores = found.state, found.A, found.E, found.g, found.h, found.scores
@@ -276,7 +276,7 @@ def _stepped(scene: Scene, found: WindowSolution, damping: float) -> Start:
     return Start(turned, depths, lens)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _solve(matrix: np.ndarray, wanted: np.ndarray) -> None:
     """Put the solution in place of `wanted` (C,), by Cholesky's factors of a matrix (C, C), of which the lower half."""
     size = len(wanted)
@@ -296,7 +296,7 @@ def _solve(matrix: np.ndarray, wanted: np.ndarray) -> None:
         wanted[j] /= matrix[j, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inner_kernel
 def _turn(step: np.ndarray, k: int, T: np.ndarray, turned: np.ndarray) -> None:
     """Put pose k (3, 4), turned by a rotation vector and then moved, into `turned`: Rodrigues' formula.
 
