@@ -142,6 +142,22 @@ def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
     assert np.array_equal(np.bincount(fewer.point, minlength=len(fewer_points.host)), counts[::every])
 
 
+def test_observations_between_parts_alone_and_the_median_depth_of_some_keyframes() -> None:
+    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2)), DisFlow())
+    for number in range(4):
+        tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)), number))
+    points, observations = tracks.collected()
+    part_of = np.array([0, 0, 1, 1])
+    between = part_of[points.host[observations.point]] != part_of[observations.keyframe]
+    assert 0 < between.sum() < len(between)
+    same_points, found = tracks.collected(across=part_of)
+    assert np.array_equal(same_points.pixel, points.pixel)
+    for part, wanted in zip(found.columns, observations.columns, strict=True):
+        assert np.array_equal(part, wanted[between])
+    assert tracks.median_depth_mm([1, 2]) == tracks.collected([1, 2])[0].median_mm
+    assert tracks.median_depth_mm([]) is None
+
+
 def test_what_windows_have_matched_is_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
     matched, both_ways = Mock(wraps=feature_tracks._matched), 2
     frames = [plane_scene.frame(plane_scene.pose(at_mm=(1.5 * n, 0.5 * n, 0.0)), n) for n in range(5)]

@@ -129,10 +129,11 @@ class Backend:
     def split(self, relocalised: Collection[tuple[Part, Part]]) -> dict[Part, int]:
         """Split maps after the last keyframe, where nothing supports a motion across a loss: see `split_maps`."""
         self.settle()
-        parts = {(pose.map, pose.segment) for pose in self._tracked}
+        parts = list(dict.fromkeys((pose.map, pose.segment) for pose in self._tracked))
         if self._camera is None or len(parts) == len({number for number, _ in parts}):
             return {}
-        points, observations = self._tracks.collected()
+        part_of = np.array([parts.index((pose.map, pose.segment)) for pose in self._tracked])
+        points, observations = self._tracks.collected(across=part_of)
         T = np.stack([pose.T_world_camera for pose in self._tracked])
         problem = BundleProblem(inverse(T), points, observations, Priors(), np.zeros((0, 2), int), self._camera.fx)
         pairs = np.column_stack([points.host[observations.point], observations.keyframe])
@@ -173,11 +174,23 @@ class Backend:
             if not alone.correction.refused:
                 break
         found, worlds = self._merged_and_adjusted(map_number, allowed, alone)
-        correction = found.correction if len(worlds) > 1 else self._with_moving_tissue(found, worlds)
-        if not correction.refused and correction.tissue is None:
-            tested = found if alone.correction.refused else alone  # the main map tells enough of the lens
-            correction = replace(correction, lens_residual=lens_residual(tested.problem, tested.rigid))
+        correction = self._tested(found, alone, worlds)
         return replace(correction, S_common_map=worlds, tracked=tracked or {})
+
+    def _tested(self, found: AdjustedMaps, alone: AdjustedMaps, worlds: Mapping[int, Similarity]) -> FrameCorrection:
+        """Return the correction with tissue that moves, or with what the views ask of the lens where none does.
+
+        Both are looked for at the same time. alone : the main map's own adjustment, which tells enough of the lens.
+        """
+        tested = found if alone.correction.refused else alone
+        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="lens") as beside:
+            lens = None
+            if not found.correction.refused:
+                lens = beside.submit(lens_residual, tested.problem, tested.rigid)
+            correction = found.correction if len(worlds) > 1 else self._with_moving_tissue(found, worlds)
+            if lens is None or correction.tissue is not None:
+                return correction
+            return replace(correction, lens_residual=lens.result())
 
     def _merged_and_adjusted(
         self, main: int, allowed: Collection[int], alone: AdjustedMaps
@@ -229,12 +242,14 @@ class Backend:
     def _merged(self, map_number: int, allowed: Collection[int]) -> dict[int, Similarity]:
         """Return Sim(3) to the common world of the map and of the allowed maps that loop closures merge with it."""
         map_of = np.array([pose.map for pose in self._tracked])
-        points, _ = self._tracks.collected(np.flatnonzero(map_of == map_number))
-        if len(set(map_of.tolist())) < 2 or not len(points.log_depth):
+        if len(set(map_of.tolist())) < 2:
+            return {map_number: self._unit(map_number)}
+        depth_mm = self._tracks.median_depth_mm(np.flatnonzero(map_of == map_number))
+        if depth_mm is None:
             return {map_number: self._unit(map_number)}
         chosen = np.flatnonzero(np.isin(map_of, [map_number, *allowed])).tolist()
         loops, T_world_camera = self._loops_among(chosen, -self._path.drift[chosen]), self._path.T_world_camera[chosen]
-        worlds = merge_maps(T_world_camera, map_of[chosen].tolist(), loops, map_number, points.median_mm)
+        worlds = merge_maps(T_world_camera, map_of[chosen].tolist(), loops, map_number, depth_mm)
         return {number: self._unit(map_number).after(S) for number, S in worlds.items()}
 
     def _unit(self, map_number: int) -> Similarity:

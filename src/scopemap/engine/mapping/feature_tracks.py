@@ -201,13 +201,23 @@ class FeatureTracks:
             first = self._add_points(host, pixels[known], log_depth[known], np.zeros(known.sum()))
             self._add_matches(first + np.arange(known.sum()), other, observed[known])
 
+    def median_depth_mm(self, keyframes: Collection[int]) -> float | None:
+        """Return the median of the estimated depths of the points of some keyframes, mm; None without any."""
+        points = self._points.read()
+        own = points["log_depth"][np.isin(points["host"], list(keyframes))]
+        return float(np.exp(np.median(own))) if len(own) else None
+
     def collected(
-        self, keyframes: Collection[int] | None = None, most_observations: int | None = None
+        self,
+        keyframes: Collection[int] | None = None,
+        most_observations: int | None = None,
+        across: np.ndarray | None = None,
     ) -> tuple[Points, Observations]:
         """Return all points, sorted by host, and their observations, sorted by point.
 
         keyframes : increasing numbers of the keyframes that are used, None: all. The result numbers keyframes by their
-        place in it. most_observations : above about so many only every n-th point is returned.
+        place in it. most_observations : above about so many only every n-th point is returned. across : (K,) int, part
+        of each keyframe: only observations between parts are returned.
         """
         new_number = np.full(self.keyframe_count, -1)
         chosen = range(self.keyframe_count) if keyframes is None else keyframes
@@ -216,13 +226,17 @@ class FeatureTracks:
         host = new_number[points["host"]]
         by_host = np.argsort(host, kind="stable")[np.count_nonzero(host < 0) :]
         if most_observations is not None:
-            found = sum(len(_among(part, host, new_number)) for part in self._matches.parts())
-            by_host = by_host[:: max(-(-found // most_observations), 1)]
+            count = sum(len(_among(part, host, new_number)) for part in self._matches.parts())
+            by_host = by_host[:: max(-(-count // most_observations), 1)]
         place = np.full(len(host), -1)
         place[by_host] = np.arange(len(by_host))
-        matches = np.concatenate(
-            [np.zeros(0, _MATCH), *(_among(part, place, new_number) for part in self._matches.parts())]
-        )
+        found = [np.zeros(0, _MATCH)]
+        for part in self._matches.parts():
+            rows = _among(part, place, new_number)
+            if across is not None:
+                rows = rows[across[points["host"][rows["point"]]] != across[rows["keyframe"]]]
+            found.append(rows)
+        matches = np.concatenate(found)
         matches = matches[np.argsort(place[matches["point"]], kind="stable")]
         pixel, log_depth, sigma = (points[name][by_host] for name in ("pixel", "log_depth", "sigma"))
         point, keyframe = place[matches["point"]], new_number[matches["keyframe"]]
