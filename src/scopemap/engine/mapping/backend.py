@@ -167,15 +167,27 @@ class Backend:
             self._take(self._finder.between([pose.map for pose in self._tracked]))
             self._all_weighed = True
         allowed = {pose.map for pose in self._tracked} if among is None else set(among)
-        # Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
-        for share in (1.0, 0.0) if any(self._log_scales) else (0.0,):
-            self._path = path_without_drift(self._tracked, share * np.array(self._log_scales))
-            alone = self._adjusted({map_number: self._unit(map_number)}, map_number)
-            if not alone.correction.refused:
-                break
+        alone = self._alone(map_number)
         found, worlds = self._merged_and_adjusted(map_number, allowed, alone)
         correction = self._tested(found, alone, worlds)
         return replace(correction, S_common_map=worlds, tracked=tracked or {})
+
+    def _alone(self, map_number: int) -> AdjustedMaps:
+        """Return the adjustment of one map, the drift of the scale removed from all where that is confirmed.
+
+        Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
+        """
+
+        def without_drift(share: float) -> AdjustedMaps:
+            self._path = path_without_drift(self._tracked, share * np.array(self._log_scales))
+            return self._adjusted({map_number: self._unit(map_number)}, map_number)
+
+        if any(self._log_scales):
+            found = without_drift(1.0)
+            if not found.correction.refused:
+                return found
+            del found  # for memory
+        return without_drift(0.0)
 
     def _tested(self, found: AdjustedMaps, alone: AdjustedMaps, worlds: Mapping[int, Similarity]) -> FrameCorrection:
         """Return the correction with tissue that moves, or with what the views ask of the lens where none does.
@@ -309,17 +321,20 @@ class Backend:
         T_map_camera, to_common = self._path.T_world_camera[chosen], [worlds[pose.map] for pose in poses]
         T_world_camera = np.stack([S.transform_poses(T) for S, T in zip(to_common, T_map_camera, strict=True)])
         log_unit = np.log([S.scale for S in to_common]) - self._path.drift[chosen]
+        pairs, graph = tracked_pairs([self._frames[k] for k in chosen], poses), None
+        # Before the observations are read: both fill memory.
+        if loops := self._loops_among(chosen, log_unit):
+            depth_mm = self._tracks.median_depth_mm(chosen, log_unit)
+            assert depth_mm is not None  # loops have points
+            graph = optimise_pose_graph(T_world_camera, pairs, loops, depth_mm)
         points, observations = self._tracks.collected(chosen, self.most_observations)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
         rotation_rad = math.radians(settings.rotation_sigma_deg)
         priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
-        pairs = tracked_pairs([self._frames[k] for k in chosen], poses)
         T, correlated = inverse(T_world_camera), settings.correlated_observations
         problem = BundleProblem(T, points, observations, priors, pairs, self._camera.fx, correlated=correlated)
-        loops = self._loops_among(chosen, log_unit)
-        if not loops:
+        if graph is None:
             return problem, np.zeros((0, 2), int)
-        graph = optimise_pose_graph(T_world_camera, pairs, loops, points.median_mm)
         log_depth = points.log_depth + graph.log_scale[points.host]
         start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
         return replace(problem, start=start), graph.accepted

@@ -201,11 +201,16 @@ class FeatureTracks:
             first = self._add_points(host, pixels[known], log_depth[known], np.zeros(known.sum()))
             self._add_matches(first + np.arange(known.sum()), other, observed[known])
 
-    def median_depth_mm(self, keyframes: Collection[int]) -> float | None:
-        """Return the median of the estimated depths of the points of some keyframes, mm; None without any."""
-        points = self._points.read()
-        own = points["log_depth"][np.isin(points["host"], list(keyframes))]
-        return float(np.exp(np.median(own))) if len(own) else None
+    def median_depth_mm(self, keyframes: Collection[int], log_factor: np.ndarray | None = None) -> float | None:
+        """Return the median of the estimated depths of the points of some keyframes, mm; None without any.
+
+        log_factor : (n,) ln of the factor of each keyframe's depth; None: 1.
+        """
+        points, log_factors = self._points.read(), np.full(self.keyframe_count, np.nan)
+        log_factors[list(keyframes)] = 0.0 if log_factor is None else log_factor
+        log_depth = points["log_depth"] + log_factors[points["host"]]
+        log_depth = log_depth[np.isfinite(log_depth)]
+        return float(np.exp(np.median(log_depth))) if len(log_depth) else None
 
     def collected(
         self,
