@@ -16,7 +16,7 @@ from scopemap.apps.export.formats import export_run
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.agreement import surface_agreement, vertex_sigmas
+from scopemap.engine.fusion.agreement import surface_agreement, surface_views, vertex_sigmas
 from scopemap.engine.fusion.mesh_files import T_GLTF_WORLD, read_mesh, save_mesh_over_time
 from scopemap.engine.fusion.reference_state import SurfaceState, in_surface_state
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
@@ -87,9 +87,10 @@ def test_frames_of_different_states_agree_with_one_surface() -> None:
         one_state.integrate(in_surface_state(frame, states))
         mean.integrate(frame)
     sharp, smeared = one_state.extract_mesh(), mean.extract_mesh()
-    found, worse = surface_agreement(sharp, settings, frames, states), surface_agreement(smeared, settings, frames)
+    views = surface_views(sharp, frames, states)
+    found, worse = (surface_agreement(seen, settings) for seen in (views, surface_views(smeared, frames)))
     assert found["depth_error"] < 0.002 < 0.015 < worse["depth_error"]
-    sigma_mm = vertex_sigmas(sharp, frames, states)
+    sigma_mm = vertex_sigmas(len(sharp.vertices), views)
     assert np.nanmedian(sigma_mm) == pytest.approx(0.01 * Z_MM, rel=0.1)  # that of the depth itself
 
 

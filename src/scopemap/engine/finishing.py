@@ -21,7 +21,7 @@ import trimesh
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import FusionSettings
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.agreement import surface_agreement, vertex_sigmas
+from scopemap.engine.fusion.agreement import surface_agreement, surface_views, vertex_sigmas
 from scopemap.engine.fusion.finish import finished, with_normals_alone
 from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.fusion.free_space import FreeSpace, views_among
@@ -149,9 +149,10 @@ class SubmapFinishing:
 
     def check(self, fused: FusedSurface) -> SubmapSurface:
         """Return the finished surface with its agreement with some frames, and what there is to say about it."""
-        mesh, frames = fused.mesh, self._checked.frames(self._fusion.store)
-        agreement = surface_agreement(mesh, fused.settings, frames, self._states)
-        mesh.vertex_attributes["sigma_mm"] = vertex_sigmas(mesh, frames, self._states)
+        mesh = fused.mesh
+        views = surface_views(mesh, self._checked.frames(self._fusion.store), self._states)
+        agreement = surface_agreement(views, fused.settings)
+        mesh.vertex_attributes["sigma_mm"] = vertex_sigmas(len(mesh.vertices), views)
         adjusted = self._adjustment_notices()
         confirmed = bool(adjusted) or self._pipeline.estimators.anchor.is_measured
         notices = adjusted + self._fusion_notices(fused)

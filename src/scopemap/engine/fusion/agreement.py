@@ -115,44 +115,59 @@ def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
     return figures
 
 
-def surface_agreement(
-    mesh: trimesh.Trimesh, settings: FusionSettings, frames: list[Frame], states: TissueStates | None = None
-) -> dict[str, float]:
-    """Return the figures of a fusion's surface with some of its frames; {} without a surface or frames.
+class SurfaceView(NamedTuple):
+    """A frame with depth and pose, the vertices (V, 3) of a surface as they were then, world mm, and its rendering."""
+
+    frame: Frame
+    vertices: np.ndarray
+    rendering: Rendering
+
+
+def surface_views(mesh: trimesh.Trimesh, frames: list[Frame], states: TissueStates | None = None) -> list[SurfaceView]:
+    """Return the views of a fusion's surface at some of its frames; [] without a surface or frames.
 
     states : of tissue that moves, with which the surface is in that of each frame.
     """
-    agreements = []
+    views = []
     for frame in frames if len(mesh.faces) else []:
         if frame.T_world_camera is not None and frame.depth_mm is not None:
-            depth_mm = np.where(frame.valid, frame.depth_mm, np.nan)
-            seen = (frame.camera, frame.T_world_camera, frame.rgb, depth_mm)
             then = mesh if states is None else states.moved(mesh, frame.index)
-            agreements.append(compare_with_frame(then, *seen, albedo=settings.colours == "albedo")[0])
+            rendering = render_mesh(then, frame.camera, frame.T_world_camera)
+            views.append(SurfaceView(frame, np.asarray(then.vertices), rendering))
+    return views
+
+
+def surface_agreement(views: list[SurfaceView], settings: FusionSettings) -> dict[str, float]:
+    """Return the figures of a fusion's surface with some of its frames; {} without any."""
+    agreements = []
+    for frame, _, rendering in views:
+        depth_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
+        if settings.colours == "albedo":
+            rendering = lit_like(rendering, frame.camera, frame.rgb, depth_mm)
+        agreements.append(compare_rendering(rendering, frame.rgb, depth_mm))
     return agreement_figures(agreements) if agreements else {}
 
 
-def vertex_sigmas(mesh: trimesh.Trimesh, frames: list[Frame], states: TissueStates | None = None) -> np.ndarray:
+def vertex_sigmas(count: int, views: list[SurfaceView]) -> np.ndarray:
     """Return the standard deviation of each vertex along the lines of sight, (V,) float32, mm; NaN: no frame sees it.
 
     It is the root mean square, over the frames that see the vertex, of what their depth and the surface differ by or of
     the depth's own standard deviation where that is larger. Many frames do not make it smaller: their errors are alike.
+    count : of the vertices, V.
     """
-    total, count = np.zeros(len(mesh.vertices)), np.zeros(len(mesh.vertices))
-    for frame in frames if len(mesh.faces) else []:
-        if frame.T_world_camera is None or frame.depth_mm is None:
-            continue
-        then = mesh if states is None else states.moved(mesh, frame.index)
-        z = transform(inverse(frame.T_world_camera), np.asarray(then.vertices))
-        shown = render_mesh(then, frame.camera, frame.T_world_camera).depth_mm
-        pixels = frame.camera.project(z)
+    total, seen_by = np.zeros(count), np.zeros(count)
+    for frame, vertices, rendering in views:
+        assert frame.T_world_camera is not None
+        in_camera = transform(inverse(frame.T_world_camera), vertices)
+        pixels, shown = frame.camera.project(in_camera), rendering.depth_mm
         limits = [frame.camera.width - 0.5, frame.camera.height - 0.5]
         inside = np.flatnonzero(((pixels >= -0.5) & (pixels < limits)).all(axis=1))
-        (column, row), z_mm = np.round(pixels[inside]).astype(int).T, z[inside, 2]
+        (column, row), z_mm = np.round(pixels[inside]).astype(int).T, in_camera[inside, 2]
         error = np.abs(np.asarray(frame.depth_mm)[row, column] - z_mm)
         if frame.depth_sigma_mm is not None:
             error = np.fmax(error, np.asarray(frame.depth_sigma_mm)[row, column])
         seen = frame.valid[row, column] & np.isfinite(error) & (np.abs(shown[row, column] / z_mm - 1) < _SAME_SURFACE)
         total[inside[seen]] += error[seen] ** 2
-        count[inside[seen]] += 1
-    return np.sqrt(np.divide(total, count, out=np.full(len(total), np.nan), where=count > 0)).astype(np.float32)
+        seen_by[inside[seen]] += 1
+    mean = np.divide(total, seen_by, out=np.full(count, np.nan), where=seen_by > 0)
+    return np.sqrt(mean).astype(np.float32)
