@@ -155,25 +155,37 @@ class FeatureTracks:
         """Match a new keyframe both ways with recent ones of its map, the latest first; return what is known then."""
         if not recent:
             return known
-        latest, size = recent[-1], new.frame.valid.shape[::-1]
+        latest = recent[-1]
         coarse = known.coarse if known.latest == latest.frame.index else None
         if coarse is None:
-            small = small_flow_size(self._flow, size)
-            coarse = self._flow.estimate_both(resized(latest.frame.rgb, small), resized(new.frame.rgb, small))
+            coarse = self._flow.estimate_both(*self._small_pictures(latest, new))
         pairs, overlaps = dict(known.pairs), True
         for past in reversed(recent):
             gap, number = new.number_in_map - past.number_in_map, past.frame.index
             wanted = overlaps and gap in self._gaps
             start = self._start(past, new, coarse, gap, wanted=wanted)
             if wanted and number not in pairs and start is not None:
-                flows = flow_at(start[0], size), flow_at(start[1], size)
-                pairs[number] = PairMatches(_matched(past, new, flows), _matched(new, past, flows[::-1]))
+                pairs[number] = _pair(past, new, start)
+                expected = None
+                if gap == 1 and not _overlap(past, new, pairs[number]):
+                    expected = _expected_flows(past.frame, new.frame)
+                if expected is not None:  # as across a cut: poses tell where flow finds nothing by itself
+                    pictures = self._small_pictures(past, new)
+                    size = pictures[0].shape[1::-1]
+                    start = flow_at(expected[0], size), flow_at(expected[1], size)
+                    coarse = past.composed = self._flow.estimate_checked(*pictures, start)
+                    pairs[number] = _pair(past, new, coarse)
             if wanted and number in pairs:
                 found = pairs[number]
                 self._add_matches(past.first_point + found.of_past[0], new.number, found.of_past[1])
                 self._add_matches(new.first_point + found.of_new[0], past.number, found.of_new[1])
-                overlaps = found.corners >= _LEAST_MATCHED * (len(past.corners) + len(new.corners))
+                overlaps = _overlap(past, new, found)
         return known._replace(pairs=pairs, latest=latest.frame.index, coarse=coarse)
+
+    def _small_pictures(self, one: _FlowKeyframe, other: _FlowKeyframe) -> tuple[np.ndarray, np.ndarray]:
+        """Return both pictures at the size between which flow is computed."""
+        size = small_flow_size(self._flow, one.frame.valid.shape[::-1])
+        return resized(one.frame.rgb, size), resized(other.frame.rgb, size)
 
     def _start(
         self, past: _FlowKeyframe, new: _FlowKeyframe, coarse: FlowPair, gap: int, *, wanted: bool
@@ -288,6 +300,18 @@ def _among(matches: np.ndarray, place: np.ndarray, new_number: np.ndarray) -> np
     """Return the observations of points with a place (P,), not -1, in keyframes with a new number (K,)."""
     chosen: np.ndarray = matches[(place[matches["point"]] >= 0) & (new_number[matches["keyframe"]] >= 0)]
     return chosen
+
+
+def _pair(past: _FlowKeyframe, new: _FlowKeyframe, start: FlowPair) -> PairMatches:
+    """Return what is matched both ways between two keyframes, searched from flows of any size."""
+    size = new.frame.valid.shape[::-1]
+    flows = flow_at(start[0], size), flow_at(start[1], size)
+    return PairMatches(_matched(past, new, flows), _matched(new, past, flows[::-1]))
+
+
+def _overlap(past: _FlowKeyframe, new: _FlowKeyframe, found: PairMatches) -> bool:
+    """Return whether more is matched between two keyframes than by chance."""
+    return found.corners >= _LEAST_MATCHED * (len(past.corners) + len(new.corners))
 
 
 def _matched(host: _FlowKeyframe, other: _FlowKeyframe, flows: FlowPair) -> tuple[np.ndarray, np.ndarray]:
