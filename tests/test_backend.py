@@ -114,6 +114,16 @@ def test_corrections_are_interpolated_by_the_camera_motion() -> None:
     assert resting.pose(5, np.eye(4))[0, 3] == pytest.approx(2.0)
 
 
+def test_the_motion_from_a_keyframe_is_scaled_as_its_depth_is() -> None:
+    T = np.stack([np.eye(4), se3_exp(np.array([0, 0, 0, 4.0, 0, 0]))])
+    tracked = {0: _tracked(0, 0), 4: _tracked(0, 4), 10: _tracked(0, 10), 13: _tracked(10, 13)}
+    correction = FrameCorrection(np.array([0, 10]), T, np.log([1.4, 2.0]), tracked=tracked, depth_mm=50.0)
+    # Frame 10 was 10 mm from keyframe 0, whose depth asks for 14, where the adjustment has it.
+    for index, x_mm in ((0, 0), (4, 5.6), (10, 14), (13, 20)):
+        pose = correction.pose(index, tracked[index].T_world_camera)
+        assert pose[0, 3] == pytest.approx(x_mm)
+
+
 def test_the_step_of_a_keyframe_that_was_moved_as_it_came_is_spread_over_the_frames_that_lead_to_it() -> None:
     """Frames drift by 0.5 mm until the next keyframe, every tenth, which comes back to its place."""
     backend = Backend(MappingSettings(), DisFlow())

@@ -150,7 +150,7 @@ class FrameCorrection:
         """Return the corrected pose (4, 4) of the frame with this number."""
         before, after, share = self._between(index)
         T_world_camera = self._world(index).transform_poses(T_world_camera)
-        poses = [self._T_world_world(k, index) @ T_world_camera for k in (before, after)]
+        poses = [self._moved_with(k, index, T_world_camera) for k in (before, after)]
         return mean_near(poses[0], [poses[1]], [share])
 
     def depth_factor(self, index: int) -> float:
@@ -172,6 +172,20 @@ class FrameCorrection:
     def _factor(self, index: int, before: int, after: int, share: float) -> float:
         log_scale = (1 - share) * self._log_scale(before, index) + share * self._log_scale(after, index)
         return float(np.exp(log_scale)) * self._world(index).scale
+
+    def _moved_with(self, k: int, index: int, T_world_camera: np.ndarray) -> np.ndarray:
+        """Return the pose (4, 4) of a frame that moves with keyframe k.
+
+        Its motion from there, as tracked, is as long as the depth of the keyframe it was aligned to has it: they are
+        scaled alike. T_world_camera : (4, 4), as tracked, in the common world.
+        """
+        T: np.ndarray = self._T_world_world(k, index) @ T_world_camera
+        reference, number = self._reference(index), int(self.index[k])
+        if reference is not None and number in self.tracked:
+            keyframe = self._world(number).transform_poses(self.tracked[number].T_world_camera)
+            centre = (self.T_world_world[k] @ keyframe)[:3, 3]
+            T[:3, 3] = centre + np.exp(self.log_scale[reference]) * (T[:3, 3] - centre)
+        return T
 
     def _T_world_world(self, k: int, index: int) -> np.ndarray:
         """Return the correction (4, 4) of a frame near keyframe k, which it follows or leads to."""
