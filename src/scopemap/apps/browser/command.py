@@ -93,13 +93,14 @@ def _beside_a_command(window: BrowserWindow, view: Path, result: Path | None, *,
 
 def serve(window: BrowserWindow, *, browser: bool, quiet: bool, ends: Callable[[], bool] = lambda: False) -> None:
     """Run a window until Ctrl-C, or until it `ends`."""
-    if not quiet:
-        typer.echo(f"{window.url} until Ctrl-C")
-    if browser:
-        webbrowser.open(window.url)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, lambda number, frame: window.stop())
     try:
+        # Whoever has read the address may press Ctrl-C at once.
+        if not quiet:
+            typer.echo(f"{window.url} until Ctrl-C")
+        if browser:
+            webbrowser.open(window.url)
         window.run(ends)
     except KeyboardInterrupt:
         if not quiet:
