@@ -98,6 +98,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="rows whose names begin with this")
     parser.add_argument("--seed", type=int, default=SEED, help="of the phantoms; those that --out holds are used again")
     options = parser.parse_args()
+    if not any(name.startswith(options.only) for name in PHANTOMS):
+        parser.error(f"no row begins with {options.only!r}; rows: {'; '.join(PHANTOMS)}")
     with measuring.folder_or_scratch(options.out) as folder:
         folder.mkdir(parents=True, exist_ok=True)
         print_phantoms(folder, options.only, options.seed)

@@ -1,6 +1,7 @@
 """Feature tracks: corners of keyframes, matched in others by aligned patches, and loops.
 
-Flow is computed between successive keyframes only, and between small images. Patches in near keyframes are searched
+Flow is computed between successive keyframes only, and between small images; where it matches nothing, as across a
+cut, it is computed again from the flow that depth and poses as tracked predict. Patches in near keyframes are searched
 from the composed flows of those between; those in distant ones, whose parallax outweighs what flow lags behind, from
 where depth and poses as tracked have them.
 """

@@ -176,8 +176,10 @@ class FrameCorrection:
     def _moved_with(self, k: int, index: int, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the pose (4, 4) of a frame that moves with keyframe k.
 
-        Its motion from there, as tracked, is as long as the depth of the keyframe it was aligned to has it: they are
-        scaled alike. T_world_camera : (4, 4), as tracked, in the common world.
+        Tracking measures translation in units of the depth of the keyframe that the frame was aligned to. So the
+        translation from keyframe k is scaled as that depth is.
+
+        T_world_camera : (4, 4), as tracked, in the common world.
         """
         T: np.ndarray = self._T_world_world(k, index) @ T_world_camera
         reference, number = self._reference(index), int(self.index[k])
