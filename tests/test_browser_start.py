@@ -209,7 +209,11 @@ class Opened:
             self.page.wait_for_timeout(100)
 
     def press(self, name: str) -> None:
-        self.page.get_by_role("button", name=name, exact=True).click()
+        # Not `click()` of Playwright: it first waits until nothing moves, and the scene is drawn by the processor here,
+        # beside a run. A short run ended before.
+        button = self.page.get_by_role("button", name=name, exact=True)
+        self.until(button.is_enabled)
+        button.evaluate("button => button.click()")
 
     def points(self) -> int:
         found = SIZE_SO_FAR.search(self.text())
