@@ -30,9 +30,10 @@ def test_two_views_are_set(tmp_path: Path) -> None:
     assert "it is set below" in words_of(found)
 
 
-def test_two_fields_are_set(tmp_path: Path) -> None:
+def test_two_fields_need_no_option(tmp_path: Path) -> None:
     found = looked(encode(tmp_path / "woven.mp4", [woven(2 * number) for number in range(12)]))
-    assert found.suggested.arguments() == ["--deinterlace"]
+    assert found.suggested.arguments() == []
+    assert "runs use one field" in words_of(found)
 
 
 def test_frames_without_tissue_at_the_ends_are_left_out(tmp_path: Path) -> None:
@@ -107,7 +108,6 @@ def test_a_choice_makes_the_arguments_of_a_run() -> None:
         Path("/v/c d.yaml"),
         0,
         "none",
-        True,
         12.5,
         "-50:",
         ((1, 2, 3, 4),),
@@ -117,7 +117,7 @@ def test_a_choice_makes_the_arguments_of_a_run() -> None:
     )
     assert choice.checked().arguments() == [
         *("--preset=realtime", "--scope=colonoscope", "--camera=/v/c d.yaml", "--stereo=none", "--fps=12.5"),
-        *("--frames=-50:", "--near-far=5:80", "--set=mask.files=/m", "--deinterlace", "--redact=1,2,3,4"),
+        *("--frames=-50:", "--near-far=5:80", "--set=mask.files=/m", "--redact=1,2,3,4"),
     ]
     assert RunChoice().arguments() == []
 

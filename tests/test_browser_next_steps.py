@@ -47,8 +47,8 @@ def test_choices_and_values() -> None:
     (one,) = next_runs("Run again with --set mapping.method=local.", result)
     assert one.label(*one.choices) == "Run again with --set mapping.method=local"
     assert one.arguments(*one.choices) == ["--set", "mapping.method=local"]
-    (flag,) = next_runs("Run again with --deinterlace.", result)
-    assert (flag.label(), flag.arguments()) == ("Run again with --deinterlace", ["--deinterlace"])
+    (flag,) = next_runs("Run again with --camera-at-rest.", result)
+    assert (flag.label(), flag.arguments()) == ("Run again with --camera-at-rest", ["--camera-at-rest"])
     (moment,) = next_runs("Run again with --surface-at SECONDS for it.", result)
     assert moment.number is not None
     assert moment.number[1] <= moment.number[0] <= moment.number[2]

@@ -25,7 +25,7 @@ from scopemap.result.summary import summary_lines
 pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
 
 KNOWN = {"known": True, "source": "a ruler", "measured": True}
-INTERLACED = [Notice("input-interlaced").as_json()]
+NOT_ADJUSTED = [Notice("mapping-none").as_json()]
 FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
 
@@ -42,7 +42,7 @@ def ring(shown: ShownWindow) -> int:
 
 
 def test_it_says_what_the_summary_of_the_run_says(tmp_path: Path) -> None:
-    folder = draw_run(tmp_path, notices=INTERLACED)
+    folder = draw_run(tmp_path, notices=NOT_ADJUSTED)
     with shown_window() as shown:
         shown.show(ResultPage(folder))
         word, *lines = summary_lines(Result(folder))
@@ -61,7 +61,7 @@ def test_a_caution_starts_the_run_that_mends_it(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "video.mp4").write_bytes(b"")
     monkeypatch.setattr(BrowserRun, "start", lambda run: None)
     camera = FACTS | {"source": "70 deg", "origin": "assumed"}
-    folder = draw_run(tmp_path / "one", name=str(tmp_path / "video.mp4"), notices=INTERLACED, camera=camera)
+    folder = draw_run(tmp_path / "one", name=str(tmp_path / "video.mp4"), notices=NOT_ADJUSTED, camera=camera)
     with Workspace(tmp_path) as workspace, shown_window() as shown:
         shown.show(ResultPage(folder, workspace))
         shown.choose("Dropdown", "--scope", "laparoscope")
@@ -76,18 +76,18 @@ def test_a_caution_starts_the_run_that_mends_it(tmp_path: Path, monkeypatch: pyt
         run.status = "done"
         shown.until(lambda: "Colour by" in shown.labels("Dropdown"))
         shown.show(ResultPage(folder, workspace))
-        shown.press("Run again with --deinterlace")
-        assert workspace.runs.runs[-1].arguments[-1] == "--deinterlace"
+        shown.press("Run again with --set mapping.method=local")
+        assert workspace.runs.runs[-1].arguments[-2:] == ("--set", "mapping.method=local")
 
 
 def test_an_input_that_is_another_file_now_is_said(tmp_path: Path) -> None:
     video = tmp_path / "video.mp4"
     video.write_bytes(b"now")
     content = {"bytes": 7, "sha256": "0" * 64}
-    folder = draw_run(tmp_path / "one", name=str(video), notices=INTERLACED, input_content=content)
+    folder = draw_run(tmp_path / "one", name=str(video), notices=NOT_ADJUSTED, input_content=content)
     with Workspace(tmp_path) as workspace, shown_window() as shown:
         shown.show(ResultPage(folder, workspace))
-        shown.press("Run again with --deinterlace")
+        shown.press("Run again with --set mapping.method=local")
         assert "is another file now" in shown.window._error.content.replace("\\", "")
         assert not workspace.runs.runs
 

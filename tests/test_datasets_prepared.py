@@ -100,11 +100,11 @@ def test_the_calibration_beside_stereo_images_is_that_of_one_view(tmp_path: Path
 
 def test_interlaced_material_is_told_and_undone(tmp_path: Path) -> None:
     file = _video(tmp_path / "v.mp4", lambda number: woven(2 * number))
-    told = open_sequence(file)
+    told = open_sequence(file, settings=InputSettings(deinterlace="off"))
     assert told.warnings == [Notice("input-interlaced")]
-    undone = open_sequence(file, settings=InputSettings(deinterlace=True))
+    undone = open_sequence(file)
     assert undone.warnings == []
-    assert any("deinterlaced" in str(note) for note in undone.notes)
+    assert Notice("input-deinterlaced", {"why": "the video is interlaced"}) in undone.notes
     for comb, frame in zip(told.source.frames(slice(None)), undone.source.frames(slice(None)), strict=True):
         np.testing.assert_array_equal(frame.rgb[::2], comb.rgb[::2])
         assert combing(comb.rgb) > 10 * combing(frame.rgb)
@@ -117,6 +117,25 @@ def test_interlacing_does_not_matter_where_rows_are_averaged(tmp_path: Path) -> 
     assert Notice("input-interlaced-averaged") in halved.notes
     frame = next(halved.frames())
     assert combing(frame.rgb) < LEAST_COMBING
+    (picture,) = (one.rgb for one in halved.source.frames(slice(0, 1)))
+    assert combing(picture) > LEAST_COMBING
+
+
+def test_progressive_material_is_left_as_it_is_unless_asked(tmp_path: Path) -> None:
+    file = _video(tmp_path / "v.mp4", lambda number: tissue(2 * number))
+    kept, one_field = (open_sequence(file, settings=InputSettings(deinterlace=how)) for how in ("auto", "on"))
+    assert not any(isinstance(note, Notice) and "interlaced" in note.code for note in kept.notes)
+    assert Notice("input-deinterlaced", {"why": "as asked"}) in one_field.notes
+    (before,), (after,) = ([one.rgb for one in each.source.frames(slice(0, 1))] for each in (kept, one_field))
+    np.testing.assert_array_equal(before[::2], after[::2])
+    assert (before[1::2] != after[1::2]).any()
+
+
+def test_true_and_false_of_older_settings_are_read() -> None:
+    read = [InputSettings.model_validate({"deinterlace": value}).deinterlace for value in (True, "true", False, "off")]
+    assert read == ["on", "on", "off", "off"]
+    with pytest.raises(ValueError, match="deinterlace"):
+        InputSettings.model_validate({"deinterlace": 1})
 
 
 @pytest.mark.parametrize("kind", ["video", "folder"])

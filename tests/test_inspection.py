@@ -184,7 +184,7 @@ def test_segments_of_no_use(tmp_path: Path, change: Change, code: str, segment: 
 
 
 def test_fields_and_two_views_are_found_and_the_camera_may_be_that_of_one(tmp_path: Path) -> None:
-    assert by_code(inspected(tmp_path, combed))["interlaced"].advice == "--deinterlace"
+    assert by_code(inspected(tmp_path, combed))["interlaced"].advice.startswith("runs use one field")
     found, camera = inspected(tmp_path, beside), tmp_path / "camera.yaml"
     assert by_code(found)["stereo"].advice == "--stereo left-right"
     assert by_code(found)["scope"].message == "two views: typical of laparoscope"

@@ -88,9 +88,9 @@ def test_stereo_and_fields_by_option(pictures: list[np.ndarray], tmp_path: Path)
     assert (facts["camera"]["width"], facts["camera"]["height"]) == (width, height)
     assert facts["camera"]["fx"] == pytest.approx(0.8 * width)
     assert any(note.lower().startswith("stereo, top-bottom: the upper half") for note in said(facts))
-    assert any(note.lower().startswith("deinterlaced") for note in said(facts))
+    assert any(note.lower().startswith("one field of each picture") for note in said(facts))
     read = Config.load(file=out / "config.toml").input
-    assert (read.stereo, read.deinterlace, read.camera_fit) == ("top-bottom", True, "scale")
+    assert (read.stereo, read.deinterlace, read.camera_fit) == ("top-bottom", "on", "scale")
 
 
 @pytest.mark.parametrize(("rate_hz", "fps", "step"), [(30, 30, 1), (30, 15, 2), (60, 60, 1), (25, 25, 1), (24, 12, 2)])

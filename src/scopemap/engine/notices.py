@@ -45,12 +45,14 @@ KINDS: dict[str, _Kind] = {
     ),
     "checkpoint-damaged": _Kind("info", "The run began again at its first frame instead of resuming: {reason}."),
     "input-interlaced": _Kind(
-        "doubtful", "The video is interlaced: moving edges look like combs.", "Run again with --deinterlace."
+        "doubtful", "The video is interlaced, and you chose to use both fields: moving edges look like combs."
+    ),
+    "input-deinterlaced": _Kind(
+        "info", "One field of each picture is used, and the missing rows are interpolated: {why}."
     ),
     "input-interlaced-averaged": _Kind(
         "info",
         "The video is interlaced: the working size averages both fields, and fast motion is blurred.",
-        "Use one field with --deinterlace.",
     ),
     "input-resized": _Kind(
         "info", "{frames} pictures differ from {size} px by at most 1 % and were cut or completed (first: {first})."

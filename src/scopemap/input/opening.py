@@ -14,7 +14,6 @@ import numpy as np
 from scopemap.engine.cameras.rectification import Rectifier, StereoPair, working_camera, working_size
 from scopemap.engine.config import InputSettings
 from scopemap.engine.errors import CalibrationError, InputError
-from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.calibration import Calibration, fitted
 from scopemap.input.camera_files.pair import NEEDS_PAIR, read_pair
 from scopemap.input.camera_files.reading import read_calibration
@@ -111,7 +110,7 @@ def sequence_of(
     """Return the frames of a reader as `open_sequence` returns those of a path."""
     settings = settings or InputSettings()
     with _errors_of_the_system(reader.path):
-        source = _prepared(reader, settings)
+        source = _prepared(reader, settings, size)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings)
     pair = _pair_of(source, camera, settings.camera_fit, frames or slice(None)) if settings.uses_both_views else None
     size_source = "chosen" if size is None else "given (--size)"
@@ -123,7 +122,6 @@ def sequence_of(
         most = f"{_LARGEST_SIDE_PX} px a side and {most_pixels() / 1e6:g} million pixels at most"
         raise InputError(f"{working} is too large: {most}; give another by --size")
     size_source = f"{size[0]}x{size[1]} px {size_source} for input of {source.width}x{source.height} px"
-    _soften_interlacing(source, size[1])
     rectifier = Rectifier(calibration.camera, working_camera(calibration.camera, size))
     if (seen := float(rectifier.valid.mean())) < _LEAST_SEEN_SHARE:
         rest = f"{seen:.1%} of the picture remains without its distortion; check the distortion coefficients"
@@ -146,12 +144,14 @@ def sequence_of(
 def open_source(path: Path | str, *, dataset: str | None = None, settings: InputSettings | None = None) -> Source:
     """Return the frames of an input as in the file, one view and field by `settings`; raises `InputError`."""
     with _errors_of_the_system(path):
-        return _prepared(_reader(Path(path), dataset), settings or InputSettings())
+        reader = _reader(Path(path), dataset)
+        # Nothing is averaged in pictures as they are in the file.
+        return _prepared(reader, settings or InputSettings(), (reader.width, reader.height))
 
 
-def _prepared(reader: Source, settings: InputSettings) -> Source:
+def _prepared(reader: Source, settings: InputSettings, size: tuple[int, int] | None) -> Source:
     second = settings.second_view
-    return prepared(reader, settings, None if second is None else _reader(second, None))
+    return prepared(reader, settings, None if second is None else _reader(second, None), size)
 
 
 @contextmanager
@@ -257,13 +257,6 @@ def _folders_in(path: Path) -> list[Path]:
         names = [entry.name for entry in found if os.path.isdir(entry)]  # a link may lead in a circle
     inner = (path / n for n in names if not n.startswith(".") and n not in ("lost+found", "__MACOSX"))
     return sorted(i for i in inner if not (i.is_symlink() and path.resolve().is_relative_to(i.resolve())))
-
-
-def _soften_interlacing(source: Source, height: int) -> None:
-    """Let the source say no more than is so where a pixel of the working size holds rows of both fields."""
-    if Notice("input-interlaced") in source.warnings and source.height >= 2 * height:
-        source.warnings.remove(Notice("input-interlaced"))
-        source.notes.append(Notice("input-interlaced-averaged"))
 
 
 def _pair_of(source: Source, file: Path | str | None, camera_fit: str, frames: slice) -> StereoPair | CalibrationError:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scopemap.engine.cameras.rectification import working_size
 from scopemap.engine.config import InputSettings
 from scopemap.engine.config.input import Box
 from scopemap.engine.errors import CalibrationError, InputError
@@ -38,11 +39,14 @@ _KEPT = (
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 
 
-def prepared(source: Source, settings: InputSettings, second: Source | None = None) -> Source:
+def prepared(
+    source: Source, settings: InputSettings, second: Source | None = None, size: tuple[int, int] | None = None
+) -> Source:
     """Return the source with boxes blackened, one view and one field per picture; the source itself where it is so.
 
-    With `stereo` = auto, the packing is detected in videos and folders of images of no data set; a warning names
-    interlaced ones. Both views are kept where they are used; `second` holds the right one where it is another file.
+    With `stereo` = auto, the packing is detected in videos and folders of images of no data set, and with `deinterlace`
+    = auto, whether they are interlaced. Both views are kept where they are used; `second` holds the right one where it
+    is another file. size : working size (width, height), px; None: by the settings.
     Raises `InputError` where `stereo` names the views of a data set, whose reader defines them, where there are no two
     views to be used, and for a box outside of the pictures.
     """
@@ -57,8 +61,7 @@ def prepared(source: Source, settings: InputSettings, second: Source | None = No
     pairs = sample_pairs(source) if source.name in UNKNOWN_MAKE else []
     pairs = [(redacted(rgb, settings.redact), redacted(later, settings.redact)) for rgb, later in pairs]
     packed, note = _packing(source, settings, [rgb for rgb, _ in pairs])
-    if not settings.deinterlace and shows_two_fields(source, pairs):
-        source.warnings.append(Notice("input-interlaced"))
+    one_field = _uses_one_field(source, settings, packed, pairs, size)
     if note:
         source.notes.append(note)
     if second is not None:
@@ -66,28 +69,34 @@ def prepared(source: Source, settings: InputSettings, second: Source | None = No
     elif settings.uses_both_views and packed is None:
         remedy = "give use:left-right, use:top-bottom or use:FILE, the right camera's video or folder"
         raise InputError(f"reading {source.path}: --stereo use finds no two views in its pictures; {remedy}")
-    if packed is None and second is None and not (settings.deinterlace or settings.redact):
+    if packed is None and second is None and not (one_field or settings.redact):
         return source
-    return PreparedSource(source, packed, settings, second)
+    return PreparedSource(source, packed, settings, second, one_field=one_field)
 
 
 class PreparedSource(Source):
     """A source of which a part of each picture is used, of the views `packed` the left eye's; None: one view.
 
-    Frames carry the right eye's view, too, where the settings use it: that of `packed`, or of `second`.
+    Frames carry the right eye's view, too, where the settings use it: that of `packed`, or of `second`. one_field :
+    odd rows are interpolated.
     """
 
     def __init__(
-        self, source: Source, packed: Packing | None, settings: InputSettings, second: Source | None = None
+        self,
+        source: Source,
+        packed: Packing | None,
+        settings: InputSettings,
+        second: Source | None = None,
+        *,
+        one_field: bool = False,
     ) -> None:
         self._source, self.packed, self._settings, self._second = source, packed, settings, second
+        self._one_field = one_field
         super().__init__(source.path)
         for attribute in _KEPT:
             setattr(self, attribute, getattr(source, attribute))
         if settings.redact:
             self.notes.append(f"redacted: {len(settings.redact)} box(es) of each picture are black (input.redact)")
-        if settings.deinterlace:
-            self.notes.append("deinterlaced: the even rows of each picture are used, the odd ones interpolated")
         if packed is not None:
             self.width, self.height = packed.view_size(source.width, source.height)
             self.pixel_aspect *= packed.pixel_aspect
@@ -120,7 +129,34 @@ class PreparedSource(Source):
 
     def _used(self, rgb: np.ndarray) -> np.ndarray:
         rgb = redacted(rgb, self._settings.redact)
-        return deinterlaced(rgb) if self._settings.deinterlace else rgb
+        return deinterlaced(rgb) if self._one_field else rgb
+
+
+def _uses_one_field(
+    source: Source,
+    settings: InputSettings,
+    packed: Packing | None,
+    pairs: list[SampledPair],
+    size: tuple[int, int] | None,
+) -> bool:
+    """Return whether one field of each picture is used, and let the source say so, or that it is interlaced.
+
+    At a working size of half the height or less a pixel holds rows of both fields, so that nothing is gained.
+    """
+    if settings.deinterlace == "on":
+        source.notes.append(Notice("input-deinterlaced", {"why": "as asked"}))
+    if settings.deinterlace == "on" or not shows_two_fields(source, pairs):
+        return settings.deinterlace == "on"
+    width, height = (source.width, source.height) if packed is None else packed.view_size(source.width, source.height)
+    used = size or working_size(width, height, settings.longest_side_px)
+    if height >= 2 * used[1]:
+        source.notes.append(Notice("input-interlaced-averaged"))
+        return False
+    if settings.deinterlace == "off":
+        source.warnings.append(Notice("input-interlaced"))
+        return False
+    source.notes.append(Notice("input-deinterlaced", {"why": "the video is interlaced"}))
+    return True
 
 
 def redacted(rgb: np.ndarray, boxes: tuple[Box, ...]) -> np.ndarray:

@@ -33,7 +33,7 @@ _PICTURES = 3
 _MOST_MEASURED = 5
 _MOST_FINDINGS = 8
 _USUAL_FOV_DEG = 70.0
-_SET_BELOW = {"scope", "stereo", "interlaced", "rate-high", "black", "one-colour", "not-tissue", "inset"}
+_SET_BELOW = {"scope", "stereo", "rate-high", "black", "one-colour", "not-tissue", "inset"}
 """Codes of findings that a switch of this page answers."""
 _WORDS = {"error": "Error", "warning": "Caution", "info": "Note"}
 
@@ -113,7 +113,6 @@ class InputPage:
         seen, rest = list[Callable[[], None]](), list[Callable[[], None]]()
         for add, is_advised in (
             (self._add_layout, self.choice.stereo != LAYOUTS[0]),
-            (self._add_fields, self.choice.deinterlace),
             (self._add_rate, bool(self.choice.fps)),
             (self._add_frames, bool(self.choice.frames)),
         ):
@@ -167,10 +166,6 @@ class InputPage:
 
     def _add_layout(self) -> None:
         self._add_list("Two views in a picture", _LAYOUTS, "stereo")
-
-    def _add_fields(self) -> None:
-        handle = self._window.gui.add_checkbox("Interlaced: use one field", self.choice.deinterlace)
-        self._window.on(handle, lambda is_on: self._set({"deinterlace": bool(is_on)}))
 
     def _add_rate(self) -> None:
         hint = "Leave out frames beyond this rate; 0: use all."

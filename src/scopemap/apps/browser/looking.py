@@ -135,7 +135,7 @@ def look(path: Path, listener: Callable[[int, int], None]) -> Look:
     from scopemap.engine.config import InputSettings
     from scopemap.input.opening import open_source
 
-    count = open_source(path, settings=InputSettings(stereo="none", skip_duplicates=False)).count
+    count = open_source(path, settings=InputSettings(stereo="none", skip_duplicates=False, deinterlace="off")).count
     if count is not None and count <= _MOST_WHOLE:
         spread = together = inspect(path, listener=lambda done, all_: listener(done, all_ or count))
         whole = True

@@ -13,7 +13,7 @@ from scopemap.result.result import Result
 from scopemap.result.run_input import places_of_input
 
 _OPTION = re.compile(r"--([a-z][a-z-]*)(?: ([a-z][\w.]*(?:[=|][\w.|]+)*))?")
-_FLAGS = ("deinterlace", "camera-at-rest")
+_FLAGS = ("camera-at-rest",)
 _SCOPES = tuple(kind for kind in InputSettings.model_fields["scope"].annotation.__args__ if kind)  # type: ignore[union-attr]
 _CAMERA = {"scope", "fov"}
 """Options of a lens that is not known: without effect where a calibration is."""

@@ -42,7 +42,6 @@ class RunChoice:
     camera: Path | None = None
     fov_deg: float = 0.0
     stereo: str = "auto"
-    deinterlace: bool = False
     fps: float = 0.0
     frames: str = ""
     redact: tuple[Box, ...] = ()
@@ -81,7 +80,6 @@ class RunChoice:
         }
         # In one word: a value may begin with "-".
         out = [f"{name}={value}" for name, value in given.items() if value]
-        out += ["--deinterlace"] if self.deinterlace else []
         return out + [f"--redact={','.join(map(str, box))}" for box in self.redact]
 
 
@@ -97,7 +95,6 @@ def suggested(found: Inspection, findings: Sequence[VideoFinding], *, whole: boo
     return RunChoice(
         scope=scope if scope in SCOPES else "",
         stereo="auto" if found.packed is None else found.packed.layout,
-        deinterlace="interlaced" in by_code,
         fps=float(rates[0]) if rates else 0.0,
         frames=_without_ends(found, findings, whole=whole),
         redact=boxes_of(found, [one for one in found.overlays if not one.in_field]),

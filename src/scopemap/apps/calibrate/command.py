@@ -56,7 +56,7 @@ def calibrate(
     settings: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="KEY=VALUE", help=f"How pictures are read: {_SETTINGS[0]}=..., {_SETTINGS[1]}=true."
+            "--set", metavar="KEY=VALUE", help=f"How pictures are read: {_SETTINGS[0]}=..., {_SETTINGS[1]}=on."
         ),
     ] = None,
     overwrite: options.Overwrite = False,

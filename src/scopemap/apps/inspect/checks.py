@@ -90,7 +90,7 @@ def check_packing(packed: Packing | None, *, interlaced: bool) -> Iterator[Video
         yield VideoFinding("warning", "stereo", message, f"--stereo {packed.layout}")
     if interlaced:
         message = "interlaced: odd and even rows show two moments, edges of what moves look like combs"
-        yield VideoFinding("warning", "interlaced", message, "--deinterlace")
+        yield VideoFinding("info", "interlaced", message, "runs use one field of it (--no-deinterlace: both)")
 
 
 def check_repeats(clip: Clip) -> Iterator[VideoFinding]:

@@ -62,4 +62,4 @@ def check_container(facts: dict[str, Any]) -> Iterator[VideoFinding]:
         yield VideoFinding("info", "rotation", message)
     if facts["interlaced"]:
         message = "the header says that the pictures are interlaced"
-        yield VideoFinding("info", "field-order", message, "--deinterlace, where combs are found, too")
+        yield VideoFinding("info", "field-order", message, "runs use one field where combs are found, too")

@@ -100,7 +100,7 @@ def inspect(
     `dataset`, `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called after
     each. Raises `InputError` and `CalibrationError` where it cannot be opened or holds fewer than two pictures.
     """
-    plain = InputSettings(stereo="none", skip_duplicates=False)
+    plain = InputSettings(stereo="none", skip_duplicates=False, deinterlace="off")
     # Whether there are two views comes first: the camera may be that of one.
     source = open_source(path, dataset=dataset, settings=plain)
     unknown = source.name in OF_UNKNOWN_VIEWS  # the readers of data sets know what a picture holds

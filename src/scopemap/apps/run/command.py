@@ -45,9 +45,12 @@ def run(
         ),
     ] = None,
     deinterlace: Annotated[
-        bool,
-        options.advanced("--deinterlace", help="Use one field of interlaced images and interpolate the missing rows."),
-    ] = False,
+        bool | None,
+        options.advanced(
+            "--deinterlace/--no-deinterlace",
+            help="Use one field of each image and interpolate the missing rows; default: if the video is interlaced.",
+        ),
+    ] = None,
     redact: Annotated[
         list[str] | None,
         typer.Option(
@@ -140,7 +143,7 @@ def run(
     given = {
         "input.camera_fit": camera_fit,
         "input.stereo": stereo,
-        "input.deinterlace": deinterlace or None,
+        "input.deinterlace": deinterlace,
         "input.redact": [options.parse_box(box) for box in redact] if redact else None,
         "input.frames": None if frames is None else selection_text(frames),
         "input.fps": fps,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, cast, get_args
 
-from pydantic import Field, NonNegativeInt
+from pydantic import BeforeValidator, Field, NonNegativeInt
 
 from scopemap.engine.config.settings import Methods, Settings, StageSettings, advanced
 
@@ -15,6 +15,11 @@ Box = tuple[
 """Left, top, width and height, px."""
 
 _Layout = Literal["auto", "none", "left-right", "top-bottom"]
+_BY_TRUTH = {True: "on", "true": "on", False: "off", "false": "off"}
+_Deinterlace = Annotated[
+    Literal["auto", "on", "off"],
+    BeforeValidator(lambda value: _BY_TRUTH.get(value, value) if isinstance(value, bool | str) else value),
+]
 _Scope = Literal[
     "", "colonoscope", "gastroscope", "bronchoscope", "laparoscope", "cystoscope", "ureteroscope", "sinus", "capsule"
 ]
@@ -47,7 +52,11 @@ class InputSettings(Settings):
         "left or upper is used; use: depth is measured from both, with a calibration of the pair; "
         "use:left-right, use:top-bottom, use:FILE (a second video or folder, of the right camera)",
     )
-    deinterlace: bool = Field(False, description="use one field of each interlaced image, interpolate the missing rows")
+    deinterlace: _Deinterlace = Field(
+        "auto",
+        description="use one field of each image and interpolate the missing rows (on, off); auto: where a video is "
+        "interlaced and the working size does not average both fields; true means on, false off",
+    )
     redact: tuple[Box, ...] = Field(
         (),
         description="boxes of the input's pictures, x y width height, px, that are blackened before anything else is "
