@@ -16,7 +16,7 @@ from scopemap.engine.config import Config, FusionSettings
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame, Rows
 from scopemap.engine.fusion.frame_store import FrameStore
-from scopemap.engine.fusion.surface_fusion import SurfaceFusion, TsdfVolume, choose_parameters
+from scopemap.engine.fusion.surface_fusion import SurfaceFusion, TsdfVolume, choose_parameters, depth_notices
 
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
 
@@ -33,6 +33,20 @@ def test_what_is_set_stays_and_the_rest_follows_it() -> None:
     assert choose_parameters(FusionSettings(voxel_mm=0.5)) == (0.5, 2.5, 100.0)
     assert choose_parameters(FusionSettings(voxel_mm=0.5, truncation_mm=4.0, max_depth_mm=30.0)) == (0.5, 4.0, 30.0)
     assert choose_parameters(FusionSettings(max_depth_mm=30.0), 120.0) == (2.0, 10.0, 30.0)
+    assert choose_parameters(FusionSettings(voxel_mm=0.5), 90.0) == (0.5, 2.5, 100.0)
+
+
+@pytest.mark.parametrize(("largest_mm", "said"), [(None, ["fusion-farther"]), (100.0, [])])
+def test_voxels_that_are_set_leave_no_scene_out_unless_a_largest_depth_is_set(
+    largest_mm: float | None, said: list[str]
+) -> None:
+    settings = FusionSettings(voxel_mm=0.5, max_depth_mm=largest_mm)
+    fusion = SurfaceFusion(settings, FrameStore(), corrected=True)
+    fused = fusion.fuse([wall(120.0, n) for n in range(3)], 120.0)
+    assert [notice.code for notice in fused.notices] == said
+    assert fused.settings.max_depth_mm == (largest_mm or 400.0)
+    assert len(fused.mesh.faces) > 0 if largest_mm is None else len(fused.mesh.faces) == 0
+    assert len(depth_notices([120.0], fused.settings)) == (0 if largest_mm is None else 1)
 
 
 def test_the_store_returns_what_it_was_given_in_order_and_by_number(tmp_path: Path) -> None:

@@ -198,6 +198,11 @@ KINDS: dict[str, _Kind] = {
         "fused.",
         "Set fusion.voxel_mm for another size.",
     ),
+    "fusion-farther": _Kind(
+        "info",
+        "Pixels up to {max_depth_mm:g} mm are fused, farther than voxels of that size usually reach: the median depth "
+        "is {median_mm:.0f} mm.",
+    ),
     "fusion-coarsened": _Kind(
         "info",
         "Voxels measure {voxel_mm:g} mm instead of {finest_mm:g} mm, so that the surface fits into memory.",
@@ -219,7 +224,7 @@ KINDS: dict[str, _Kind] = {
         "doubtful",
         "Most of the scene is not fused: its median depth is {median_mm:.0f} mm, and fusion ends at "
         "{max_depth_mm:g} mm.",
-        "Run again with larger fusion.max_depth_mm and fusion.voxel_mm.",
+        "Leave fusion.max_depth_mm and fusion.voxel_mm out: they then follow the scene.",
     ),
     "memory-limited": _Kind(
         "info",

@@ -111,7 +111,10 @@ class FusionSettings(StageSettings):
         None, ge=0.05, le=1e4, description="truncation of the TSDF, mm; default: 5 voxels"
     )
     max_depth_mm: float | None = Field(
-        None, gt=0, le=1e6, description="depth beyond this is not fused, mm; default: 200 voxels"
+        None,
+        gt=0,
+        le=1e6,
+        description="depth beyond this is not fused, mm; default: 200 voxels, or 3.3 times a median depth beyond that",
     )
     every: int = Field(0, ge=0, description="fuse every n-th tracked frame; 0: those that show tissue anew")
     surface_at_s: float | None = Field(

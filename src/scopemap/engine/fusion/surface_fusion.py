@@ -79,10 +79,14 @@ def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = 
             raise ValueError("fusing without fusion.voxel_mm: the scene's median depth must be known")
         # Two digits: a clip cut at another frame gives the same.
         voxel_mm = float(f"{max(median_depth_mm / _VOXELS_PER_MEDIAN_DEPTH, _MIN_VOXEL_MM):.2g}")
+    largest_mm = _VOXELS_PER_MAX_DEPTH * voxel_mm
+    if median_depth_mm is not None and median_depth_mm > largest_mm:
+        # Voxels that were set are so fine that most of the scene would be left out.
+        largest_mm = _VOXELS_PER_MAX_DEPTH / _VOXELS_PER_MEDIAN_DEPTH * median_depth_mm
     return TsdfParameters(
         voxel_mm,
         settings.truncation_mm or round(_VOXELS_PER_TRUNCATION * voxel_mm, 4),
-        settings.max_depth_mm or round(_VOXELS_PER_MAX_DEPTH * voxel_mm, 4),
+        settings.max_depth_mm or round(largest_mm, 4),
     )
 
 
@@ -278,6 +282,9 @@ class SurfaceFusion:
         if volume.parameters.voxel_mm > (finest := choose_parameters(settings, median_mm)).voxel_mm:
             sizes = {"voxel_mm": volume.parameters.voxel_mm, "finest_mm": finest.voxel_mm}
             notices = [Notice("fusion-coarsened", sizes)]
+        if settings.voxel_mm is not None and volume.parameters.max_depth_mm > choose_parameters(settings).max_depth_mm:
+            depths = {"max_depth_mm": volume.parameters.max_depth_mm, "median_mm": median_mm}
+            notices.append(Notice("fusion-farther", depths))
         used = settings.model_copy(update=volume.parameters._asdict())
         return FusedSurface(volume.extract_mesh(), used, notices)
 
