@@ -20,7 +20,7 @@ from scopemap.input.opening import open_sequence
 from scopemap.result.result import Result
 
 # Options that need a file, a box or a choice that nobody can make for the user.
-NOT_OFFERED = {"camera", "redact", "memory"}
+NOT_OFFERED = {"camera", "redact", "memory", "frames"}
 FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
 
@@ -47,8 +47,6 @@ def test_choices_and_values() -> None:
     (one,) = next_runs("Run again with --set mapping.method=local.", result)
     assert one.label(*one.choices) == "Run again with --set mapping.method=local"
     assert one.arguments(*one.choices) == ["--set", "mapping.method=local"]
-    (flag,) = next_runs("Run again with --camera-at-rest.", result)
-    assert (flag.label(), flag.arguments()) == ("Run again with --camera-at-rest", ["--camera-at-rest"])
     (moment,) = next_runs("Run again with --surface-at SECONDS for it.", result)
     assert moment.number is not None
     assert moment.number[1] <= moment.number[0] <= moment.number[2]

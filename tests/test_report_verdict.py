@@ -148,7 +148,7 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
     ("facts", "words"),
     [
         ({"camera": {"origin": "assumed"}}, "lens is assumed"),
-        (notices(Notice("mapping-not-rigid", {"merged": "", "sigma_px": 0.98})), "scene is not rigid"),
+        (notices(Notice("mapping-not-rigid", {"merged": "", "sigma_px": 0.98})), "no rigid scene fits the views"),
         (notices(Notice("mapping-none")), "not adjusted: no other view confirms"),
         (notices(Notice("camera-at-rest")), "is at rest while the tissue moves"),
         (notices(Notice("camera-distorted", {"share": 0.12})), "has radial distortion"),

@@ -30,8 +30,8 @@ class _Kind:
     in_verdict: bool = True
 
 
-_CHECK_THE_LENS = "Check the calibration (--camera, --fov or --scope)."
-_MORE_MOTION = "Do not trust the relief; record sideways motion and revisit places."
+_HOLDS_STILL = "Use the segments in which it holds still, or a part with --frames A:B."
+_MORE_MOTION = "Do not trust the relief; try a part with sideways motion (--frames A:B)."
 _OTHER_STATES = "See mesh_over_time.glb for the other states."
 
 KINDS: dict[str, _Kind] = {
@@ -93,12 +93,11 @@ KINDS: dict[str, _Kind] = {
     "camera-unconfirmed": _Kind(
         "doubtful",
         "The motion does not constrain the focal length (standard deviation {sigma:.0%}): a wrong one would not show.",
-        "Check the calibration; record more rotation and sideways motion.",
+        "Check the calibration.",
     ),
     "camera-at-rest": _Kind(
         "doubtful",
-        "The camera is at rest while the tissue moves, so the estimated path means little.",
-        "Run again with --camera-at-rest.",
+        "The data set states that the camera is at rest while the tissue moves: the estimated path means little.",
     ),
     "camera-at-rest-stated": _Kind(
         "note", "You stated that the camera is at rest: each frame has its own surface, wrong if the camera moved."
@@ -127,7 +126,7 @@ KINDS: dict[str, _Kind] = {
     "tissue-moves": _Kind(
         "note",
         "Tissue moves on its own in {frames} of {measured} frames, most in frame {most} ({share:.0%} of the picture).",
-        "Run again with --surface-at SECONDS for the surface at one moment.",
+        _HOLDS_STILL,
         unsaid=("threshold", "x", "y"),
     ),
     "mapping-none": _Kind(
@@ -140,8 +139,8 @@ KINDS: dict[str, _Kind] = {
     ),
     "mapping-local-not-rigid": _Kind(
         "doubtful",
-        "{refused:keyframe} could not be adjusted ({adjusted} were): the tissue moved, or the focal length is wrong.",
-        _CHECK_THE_LENS,
+        "The tissue moves: {refused:keyframe} could not be adjusted ({adjusted} were).",
+        _HOLDS_STILL,
     ),
     "mapping-adjusted": _Kind(
         "info",
@@ -154,9 +153,8 @@ KINDS: dict[str, _Kind] = {
     ),
     "mapping-not-rigid": _Kind(
         "doubtful",
-        "Bundle adjustment was rejected ({sigma_px:.2f} px error): the scene is not rigid, or the focal length "
-        "is wrong.",
-        _CHECK_THE_LENS,
+        "The tissue moves: no rigid scene fits the views ({sigma_px:.2f} px error), so bundle adjustment was rejected.",
+        _HOLDS_STILL,
         unsaid=("merged",),
     ),
     "shape-determined": _Kind(
@@ -200,8 +198,7 @@ KINDS: dict[str, _Kind] = {
     ),
     "fusion-farther": _Kind(
         "info",
-        "Pixels up to {max_depth_mm:g} mm are fused, farther than voxels of that size usually reach: the median depth "
-        "is {median_mm:.0f} mm.",
+        "Pixels up to {max_depth_mm:g} mm are fused, beyond 200 voxels: the median depth is {median_mm:.0f} mm.",
     ),
     "fusion-coarsened": _Kind(
         "info",

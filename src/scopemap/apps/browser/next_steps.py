@@ -13,7 +13,6 @@ from scopemap.result.result import Result
 from scopemap.result.run_input import places_of_input
 
 _OPTION = re.compile(r"--([a-z][a-z-]*)(?: ([a-z][\w.]*(?:[=|][\w.|]+)*))?")
-_FLAGS = ("camera-at-rest",)
 _SCOPES = tuple(kind for kind in InputSettings.model_fields["scope"].annotation.__args__ if kind)  # type: ignore[union-attr]
 _CAMERA = {"scope", "fov"}
 """Options of a lens that is not known: without effect where a calibration is."""
@@ -23,7 +22,7 @@ _CAMERA = {"scope", "fov"}
 class NextRun:
     """Another run that a next step names.
 
-    option : of `scopemap run`. choices : values of which one is chosen, (): it has none, or a number is asked for.
+    option : of `scopemap run`. choices : values of which one is chosen, (): a number is asked for.
     number : what it is at first, its lowest and its highest value; None: no number.
     """
 
@@ -32,12 +31,12 @@ class NextRun:
     number: tuple[float, float, float] | None = None
 
     def label(self, value: str = "") -> str:
-        """Return the words of the button."""
+        """Return the words of the button that chooses a value, or takes the one that is set beside it."""
         return f"Run again with --{self.option} {value}".rstrip()
 
-    def arguments(self, value: str = "") -> list[str]:
+    def arguments(self, value: str) -> list[str]:
         """Return the arguments of the option with a value."""
-        return [f"--{self.option}", *([value] if value else [])]
+        return [f"--{self.option}", value]
 
 
 def next_runs(step: str, run: Result) -> list[NextRun]:
@@ -50,9 +49,7 @@ def next_runs(step: str, run: Result) -> list[NextRun]:
         value = stated.rstrip(".")
         if option in _CAMERA and run.provenance.get("camera", {}).get("origin") == "calibrated":
             continue
-        if option in _FLAGS:
-            found.append(NextRun(option))
-        elif option == "set" and "=" in value:
+        if option == "set" and "=" in value:
             found.append(NextRun(option, (value,)))
         elif option == "scope":
             known = [kind for kind in value.split("|") if kind in _SCOPES]

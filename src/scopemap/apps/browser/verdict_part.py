@@ -60,5 +60,5 @@ class VerdictPart:
             choice = gui.add_dropdown(f"--{run.option}", run.choices)
             window.on(gui.add_button(run.label()), lambda: self._again(run, choice.value))
         else:
-            for value in run.choices or ("",):
+            for value in run.choices:
                 window.on(gui.add_button(run.label(value)), self._again, run, value)
