@@ -28,7 +28,7 @@ def with_lens_of_motion(sequence: Sequence, config: Config, lens: LensTest, *, a
     """
     is_assumed = sequence.camera_origin == "assumed" and config.input.focal == "auto"
     is_refined = again and lens.differs and abs(lens.log_focal) > _FAR
-    if not (is_assumed and lens.contradicts or is_refined):
+    if not ((is_assumed and lens.contradicts) or is_refined):
         return None
     focal_px, share = sequence.camera.fx * math.exp(lens.log_focal), _INFLATION * lens.sigma
     widest, fov, narrowest = (_fov_deg(sequence, focal_px * math.exp(n * share)) for n in (-2, 0, 2))
