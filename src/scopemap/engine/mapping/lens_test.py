@@ -2,8 +2,8 @@
 
 Half of the points are adjusted, once with the focal length held and once with it free; the other half is placed in the
 keyframes of either. A right lens leaves the same errors there: the ratio of both was 0.998 to 1.002 on three real clips
-with their calibration (C3VD cecum_t1_a and trans_t2_a, Hamlyn); with a lens 15 % too short 0.94 on cecum_t1_a. Where the motion does not constrain the focal length,
-the ratio is 1 for a wrong one, too: `sigma` tells.
+with their calibration (C3VD cecum_t1_a and trans_t2_a, Hamlyn); with a lens 15 % too short 0.94 on cecum_t1_a. Where
+the motion does not constrain the focal length, the ratio is 1 for a wrong one, too: `sigma` tells.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _MOST_RATIO = 0.97  # between right lenses and one 15 % too short, see above
 _SIGNIFICANT = 3.0  # standard deviations that the focal length must change by
 _LEAST_CHANGE = 0.02  # of ln f: changes the shape of a colon by 1.5 %, by which surfaces are off with a right lens
 _MOST_ERROR_PX = 0.45
-"""Of left-out tracks with the focal length free, above which a scene is not rigid enough: rigid clips that constrain the
-lens had 0.14 to 0.41 px, moving ones 0.53 (laparoscopy_rvim) and 1.03 (colonoscopy_nflba_03)."""
+"""Of left-out tracks with the focal length free, above which a scene is not rigid enough: rigid clips that constrain
+the lens had 0.14 to 0.41 px, moving ones 0.53 (laparoscopy_rvim) and 1.03 (colonoscopy_nflba_03)."""
 _FOCAL_SIGMA = 0.05  # by hand: of ln f, above which the motion says too little of the lens to confirm it
 _ITERATIONS = 40  # by hand: a wrong lens may be far away
 _MIN_DECREASE = 1e-4  # by hand: relative, of the cost, that ends the adjustment
