@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 
-from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.engine.mapping.bundle_adjustment import adjust, adjust_in_windows
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.engine.mapping.lens_residual import lens_residual, shape_change
+from scopemap.engine.mapping.lens_test import lens_test
 
 LOOSE = Priors(rotation_rad=10, translation_share=10)
 
@@ -36,58 +35,54 @@ def test_exact_observations_and_depths_recover_exact_poses(window: int | None) -
     assert found.sigma_px == pytest.approx(0.1)  # its floor
 
 
-@pytest.mark.parametrize(
-    ("factor", "shift"),
-    [(1.0, (0, 0)), (0.9, (0, 0)), (1.1, (0, 0)), (1.0, (0.1, 0)), (1.0, (0, -0.1)), (1.05, (-0.05, 0.1))],
-)
-def test_observations_ask_for_the_right_lens(factor: float, shift: tuple[float, float]) -> None:
-    rng = np.random.default_rng(11)
-    T, points, observations = world(rng)
-    off_px = FOCAL_PX * np.array(shift)
-    seen = observations.pixel + off_px + rng.normal(0, 0.1, observations.pixel.shape)
-    points, observations = replace(points, pixel=points.pixel + off_px), replace(observations, pixel=seen)
-    problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, factor * FOCAL_PX)
-    asked = np.array(lens_residual(problem, adjust(problem).state)[:3])
-    expected = np.array([-np.log(factor), *np.array(shift) / factor])
-    assert asked == pytest.approx(expected, abs=0.02)
-    assert ((asked == 0) == (expected == 0)).all()
-    nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
-    unseen = replace(problem, observations=nothing)
-    assert np.isnan(lens_residual(unseen, adjust(unseen).state)).all()
-
-
-def test_a_change_of_shape_is_measured_in_the_scale_of_the_path_and_without_a_turn_of_each_camera() -> None:
-    rng = np.random.default_rng(5)
-    T, points, observations = world(rng)
-    problem = BundleProblem(T, points, observations, LOOSE, LINE, FOCAL_PX)
-    one = problem.tracked
-    S = Similarity(1.7, se3_exp(np.array([0.3, -0.2, 0.5, 0, 0, 0]))[:3, :3], np.array([3.0, -2.0, 9.0]))
-    moved = one._replace(
-        T_camera_world=inverse(S.transform_poses(inverse(T))), log_depth=one.log_depth + np.log(S.scale)
-    )
-    assert shape_change(problem, one, moved) == pytest.approx((0, 0), abs=1e-9)
-    farther = moved._replace(log_depth=moved.log_depth + np.log(1.05))
-    assert shape_change(problem, one, farther) == pytest.approx((0.05, 0), abs=1e-6)
-    turned = moved._replace(T_camera_world=se3_exp(np.array([0.02, 0.01, 0, 0, 0, 0])) @ moved.T_camera_world)
-    assert shape_change(problem, one, turned)[0] == pytest.approx(0, abs=1e-9)
-    resting = one._replace(T_camera_world=np.repeat(T[:1], len(T), axis=0))
-    assert np.isnan(shape_change(problem, resting, one)).all()
-
-
-def test_a_lens_is_contradicted_where_the_one_asked_for_would_change_the_shape() -> None:
+@pytest.mark.parametrize("factor", [1.0, 0.85, 1.15])
+def test_left_out_tracks_contradict_a_wrong_focal_length_and_ask_for_the_right_one(factor: float) -> None:
     rng = np.random.default_rng(11)
     T, points, observations = world(rng)
     seen = replace(observations, pixel=observations.pixel + rng.normal(0, 0.1, observations.pixel.shape))
-    codes = []
-    for factor in (1.0, 0.8):
-        problem = BundleProblem(tracked(T, rng), points, seen, LOOSE, LINE, factor * FOCAL_PX)
-        found = adjust(problem).state
-        residual = lens_residual(problem, found)
-        codes.append([notice.code for notice in residual.notices])
-        right = adjust(replace(problem, start=found._replace(lens=np.array([np.log(FOCAL_PX), 0, 0])))).state
-        surface, path = shape_change(problem, found, right)
-        assert (residual.surface, residual.path) == pytest.approx((surface, path), abs=0.01)
-    assert codes == [[], ["camera-contradicted"]]
+    problem = BundleProblem(tracked(T, rng), points, seen, LOOSE, LINE, factor * FOCAL_PX)
+    found = lens_test(problem, adjust(problem).state)
+    assert found.log_focal == pytest.approx(-np.log(factor), abs=0.02)
+    assert found.contradicts == (factor != 1.0)
+    assert [notice.code for notice in found.notices] == ["camera-contradicted"] * (factor != 1.0)
+    assert found.ratio == pytest.approx(1.0, abs=0.03) if factor == 1.0 else found.ratio < 0.97
+
+
+def test_a_shifted_centre_alone_contradicts_no_lens() -> None:
+    rng = np.random.default_rng(11)
+    T, points, observations = world(rng)
+    off_px = FOCAL_PX * np.array([0.03, -0.02])
+    seen = observations.pixel + off_px + rng.normal(0, 0.1, observations.pixel.shape)
+    points, observations = replace(points, pixel=points.pixel + off_px), replace(observations, pixel=seen)
+    problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, FOCAL_PX)
+    assert not lens_test(problem, adjust(problem).state).contradicts
+
+
+def test_a_scene_that_is_not_rigid_contradicts_no_lens() -> None:
+    rng = np.random.default_rng(11)
+    T, points, observations = world(rng)
+    seen = replace(observations, pixel=observations.pixel + rng.normal(0, 1.0, observations.pixel.shape))
+    problem = BundleProblem(tracked(T, rng), points, seen, LOOSE, LINE, 0.6 * FOCAL_PX)
+    found = lens_test(problem, adjust(problem).state)
+    assert found.ratio < 0.97
+    assert not found.contradicts
+
+
+def test_a_motion_that_does_not_constrain_the_focal_length_is_noted() -> None:
+    rng = np.random.default_rng(3)
+    T, points, observations = world(rng)
+    resting = np.repeat(T[:1], len(T), axis=0)
+    seen = replace(
+        observations, pixel=points.pixel[observations.point] + rng.normal(0, 0.1, (len(observations.point), 2))
+    )
+    problem = BundleProblem(resting, points, seen, LOOSE, LINE, 0.85 * FOCAL_PX)
+    notices = lens_test(problem, adjust(problem).state).notices
+    assert [(notice.code, notice.level) for notice in notices] == [("camera-unconfirmed", "note")]
+    nothing = Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
+    unseen = replace(problem, observations=nothing)
+    untested = lens_test(unseen, adjust(unseen).state)
+    assert np.isnan(untested).all()
+    assert not untested.notices
 
 
 @pytest.mark.parametrize("window", [2, 3])

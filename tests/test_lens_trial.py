@@ -181,6 +181,7 @@ def test_the_lens_of_a_kind_of_endoscope_is_assumed_where_nothing_is_known(clip:
     assert getattr(lens, "distortion", ()) == pytest.approx(KINDS[SCOPES[scope].kinds[0]])
     assert sequence.focal_sigma_px == pytest.approx(SCOPES[scope].spread * SCOPES[scope].focal * 200)
     assert sequence.camera_source.startswith(f"assumed: as of a {scope}, fx {SCOPES[scope].focal:g} of the width")
+    assert sequence.camera_origin == "assumed"
     assert [notice.code for notice in sequence.source.warnings if not isinstance(notice, str)] == ["camera-unknown"]
 
 
@@ -219,6 +220,7 @@ def test_what_is_seen_is_weighed_with_what_is_expected_of_a_kind_of_endoscope(
     assert sequence.focal_sigma_px == pytest.approx(sigma_px, rel=1e-3)
     assert isinstance(sequence.rectifier.source, FisheyeCamera) == fisheye
     assert sequence.camera_source.startswith(f"assumed: as of a {scope}")
+    assert sequence.camera_origin == "assumed"
     assert [notice.code for notice in sequence.source.warnings if not isinstance(notice, str)] == ["camera-unknown"]
 
 

@@ -85,13 +85,16 @@ KINDS: dict[str, _Kind] = {
     ),
     "camera-contradicted": _Kind(
         "doubtful",
-        "The motion fits another lens (focal length {change:+.0%}), which changes surface by {surface:.0%} and path by "
-        "{path:.0%}.",
+        "The motion fits another focal length ({change:+.0%}): left-out tracks then fit {gain:.0%} better.",
         "Check calibration and cropping; tissue motion can look the same.",
-        unsaid=("x", "y"),
+    ),
+    "camera-aspect": _Kind(
+        "doubtful",
+        "fx and fy of the lens differ by {share:.0%} ({fx:.0f} and {fy:.0f} px): few cameras have such pixels.",
+        "Check fx and fy in the calibration.",
     ),
     "camera-unconfirmed": _Kind(
-        "doubtful",
+        "note",
         "The motion does not constrain the focal length (standard deviation {sigma:.0%}): a wrong one would not show.",
         "Check the calibration.",
     ),

@@ -133,7 +133,7 @@ def sequence_of(
         camera_source=calibration.source,
         size_source=size_source,
         calibrated=calibrated,
-        focal_is_stated=fov_deg is not None,
+        focal_is_stated=fov_deg not in (None, _USUAL_FOV_DEG),
         selection=frames or slice(None),
         depth_scale_mm=calibration.depth_scale_mm or source.depth_scale_mm,
         choice=FrameChoice(settings.fps, settings.skip_duplicates and source.name in UNKNOWN_MAKE),
@@ -303,6 +303,7 @@ def _calibration_of(
         assumed = f"assumed: as of a {settings.scope}, fx {prior.focal:g} of the width ({prior.source}){unfitted}"
         return Calibration(assumed_camera(source, prior.focal * source.width), None, assumed), False
     known, fov_deg, option = ("assumed", _USUAL_FOV_DEG, "") if fov_deg is None else ("stated", fov_deg, " (--fov)")
+    known = "assumed" if fov_deg == _USUAL_FOV_DEG else known
     if not 1 <= fov_deg <= 170:
         raise InputError(f"the horizontal field of view must be 1 to 170 deg, got {fov_deg:g}")
     focal_px = source.width / 2 / np.tan(np.radians(fov_deg) / 2)

@@ -21,6 +21,7 @@ from scopemap.input.frame_choice import FrameChoice, selection_text
 from scopemap.input.source import SkippedFrame, Source, SourceFrame, assumed_camera
 
 CameraOrigin = Literal["calibrated", "stated", "estimated", "assumed"]
+_MOST_ASPECT = 0.05  # by hand: share by which fx and fy differ, of pixels that are nearly square
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class Sequence:
     rectifier : from the source's camera to the working camera.
     camera_source, size_source : how the camera is known, and where the working size comes from, one phrase each.
     calibrated : whether the camera is known; False: assumed, `with_focal` may better it.
-    focal_is_stated : whether the field of view was given, not assumed. is_estimated : whether `with_focal` found it.
+    focal_is_stated : whether a field of view other than the assumed one was given. is_estimated : whether `with_focal`
+        found it.
     selection : slice over the input's frames.
     depth_scale_mm : mm per unit of the input's depth files by its calibration, or None.
     focal_sigma_px : standard deviation of an estimated focal length at the working size, None where none is known.
@@ -105,9 +107,16 @@ class Sequence:
         return [*self.source.notes, *assumed]
 
     @property
+    def _lens_doubts(self) -> list[Notice]:
+        """That the focal lengths across and down differ by more than those of real cameras."""
+        lens = self.rectifier.source.central
+        share = abs(lens.fx / lens.fy - 1)
+        return [Notice("camera-aspect", {"share": share, "fx": lens.fx, "fy": lens.fy})] if share > _MOST_ASPECT else []
+
+    @property
     def warnings(self) -> list[str | Notice]:
         """What was found wrong while reading, so far."""
-        return [*self.source.warnings, *self.source.size_notices]
+        return [*self.source.warnings, *self.source.size_notices, *self._lens_doubts]
 
     def __iter__(self) -> Iterator[tuple[Frame, Truth | None]]:
         """Yield each frame, rectified, with its truth."""
@@ -169,13 +178,19 @@ class Sequence:
             self.source.warnings.append(f"{late}; the frames until then were used")
 
     def with_focal(
-        self, focal_px: float, source: str, sigma_px: float | None = None, fisheye: tuple[float, ...] = ()
+        self,
+        focal_px: float,
+        source: str,
+        sigma_px: float | None = None,
+        fisheye: tuple[float, ...] = (),
+        *,
+        is_estimated: bool = True,
     ) -> Sequence:
         """Return the sequence with another guess of an unknown camera.
 
         `focal_px` is the horizontal focal length at the working size, `sigma_px` its standard deviation where one is
-        known; `source` says how it is known. `fisheye` : coefficients of a `FisheyeCamera`; none: a pinhole. Raises
-        `CalibrationError` where the camera is known.
+        known; `source` says how it is known. `fisheye` : coefficients of a `FisheyeCamera`; none: a pinhole.
+        is_estimated : False: still assumed. Raises `CalibrationError` where the camera is known.
         """
         if self.calibrated:
             raise CalibrationError(f"the focal length of {self.path} is known ({self.camera_source}); it stays")
@@ -183,7 +198,7 @@ class Sequence:
         if fisheye:
             camera = FisheyeCamera(camera.central, fisheye)
         target = working_camera(camera, (self.camera.width, self.camera.height))
-        changed = replace(self, rectifier=Rectifier(camera, target), camera_source=source, is_estimated=True)
+        changed = replace(self, rectifier=Rectifier(camera, target), camera_source=source, is_estimated=is_estimated)
         return replace(changed, focal_sigma_px=sigma_px)
 
 

@@ -49,6 +49,11 @@ class FramePictures:
         self._measures = Rows(_MEASURE)
         self._timed, self._before = timed, time.perf_counter()
 
+    def forget(self) -> None:
+        """Begin anew, where a run begins again at its first frame."""
+        self._pictures, self._measures = {}, Rows(_MEASURE)
+        self._every, self._count, self._before = 1, 0, time.perf_counter()
+
     def __call__(self, step: Step) -> None:
         """Put the frame of a step in: an observer for `reconstruct`."""
         self.put(step.frame.index, step.frame.rgb, step.frame.valid, step.frame.instruments)

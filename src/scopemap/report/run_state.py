@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 _SHARE_AFTERWARDS = 0.5
 _SHARE_UNADJUSTED = 0.05
 
+TRACKING_AGAIN = "tracking again"
+"""With this begins what a run says when it begins again at its first frame."""
+
 
 def of_all(total: int | None) -> str:
     """Return " of" so many; "" where their number is unknown."""
@@ -51,6 +54,9 @@ class RunState:
 
     def words(self, doing: str, done: int, frames: int) -> str:
         """Return what is done outside of tracking, as `Progress` is called with it; a resumed run counts on."""
+        if doing.startswith(TRACKING_AGAIN):
+            self.started, self.done, self.lost, self._first = time.perf_counter(), 0, 0, 1
+            self._maps.clear()
         if doing == "resuming":
             self.done, self._first = done, done + 1
             return f"resuming after {done} frames"

@@ -25,7 +25,7 @@ def prepare(
     """Return a sequence with a focal length, resolved settings, the estimators, and notices of what was estimated."""
     progress("preparing", 0, 0)
     estimators = timed("prepare", create_estimators, config, sequence, own)
-    if not sequence.calibrated:
+    if not (sequence.calibrated or sequence.is_estimated):
         progress("estimating the focal length", 0, 0)
     sequence, camera_notices = _with_estimated_focal(sequence, config, estimators, timed)
     return sequence, config, estimators, camera_notices
@@ -36,7 +36,7 @@ def _with_estimated_focal(
 ) -> tuple[Sequence, list[Notice]]:
     """Give an unknown camera the focal length by `input.focal`, with notices of the estimation."""
     is_stated = config.input.focal == "auto" and sequence.focal_is_stated
-    if sequence.calibrated or is_stated or config.input.focal == "assume":
+    if sequence.calibrated or is_stated or sequence.is_estimated or config.input.focal == "assume":
         return sequence, []
     network = next((part for part in (estimators.depth, estimators.anchor.reference) if part.name == "depth-pro"), None)
     if config.input.focal == "auto" and network is not None:

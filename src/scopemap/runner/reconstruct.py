@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from scopemap.engine.config import Config
 from scopemap.engine.fusion.frame_store import FrameStore
@@ -17,6 +19,8 @@ from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import DepthPreviews
 from scopemap.report.notebook_progress import in_notebook, notebook_progress
+from scopemap.report.run_state import TRACKING_AGAIN
+from scopemap.result.checkpoint import discard_checkpoint
 from scopemap.result.checksums import write_checksums
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.result import Result
@@ -26,10 +30,20 @@ from scopemap.result.verdict import state_verdict
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.estimators import largest_depth_mm
 from scopemap.runner.frame_surfaces import SurfaceWriter
-from scopemap.runner.memory import memory_plan
+from scopemap.runner.lens_of_motion import MOST_PASSES, with_lens_of_motion
+from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import refuse_own_input
-from scopemap.runner.run import Clock, FinalFrameObserver, FrameWriter, KeptObserver, Observer, Progress, Run
+from scopemap.runner.run import (
+    Clock,
+    FinalFrameObserver,
+    FrameWriter,
+    KeptObserver,
+    Observer,
+    Progress,
+    RestartedObserver,
+    Run,
+)
 
 _NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
 
@@ -49,6 +63,10 @@ def reconstruct(
     A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
     result; if that is damaged the run starts again, which a notice reports. So it does where a `tracker` of your own
     keeps nothing (`Kept`). Observers of the kind `KeptObserver` are resumed and saved with it.
+
+    Where nobody has given the lens and the motion of all keyframes fits another focal length clearly better, the run
+    begins again at its first frame with that one, at most twice; it does not with a `tracker`. Observers then see the
+    frames again; those of the kind `RestartedObserver` forget the earlier ones.
 
     The settings in the result are the resolved ones: the TSDF parameters are numbers. Of several submaps the one with
     most frames is the result, and `others` holds the others. With `out` the result is read from that folder.
@@ -98,38 +116,102 @@ def _reconstruct(
     with result_folder(out, overwrite=overwrite, can_resume=resumes) as folder:
         for reason in damage:
             progress(f"starting again: {reason}", 0, 0)
-        store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
-        sequence, config, estimators, notices = prepare(sequence, config, clock.timed, progress)
-        notices = [Notice("checkpoint-damaged", {"reason": reason}) for reason in damage] + notices
-        write_depth = None if folder is None else DepthWriter(folder, largest_depth_mm(config, estimators))
-        previews = None if folder is None else DepthPreviews(folder)
-        writers: tuple[FrameWriter, ...] = tuple(each for each in (write_depth, previews) if each is not None)
-        if folder is not None and config.tracking.camera_at_rest:
-            writers += (SurfaceWriter(folder, config, estimators),)
-        writers += tuple(observer.final for observer in observers if isinstance(observer, FinalFrameObserver))
-        lasting = tuple(observer for observer in observers if isinstance(observer, KeptObserver))
-        with closing(store):
-            pipeline = Pipeline(config, estimators, store, tracker)
-            run = Run(sequence, pipeline, clock, writers, progress, plan)
-            place = folder if tracker is None or kept(tracker.__class__) else None
-            # Without a name, since it holds the run, which goes before the result is written.
-            run.track(observers, None if place is None else Checkpoints(place, identity, run, lasting))
-            result = run.result(notices)
+        notices = [Notice("checkpoint-damaged", {"reason": reason}) for reason in damage]
+        passes = _Passes(config, clock, folder, observers, progress, tracker, plan, identity, notices)
+        result, written = passes.result(sequence)
         result.provenance.update(stated_input(sequence.path, None if out is None else Path(out)))
         changes = input_changes(identity, result.provenance["input_content"], sequence.path)
         result.provenance["notices"] += [notice.as_json() for notice in changes]
         state_verdict(result)
-        del run, pipeline  # with their keyframes and volumes: a long run has none to spare when it writes
-        if folder is not None and write_depth is not None and previews is not None:
+        if folder is not None and written is not None:
             progress("writing", 0, 0)
-            scale_known = result.provenance["scale"]["known"]
-            if range_mm := write_depth.finish(scale_known=scale_known):
-                previews.finish(range_mm, scale_known=scale_known)
+            written.finish(scale_known=result.provenance["scale"]["known"])
             result.save(folder)
-            for observer in lasting:
+            for observer in passes.lasting:
                 observer.save(folder)
             write_checksums(folder, without=NOT_OF_THE_RESULT)
     return result if out is None else Result(out)
+
+
+@dataclass(frozen=True)
+class _DepthPictures:
+    """What writes the depth of each frame, and pictures of it."""
+
+    depth: DepthWriter
+    previews: DepthPreviews
+
+    def finish(self, *, scale_known: bool) -> None:
+        """Write what takes the depths of all frames."""
+        if range_mm := self.depth.finish(scale_known=scale_known):
+            self.previews.finish(range_mm, scale_known=scale_known)
+
+
+@dataclass(frozen=True)
+class _Passes:
+    """Passes of a run through its frames: another one where the motion contradicts a lens that nobody has given.
+
+    What a pass has in memory goes with it: a long run has none to spare when it writes. notices : so far.
+    """
+
+    config: Config
+    clock: Clock
+    folder: Path | None
+    observers: tuple[Observer, ...]
+    progress: Progress
+    tracker: FrameTracker | None
+    plan: MemoryPlan
+    identity: dict[str, Any]
+    notices: list[Notice]
+
+    @property
+    def lasting(self) -> tuple[KeptObserver, ...]:
+        """The observers that are resumed and saved with the run."""
+        return tuple(observer for observer in self.observers if isinstance(observer, KeptObserver))
+
+    def result(self, sequence: Sequence) -> tuple[Result, _DepthPictures | None]:
+        """Return the result of the last pass, and what has written its depth."""
+        for number in range(1, MOST_PASSES + 1):
+            found = self._pass(sequence, number)
+            if not isinstance(found, Sequence):
+                break
+            sequence = found
+            # Nothing resumes from a pass with another lens: where the next one is killed the run begins anew.
+            if self.folder is not None:
+                discard_checkpoint(self.folder)
+            for observer in self.observers:
+                if isinstance(observer, RestartedObserver):
+                    observer.forget()
+            self.progress(f"{TRACKING_AGAIN}, lens {sequence.camera_source}", 0, 0)
+        assert not isinstance(found, Sequence)
+        return found
+
+    def _pass(self, sequence: Sequence, number: int) -> tuple[Result, _DepthPictures | None] | Sequence:
+        """Return the result of a sequence, and what has written its depth; or the sequence with another lens."""
+        folder = self.folder
+        store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
+        sequence, config, estimators, prepared = prepare(sequence, self.config, self.clock.timed, self.progress)
+        self.notices.extend(prepared)
+        writers: tuple[FrameWriter, ...] = ()
+        written = None
+        if folder is not None:
+            written = _DepthPictures(DepthWriter(folder, largest_depth_mm(config, estimators)), DepthPreviews(folder))
+            writers = written.depth, written.previews
+            if config.tracking.camera_at_rest:
+                writers += (SurfaceWriter(folder, config, estimators),)
+        writers += tuple(observer.final for observer in self.observers if isinstance(observer, FinalFrameObserver))
+        with closing(store):
+            pipeline = Pipeline(config, estimators, store, self.tracker)
+            run = Run(sequence, pipeline, self.clock, writers, self.progress, self.plan)
+            states = None
+            if folder is not None and number == 1 and (self.tracker is None or kept(self.tracker.__class__)):
+                states = Checkpoints(folder, self.identity, run, self.lasting)
+            run.track(self.observers, states)
+            # A tracker of the caller cannot begin again, and who stops a run waits for its end.
+            if number < MOST_PASSES and self.tracker is None and not run.stopped:
+                other = with_lens_of_motion(sequence, config, run.lens, again=number > 1)
+                if other is not None:
+                    return other
+            return run.result(self.notices), written
 
 
 def _with_selection(config: Config, sequence: Sequence) -> Config:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -18,6 +18,7 @@ from scopemap.engine.finishing import SubmapFinishing, SubmapSurface, TrackedFra
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.kept import Kept
+from scopemap.engine.mapping.lens_test import LensTest
 from scopemap.engine.mapping.submaps import Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
@@ -55,6 +56,17 @@ class FinalFrameObserver(Protocol):
 
     def final(self, frame: Frame) -> None:
         """Take a frame whose depth and pose are final."""
+
+
+@runtime_checkable
+class RestartedObserver(Protocol):
+    """An `Observer` that forgets what it has seen where a run begins again at its first frame."""
+
+    def __call__(self, step: Step) -> bool | None:
+        """Take a step."""
+
+    def forget(self) -> None:
+        """Begin anew."""
 
 
 Progress = Callable[[str, int, int], None]
@@ -176,9 +188,31 @@ class Run:
                 return
             yield frame
 
+    @cached_property
+    def table(self) -> FrameTable:
+        """The table of all frames, as tracked, after the last one."""
+        return self.frames.read()
+
+    @cached_property
+    def submaps(self) -> tuple[list[Submap], list[Notice]]:
+        """The adjusted submaps, most frames first, and notices. Raises `InputError` without one."""
+        check_tracked(self.table, self.sequence.path)
+        self.clock.timed("track backwards", track_backwards, self.pipeline, self.table)
+        if self.pipeline.config.mapping.at_end:
+            self.progress("adjusting keyframes", 0, 0)
+        trim_memory()
+        found: tuple[list[Submap], list[Notice]] = self.clock.timed("back end", self.pipeline.mapper.submaps)
+        return found
+
+    @property
+    def lens(self) -> LensTest:
+        """What left-out tracks of the largest submap tell of the focal length."""
+        correction = self.submaps[0][0].correction
+        return LensTest() if correction is None else correction.lens
+
     def result(self, prepared: list[Notice]) -> Result:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
-        result = _Finishing(self, self.frames.read(), prepared + self.plan.notices).result()
+        result = _Finishing(self, self.table, prepared + self.plan.notices).result()
         last = self.frames.last_index if self.interrupted else None
         facts = {"interrupted_at_frame": last, "resumed_after_frame": self.resumed_after}
         notices = notices_of_end(result.frames, last, self.kept_maps.forgotten, self.kept_maps.limits)
@@ -198,13 +232,7 @@ class _Finishing:
 
     def result(self) -> Result:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
-        frames, pipeline, clock = self.frames, self.run.pipeline, self.run.clock
-        check_tracked(frames, self.run.sequence.path)
-        clock.timed("track backwards", track_backwards, pipeline, frames)
-        if pipeline.config.mapping.at_end:
-            self.run.progress("adjusting keyframes", 0, 0)
-        trim_memory()
-        submaps, notices = clock.timed("back end", pipeline.mapper.submaps)
+        frames, pipeline, (submaps, notices) = self.frames, self.run.pipeline, self.run.submaps
         results = [self._submap_result(number, submaps) for number in range(len(submaps))]
         submapped = {index for submap in submaps for index in submap.frames}
         apart = set(frames["index"].tolist()) - submapped if pipeline.fusion.at_end else set()

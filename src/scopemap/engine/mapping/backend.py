@@ -23,7 +23,7 @@ from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State
 from scopemap.engine.mapping.depth_correction import depth_grid
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TissueMotion, TrackedPose
-from scopemap.engine.mapping.lens_residual import lens_residual
+from scopemap.engine.mapping.lens_test import lens_test
 from scopemap.engine.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.engine.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.engine.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
@@ -190,19 +190,16 @@ class Backend:
         return without_drift(0.0)
 
     def _tested(self, found: AdjustedMaps, alone: AdjustedMaps, worlds: Mapping[int, Similarity]) -> FrameCorrection:
-        """Return the correction with tissue that moves, or with what the views ask of the lens where none does.
+        """Return the correction with the test of the lens, or with tissue that moves where no other lens explains that.
 
-        Both are looked for at the same time. alone : the main map's own adjustment, which tells enough of the lens.
+        alone : the main map's own adjustment, which tells enough of the lens.
         """
         tested = found if alone.correction.refused else alone
-        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="lens") as beside:
-            lens = None
-            if not found.correction.refused:
-                lens = beside.submit(lens_residual, tested.problem, tested.rigid)
-            correction = found.correction if len(worlds) > 1 else self._with_moving_tissue(found, worlds)
-            if lens is None or correction.tissue is not None:
-                return correction
-            return replace(correction, lens_residual=lens.result())
+        lens = lens_test(tested.problem, tested.rigid)
+        if len(worlds) > 1 or lens.contradicts:
+            return replace(found.correction, lens=lens)
+        correction = self._with_moving_tissue(found, worlds)
+        return correction if correction.refused or correction.tissue else replace(correction, lens=lens)
 
     def _merged_and_adjusted(
         self, main: int, allowed: Collection[int], alone: AdjustedMaps
@@ -336,5 +333,5 @@ class Backend:
         if graph is None:
             return problem, np.zeros((0, 2), int)
         log_depth = points.log_depth + graph.log_scale[points.host]
-        start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.lens)
+        start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.log_focal)
         return replace(problem, start=start), graph.accepted

@@ -1,16 +1,16 @@
-"""Bundle adjustment: keyframe poses, a depth scale of each, the depth of every point and, if unknown, the lens.
+"""Bundle adjustment: keyframe poses, a depth scale of each, the depth of every point and, if unknown, the focal length.
 
 With the notation of `bundle_problem`:
 
     sum of rho(|projected - observed| / s) / c  +  sum of rho((u_p - ln depth_p - a_h) / sigma_p)
     +  sum of (a_k / sigma_a)^2  +  sum of |log(T_j T_i^-1 (T_j T_i^-1)_tracked^-1)|^2, weighted
-    +  sum of ((lens - expected) / sigma_lens)^2
+    +  ((ln f - expected) / sigma_f)^2
 
 rho is Cauchy's kernel, s the robust standard deviation of the reprojection errors, c the number of observations that
 count as one, because the errors of flow are alike at neighbouring corners. The second sum holds points to the estimated
 depth, up to the keyframe's factor exp(a_h); the third holds these factors to 1; the fourth holds a keyframe j to its
-tracked motion from keyframe i; the last is for an unknown lens. Dog-leg with Schur complement: Triggs et al., "Bundle
-Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
+tracked motion from keyframe i; the last is for an unknown focal length. Dog-leg with Schur complement: Triggs et al.,
+"Bundle Adjustment - A Modern Synthesis", 2000; Lourakis and Argyros, ICCV 2005.
 
 More than a few hundred keyframes are adjusted window by window, so that time grows with their number, not its cube.
 """
@@ -132,14 +132,16 @@ def _with_window(
         points=Points(place[points.host[own]], points.pixel[own], log_depth, sigma),
         observations=Observations(np.searchsorted(own, seen.point[some]), place[observer[some]], seen.pixel[some]),
         neighbours=place[problem.neighbours[(place[problem.neighbours] >= 0).all(1)]],
-        start=State(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.lens),
+        start=State(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.log_focal),
         held=int((keyframes < first).sum()),
     )
     solved, new = adjust(part, max_iterations=max_iterations), ~known
     log_depth, sigma, log_scale = state.log_depth.copy(), found.log_depth_sigma.copy(), state.log_scale.copy()
     log_depth[own[new]], sigma[own[new]] = solved.state.log_depth[new], solved.log_depth_sigma[new]
     moved[keyframes], log_scale[keyframes] = solved.state.T_camera_world, solved.state.log_scale
-    return BundleSolution(State(moved, log_scale, log_depth, state.lens), sigma, found.iterations + solved.iterations)
+    return BundleSolution(
+        State(moved, log_scale, log_depth, state.log_focal), sigma, found.iterations + solved.iterations
+    )
 
 
 def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: float = 1e-3) -> BundleSolution:
@@ -187,15 +189,15 @@ def weights(state: State, seen: Errors | Reprojection) -> np.ndarray:
 
 
 def linearised(problem: BundleProblem, state: State, seen: Errors | None = None) -> ReducedModel:
-    """Return the model of the cost around a state: unknowns of the keyframes, of the lens if unknown, of the points.
+    """Return the model of the cost around a state: unknowns of the keyframes, ln f if unknown, then the points.
 
     seen : the errors of the observations, where they are known.
     """
-    count, lens = len(state.T_camera_world), 0 if problem.lens_sigma is None else 3
+    count = len(state.T_camera_world)
     seen, edges = seen or reprojection_errors(problem, state), odometry_edges(problem, state)
     held = [6 + PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
     held += [np.arange(6), np.arange(PER_KEYFRAME * problem.held)]
-    unknowns = PER_KEYFRAME * count + lens
+    unknowns = PER_KEYFRAME * count + (problem.log_focal_sigma is not None)
     return ReducedModel(
         problem.first_seen,
         problem.parts,
@@ -216,14 +218,14 @@ def held_depths(problem: BundleProblem, state: State) -> tuple[np.ndarray, np.nd
 
 
 def derivatives(problem: BundleProblem, state: State, points: slice, moved: Moved | None = None) -> Linear:
-    """Return the derivatives of the observations of some points by the keyframes and the lens."""
+    """Return the derivatives of the observations of some points by the keyframes and ln f."""
     seen = reproject(problem, state, points, moved)
-    by_camera, by_host, by_depth, by_lens = jacobians(problem, state, points, seen)
+    by_camera, by_host, by_depth, by_focal = jacobians(problem, state, points, seen)
     number, observer, _ = (part[problem.seen(points)] for part in problem.observations.columns)
     first = PER_KEYFRAME * np.column_stack([observer, problem.points.host[number]])
-    of_lens = PER_KEYFRAME * len(state.T_camera_world) + np.tile(np.arange(by_lens.shape[2]), (len(number), 1))
-    columns = np.hstack([first[:, :1] + np.arange(6), first[:, 1:] + np.arange(6), of_lens])
-    by = np.concatenate([by_camera, by_host, by_lens], -1)
+    of_focal = PER_KEYFRAME * len(state.T_camera_world) + np.tile(np.arange(by_focal.shape[2]), (len(number), 1))
+    columns = np.hstack([first[:, :1] + np.arange(6), first[:, 1:] + np.arange(6), of_focal])
+    by = np.concatenate([by_camera, by_host, by_focal], -1)
     return Linear(columns, by, by_depth, seen.error, weights(state, seen) / problem.correlated)
 
 
@@ -236,8 +238,8 @@ def cost(problem: BundleProblem, state: State, seen: Errors, edges: OdometryEdge
     cost += 0.5 * (edges.information * edges.error**2).sum()
     if priors.scale > 0:
         cost += 0.5 * ((state.log_scale / priors.scale) ** 2).sum()
-    if problem.lens_sigma is not None:
-        cost += 0.5 * (((state.lens - problem.tracked.lens) / problem.lens_sigma) ** 2).sum()
+    if problem.log_focal_sigma is not None:
+        cost += 0.5 * ((state.log_focal - problem.tracked.log_focal) / problem.log_focal_sigma) ** 2
     return float(cost)
 
 
@@ -262,7 +264,7 @@ def odometry_edges(problem: BundleProblem, state: State) -> OdometryEdges:
 
 
 def camera_priors(problem: BundleProblem, state: State, edges: OdometryEdges) -> list[Prior]:
-    """Return the normal equations of the priors of keyframes, and of the lens."""
+    """Return the normal equations of the priors of keyframes, and of ln f."""
     T, unit, (i, j) = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), edges.pairs.T
     own = PER_KEYFRAME * np.repeat(edges.pairs, 6, axis=1) + np.tile(np.arange(6), 2)
     by_i = -_adjoint(T[j] @ inverse(T[i]))
@@ -272,9 +274,9 @@ def camera_priors(problem: BundleProblem, state: State, edges: OdometryEdges) ->
     if problem.priors.scale > 0:
         information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + PER_KEYFRAME * np.arange(len(T))
         priors.append(Prior(own, np.diag(information), information * state.log_scale))
-    if problem.lens_sigma is not None:
-        information, own = problem.lens_sigma**-2.0, PER_KEYFRAME * len(T) + np.arange(3)
-        change = state.lens - problem.tracked.lens
+    if problem.log_focal_sigma is not None:
+        information, own = np.array([problem.log_focal_sigma**-2.0]), np.array([PER_KEYFRAME * len(T)])
+        change = np.array([state.log_focal - problem.tracked.log_focal])
         priors.append(Prior(own, np.diag(information), information * change))
     return priors
 
@@ -321,7 +323,7 @@ def retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
     own = step[:count].reshape(-1, PER_KEYFRAME)
     twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
     T = se3_exp(twists) @ state.T_camera_world
-    lens = state.lens if problem.lens_sigma is None else state.lens + step[count : count + 3]
+    log_focal = state.log_focal + (0.0 if problem.log_focal_sigma is None else float(step[count]))
     by_points = step[len(step) - len(state.log_depth) :]
     log_depth = state.log_depth - np.log(np.clip(1 - by_points, *_INVERSE_DEPTH_STEP))
-    return State(T, state.log_scale + own[:, 6], log_depth, lens, state.sigma_px)
+    return State(T, state.log_scale + own[:, 6], log_depth, log_focal, state.sigma_px)

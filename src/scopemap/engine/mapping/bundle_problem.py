@@ -6,6 +6,7 @@ keyframe t observes it at project(T_t T_h^-1 exp(u_p) ray_p).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -76,11 +77,10 @@ class BundleProblem:
     """What is adjusted.
 
     T_camera_world : (K, 4, 4) as tracked. points, observations, priors : as named. neighbours : (C, 2) int, pairs of
-    keyframes between which the motion was tracked. focal_px : fx, as expected where the lens is unknown. start : where
-    to begin, None: as tracked. lens_sigma : (3,) standard deviations of `State.lens` from what is expected, None: it is
-    known. least_sigma_px : of the reprojection errors. correlated : so many observations count as one, since errors of
-    flow are alike at neighbouring corners. held : so many first keyframes keep pose and scale; the first one keeps its
-    pose in any case.
+    keyframes between which the motion was tracked. focal_px : fx, as expected where it is unknown. start : where to
+    begin, None: as tracked. log_focal_sigma : standard deviation of ln fx, None: it is known. least_sigma_px : of the
+    reprojection errors. correlated : so many observations count as one, since errors of flow are alike at neighbouring
+    corners. held : so many first keyframes keep pose and scale; the first one keeps its pose in any case.
     """
 
     T_camera_world: np.ndarray
@@ -90,7 +90,7 @@ class BundleProblem:
     neighbours: np.ndarray
     focal_px: float
     start: State | None = None
-    lens_sigma: np.ndarray | None = None
+    log_focal_sigma: float | None = None
     least_sigma_px: float = 0.1
     correlated: float = 1.0
     held: int = 0
@@ -132,20 +132,17 @@ class BundleProblem:
     @property
     def tracked(self) -> State:
         """The state as tracked."""
-        count, lens = len(self.T_camera_world), np.array([np.log(self.focal_px), 0.0, 0.0])
-        return State(self.T_camera_world, np.zeros(count), self.points.log_depth, lens)
+        log_scale, log_focal = np.zeros(len(self.T_camera_world)), math.log(self.focal_px)
+        return State(self.T_camera_world, log_scale, self.points.log_depth, log_focal)
 
 
 class State(NamedTuple):
-    """T_camera_world (K, 4, 4), ln of the depth scales (K,), ln of the depths (P,).
-
-    lens : (3,) ln f, and how far the principal point is from where it was taken to be, px.
-    """
+    """T_camera_world (K, 4, 4), ln of the depth scales (K,), ln of the depths (P,), ln of fx in px."""
 
     T_camera_world: np.ndarray
     log_scale: np.ndarray
     log_depth: np.ndarray
-    lens: np.ndarray
+    log_focal: float
     sigma_px: float = float("nan")
 
 
@@ -188,37 +185,29 @@ def reproject(problem: BundleProblem, state: State, points: slice, moved: Moved 
 
     moved : None where tissue is rigid.
     """
-    some, T, focal = problem.seen(points), state.T_camera_world, float(np.exp(state.lens[0]))
+    some, T, focal = problem.seen(points), state.T_camera_world, math.exp(state.log_focal)
     number, observer, pixel = (part[some] for part in problem.observations.columns)
-    rays = np.column_stack([_corners(problem, state, points) / focal, np.ones(points.stop - points.start)])
+    rays = np.column_stack([problem.points.pixel[points] / focal, np.ones(points.stop - points.start)])
     in_host, point = np.exp(state.log_depth[points])[:, None] * rays, number - points.start
     pairs, which = problem.pairs[0], problem.pairs[1][some]
     least = int(which.min(initial=len(pairs)))  # pairs are sorted by host, too
     pairs, pair = pairs[least : which.max(initial=0) + 1], which - least
     between = T[pairs % len(T)] @ inverse(T)[pairs // len(T)]
     shift = np.zeros((0, 3)) if moved is None else np.einsum("nij,nj->ni", T[observer, :3, :3], moved(some))
-    observed = pixel - state.lens[1:]
-    error, ahead, seen, projected = _projected(between, pair, in_host, point, observed, shift, focal)
+    error, ahead, seen, projected = _projected(between, pair, in_host, point, pixel, shift, focal)
     return Reprojection(error, ahead, seen, projected, in_host, point, between, pair)
 
 
 def jacobians(
     problem: BundleProblem, state: State, points: slice, at: Reprojection
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the derivatives of pixels by twists of the observing camera and of the host (n, 2, 6), ln depth and lens.
+    """Return the derivatives of pixels by twists of the observing camera and of the host (n, 2, 6), ln depth and ln f.
 
-    By ln depth (n, 2); by the lens (n, 2, 3), (n, 2, 0) where it is known. Translations are in units of the typical
+    By ln depth (n, 2); by ln f (n, 2, 1), (n, 2, 0) where it is known. Translations are in units of the typical
     depth. at : what `reproject` returned for these points.
     """
-    lens = 0 if problem.lens_sigma is None else 3
-    corners, focal = _corners(problem, state, points), float(np.exp(state.lens[0]))
-    return _derivatives(at, corners, focal, problem.unit_mm, lens)
-
-
-def _corners(problem: BundleProblem, state: State, points: slice) -> np.ndarray:
-    """Return the pixels (p, 2) of some points in their hosts, from the principal point of a state."""
-    pixels: np.ndarray = problem.points.pixel[points] - state.lens[1:]
-    return pixels
+    corners, focal = problem.points.pixel[points], math.exp(state.log_focal)
+    return _derivatives(at, corners, focal, problem.unit_mm, problem.log_focal_sigma is not None)
 
 
 @kernel
@@ -247,11 +236,11 @@ def _projected(between, pair, in_host, point, observed, shift, focal):  # type: 
 
 
 @kernel
-def _derivatives(at, corners, focal, unit_mm, lens):  # type: ignore[no-untyped-def]
-    """Return what `jacobians` does; corners : (p, 2) of the points, px from the principal point. lens : 3, 0: known."""
+def _derivatives(at, corners, focal, unit_mm, is_free):  # type: ignore[no-untyped-def]
+    """Return what `jacobians` does; corners : (p, 2) of the points, px from the centre. is_free : f is unknown."""
     count, row, turned, X = len(at.point), np.zeros(3), np.zeros(3), np.zeros(3)
     by_camera, by_host = np.empty((count, 2, 6)), np.empty((count, 2, 6))
-    by_depth, by_lens = np.zeros((count, 2)), np.empty((count, 2, lens))
+    by_depth, by_focal = np.zeros((count, 2)), np.empty((count, 2, 1 if is_free else 0))
     for n in range(count):
         z = at.seen[n, 2] if at.ahead[n] else 1.0
         q, p = at.pair[n], at.point[n]
@@ -270,10 +259,9 @@ def _derivatives(at, corners, focal, unit_mm, lens):  # type: ignore[no-untyped-
                 by_camera[n, axis, i] = at.seen[n, j] * row[k] - at.seen[n, k] * row[j]
                 by_host[n, axis, i] = turned[j] * X[k] - turned[k] * X[j]
                 by_camera[n, axis, 3 + i], by_host[n, axis, 3 + i] = unit_mm * row[i], -unit_mm * turned[i]
-            if lens:
+            if is_free:
                 scale = X[2] / focal
-                by_lens[n, axis, 0] = at.pixel[n, axis]
+                by_focal[n, axis, 0] = at.pixel[n, axis]
                 for j in range(2):
-                    by_lens[n, axis, 0] -= scale * turned[j] * corners[p, j]
-                    by_lens[n, axis, 1 + j] = (1.0 if j == axis else 0.0) - scale * turned[j]
-    return by_camera, by_host, by_depth, by_lens
+                    by_focal[n, axis, 0] -= scale * turned[j] * corners[p, j]
+    return by_camera, by_host, by_depth, by_focal

@@ -12,7 +12,7 @@ from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, mean_near, rotation_angle_rad
 from scopemap.engine.mapping.deformation_graph import Deformation
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField
-from scopemap.engine.mapping.lens_residual import LensResidual
+from scopemap.engine.mapping.lens_test import LensTest
 from scopemap.engine.mapping.nonrigid_adjustment import LeftOutTracks
 from scopemap.engine.mapping.other_starts import ShapeTest
 from scopemap.engine.notices import Notice
@@ -66,8 +66,8 @@ class FrameCorrection:
     observations. refused : why keyframes stay as tracked, None where it is. loops : number of accepted loop closures.
     loop_frames : the two frames of each. depth_fields : (K,) further factors of each pixel's depth; (): none.
     S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
-    number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens_residual :
-    what the observations ask of the lens. tissue : how it moves; None: it is taken to be at rest. shape : what other
+    number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens : what
+    left-out tracks tell of it. tissue : how it moves; None: it is taken to be at rest. shape : what other
     starts of the adjustment tell of it.
     """
 
@@ -84,7 +84,7 @@ class FrameCorrection:
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
     tracked: Mapping[int, TrackedPose] = field(default_factory=dict)
     depth_mm: float = 1.0
-    lens_residual: LensResidual = field(default_factory=LensResidual)
+    lens: LensTest = field(default_factory=LensTest)
     tissue: TissueMotion | None = None
     shape: ShapeTest = field(default_factory=ShapeTest)
 
@@ -93,7 +93,7 @@ class FrameCorrection:
         """What was adjusted and how well it fits, or why nothing was; what determines the shape; another lens."""
         said = self.tissue is not None or (self.refused and self.refused.code == "mapping-not-determined")
         tested = [] if said else self.shape.notices
-        return [self.notice, *tested, *self.lens_residual.notices]
+        return [self.notice, *tested, *self.lens.notices]
 
     @property
     def notice(self) -> Notice:

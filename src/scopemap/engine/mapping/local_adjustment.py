@@ -24,7 +24,6 @@ from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, 
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.engine.mapping.frame_correction import KeyframeStep
-from scopemap.engine.mapping.lens_residual import LensEvidence, LensResidual, lens_evidence
 from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.engine.notices import Notice
 
@@ -32,8 +31,6 @@ _FREE = 3  # by hand: last keyframes of the window that move
 _ITERATIONS = 10  # by hand: steps of a window's adjustment
 _LEAST_SEEN = 0.1  # by hand: of a keyframe's points that those before it must observe: else nothing corrects its depth
 _REMEMBERED = 1000  # by hand: keyframes whose correction is kept: the tracker returns to fewer
-_LENS_EVERY = 4  # by hand: adjusted keyframes: windows that have hardly a keyframe in common
-_LENS_SIGMA = 0.01  # by hand: of ln f, below which no further windows are asked
 _MOST_REFUSED = 0.1  # by hand: of the keyframes: with more, the scene is not rigid
 
 
@@ -86,8 +83,6 @@ class LocalAdjustment:
     _corrections: Kept[dict[int, KeyframeCorrection]]
     _adjusted: Kept[Counter[int]]
     _refused: Kept[Counter[int]]
-    _lens_evidence: Kept[LensEvidence | None] = None
-    _lens: Kept[LensResidual] = LensResidual()
     _is_determined: Kept[bool] = False
     _shapes: Kept[dict[int, ShapeTest]]
 
@@ -126,7 +121,6 @@ class LocalAdjustment:
                 self._take(keyframe, reference, matches)
             else:
                 self._adjusted[map_number] += 1
-                self._test_lens(points, observations, found.state, keyframe.camera.fx)
                 correction = self._update(points, found, keyframe.camera)
         self._corrections[keyframe.index] = correction
         while len(self._corrections) > _REMEMBERED:
@@ -144,14 +138,14 @@ class LocalAdjustment:
             self._window[-1] = self._window[-1]._replace(reference=index)
 
     def notices(self, map_number: int) -> list[Notice]:
-        """Return what was adjusted of a map, what determines its shape, and another lens; [] where nothing was."""
+        """Return what was adjusted of a map, and what determines its shape; [] where nothing was."""
         adjusted, refused = self._adjusted[map_number], self._refused[map_number]
         if not adjusted + refused:
             return []
         values = {"adjusted": adjusted, "refused": refused}
         moves = refused > _MOST_REFUSED * (adjusted + refused)
         shape = self._shapes.get(map_number, ShapeTest()).notices
-        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *shape, *self._lens.notices]
+        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *shape]
 
     @property
     def _numbers(self) -> range:
@@ -182,8 +176,8 @@ class LocalAdjustment:
         """Return the adjustment of the window, from where its keyframes are; the first ones are held."""
         settings, count = self._settings, len(self._window)
         _, _, T_camera_world, log_scale, log_depth, found_sigma = map(list, zip(*self._window, strict=True))
-        T, lens = np.stack(T_camera_world), np.array([np.log(focal_px), 0.0, 0.0])
-        start = State(T, np.array(log_scale), np.concatenate(log_depth), lens)
+        T = np.stack(T_camera_world)
+        start = State(T, np.array(log_scale), np.concatenate(log_depth), math.log(focal_px))
         held = max(count - _FREE, 0)
         known, sigma = points.host < held, np.clip(np.concatenate(found_sigma), HELD_SIGMA, points.sigma)
         estimated = np.where(known, start.log_depth - start.log_scale[points.host], points.log_depth)
@@ -207,18 +201,6 @@ class LocalAdjustment:
             self._is_determined = not test.refuses_window
             self._shapes[map_number] = test
         return best, test
-
-    def _test_lens(self, points: Points, observations: Observations, state: State, focal_px: float) -> None:
-        """Ask one full window in a few what its views tell of the lens, until they tell it."""
-        is_due = len(self._window) == self._window.maxlen and not self._adjusted.total() % _LENS_EVERY
-        if is_due and not self._lens.sigma <= _LENS_SIGMA:
-            problem = replace(self._problem(points, observations, focal_px), points=points, held=0)
-            evidence = lens_evidence(problem, state)
-            if evidence is not None:
-                self._lens_evidence = evidence.and_also(self._lens_evidence)
-                # So short windows do not tell the principal point well: a right lens of a real clip had -0.1 +- 0.02.
-                asked = self._lens_evidence.residual._replace(x=0.0, y=0.0)
-                self._lens = asked.with_effect(problem, state)
 
     def _update(self, points: Points, found: BundleSolution, camera: PinholeCamera) -> KeyframeCorrection:
         """Take over an adjustment; return the correction of the window's last keyframe."""

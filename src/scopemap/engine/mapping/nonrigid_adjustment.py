@@ -223,6 +223,6 @@ def _errors(part: BundleProblem, keyframes: State, moved: Moved | None) -> tuple
 def _in_world(problem: BundleProblem) -> np.ndarray:
     """Return the points (P, 3), mm, where their hosts see them when the search begins."""
     points, state = problem.points, problem.begin
-    rays = np.column_stack([points.pixel / np.exp(state.lens[0]), np.ones(len(points.host))])
+    rays = np.column_stack([points.pixel / np.exp(state.log_focal), np.ones(len(points.host))])
     T = inverse(state.T_camera_world)[points.host]
     return np.einsum("nij,nj->ni", T[:, :3, :3], np.exp(state.log_depth)[:, None] * rays) + T[:, :3, 3]

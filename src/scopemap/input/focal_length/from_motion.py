@@ -179,8 +179,10 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
         source, focal_px = f"{sequence.camera_source}; {kept}", scope.focal * sequence.camera.width
         if found is not None and found.reason:
             # Its mean weighs what is expected against what was seen.
-            return _with_tried(sequence, found, windows, f"{source}; used: the likeliest of such lenses"), []
-        return sequence.with_focal(focal_px, source, scope.spread * focal_px, KINDS[scope.kinds[0]]), []
+            used = f"{source}; used: the likeliest of such lenses"
+            return replace(_with_tried(sequence, found, windows, used), is_estimated=False), []
+        sigma_px, fisheye = scope.spread * focal_px, KINDS[scope.kinds[0]]
+        return sequence.with_focal(focal_px, source, sigma_px, fisheye, is_estimated=False), []
     if kept:
         return replace(sequence, camera_source=f"{sequence.camera_source}; {kept}"), []
     distorted = Notice("camera-distorted", {"share": abs(estimate.distortion)})
