@@ -134,7 +134,9 @@ def test_a_keyframe_that_sees_nothing_of_those_before_takes_over_the_correction(
 
 def test_windows_contradict_a_wrong_focal_length_and_not_the_right_one(tmp_path: Path) -> None:
     clip = write_clip(tmp_path / "clip", 100.0, 40)
-    config = Config.load("realtime", settings={"fusion.enabled": False, "tracking.keyframe_every": 3})
+    config = Config.load(
+        "realtime", settings={"fusion.enabled": False, "tracking.keyframe_every": 3, "mapping.method": "local"}
+    )
     for factor, expected in {1.0: [], 0.85: [1 / 0.85 - 1]}.items():
         px = factor * focal_of(100.0)
         result = reconstruct(open_sequence(clip, camera=f"{px} {px} 99.5 79.5"), config)
