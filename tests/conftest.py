@@ -37,6 +37,7 @@ CLUSTER = {"test_engines", "test_addresses"}
 # Runs of whole clips, or of many processes: a module takes more than three seconds on an idle core. In other modules
 # single tests are marked `slow`, for the same reason.
 SLOW = {
+    "test_ends_of_settings",
     "test_backwards",
     "test_bad_input",
     "test_browser_result_page",

@@ -110,17 +110,20 @@ def test_a_store_that_lost_bytes_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("corrected", "voxel_mm", "at_end"), [(False, 1.0, False), (True, 1.0, True), (False, None, True)]
+    ("corrected", "voxel_mm", "shown", "at_end"),
+    [(False, 1.0, False, False), (True, 1.0, False, True), (True, 1.0, True, True), (False, None, True, True)],
 )
 def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
-    corrected: bool, voxel_mm: float | None, at_end: bool
+    corrected: bool, voxel_mm: float | None, shown: bool, at_end: bool
 ) -> None:
     settings = FusionSettings(voxel_mm=voxel_mm, every=2, min_weight=0.0)
     fusion = SurfaceFusion(settings, FrameStore(), corrected=corrected)
+    fusion.shown = shown
     frames = [wall(60.0, n) for n in range(3)]
     for frame in frames:
         fusion.put(frame)
-    assert (fusion.at_end, fusion.at_once) == (at_end, not at_end)
+    assert (fusion.at_end, fusion.at_once) == (at_end, voxel_mm is not None and (shown or not at_end))
+    assert bool(len(fusion.surface(0).faces)) == fusion.at_once
     surface = fusion.fuse(fusion.store.frames(), fusion.store.median_depth_mm())
     volume = TsdfVolume(FusionSettings(voxel_mm=1.0, min_weight=0.0))
     for frame in frames[::2]:

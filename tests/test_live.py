@@ -27,6 +27,7 @@ from scopemap.apps.live.live import LiveSession
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.input.live_source import LiveSource
 from scopemap.input.opening import sequence_of
+from scopemap.result.result import Result
 
 FPS = 10
 SETTINGS = {"input.focal": "assume", "fusion.every": 1}
@@ -176,9 +177,14 @@ def test_the_command_writes_a_result(clip: Path, tmp_path: Path, capfd: pytest.C
     assert {"trajectory.tum", "mesh.ply", "report.html", "frames.csv", "SHA256SUMS"} <= {
         file.name for file in out.iterdir()
     }
+    result = Result(out)
+    assert result.config.mapping.method == "realtime"
+    kept = [index for index in result.trajectory.indices.tolist() if result.depth.has(index)]
+    assert len(kept) >= 3
     assert call("live", clip, "--json", "--seconds", 2.5) == 0
     facts = json.loads(capfd.readouterr().out)
     assert facts["live"]["read"] < 40
+    assert not [notice for notice in facts["notices"] if notice["code"] == "mapping-adjusted"]
     assert "overwrite" in refused(capfd, "live", clip, "--out", out)
 
 

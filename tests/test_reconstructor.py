@@ -60,8 +60,11 @@ def test_pictures_with_a_camera_are_what_a_sequence_is(folder: Path) -> None:
     assert one.camera == sequence.camera
     for picture in _pictures(folder):
         one.step(picture)
-    assert len(one.surface().faces) > 100
-    found = one.result()
+    assert len(one.surface().faces) > 100  # as tracked
+    final: list[Frame] = []
+    found = one.result(final.append)
+    poses = np.stack([np.asarray(frame.T_world_camera) for frame in final])
+    np.testing.assert_array_equal(poses, found.trajectory.T_world_camera)
     np.testing.assert_array_equal(found.trajectory.T_world_camera, by_run.trajectory.T_world_camera)
     assert found.provenance["camera"]["source"] == "given"
 
@@ -159,6 +162,25 @@ def test_pictures_that_do_not_fit_are_refused() -> None:
         one.result()
     with pytest.raises(ValueError, match="closed"):
         one.step(black)
+
+
+def test_beyond_the_limit_of_stored_frames_the_result_is_what_was_shown(folder: Path) -> None:
+    config = Config.load("realtime", settings={"tracking.keyframe_every": 2})
+    codes = {}
+    for stored in (FRAMES, FRAMES - 1):
+        one = Reconstructor(config, open_sequence(folder), limits=Limits(stored=stored))
+        steps = [one.step(frame) for frame in one.frames()]
+        shown, result = one.surface(), one.result()
+        tracked = np.stack([np.asarray(step.frame.T_world_camera) for step in steps])
+        is_shown = np.array_equal(result.trajectory.T_world_camera, tracked)
+        assert is_shown == (stored < FRAMES)
+        assert np.allclose(shown.bounds, result.mesh.bounds, rtol=0, atol=1e-3) == is_shown
+        assert result.provenance["surface"]["frames"] > 0
+        codes[stored] = {notice["code"] for notice in result.provenance["notices"]}
+    assert "mapping-adjusted" in codes[FRAMES]
+    assert {code for code in codes[FRAMES - 1] if code.startswith("mapping")} == {"mapping-local"}
+    by_run = reconstruct(open_sequence(folder), config)
+    assert "mapping-local" not in {notice["code"] for notice in by_run.provenance["notices"]}
 
 
 def test_limits_bound_what_is_kept(folder: Path) -> None:

@@ -91,7 +91,7 @@ class Pipeline:
         return self.odometry.track(preprocessed)
 
     def fuse(self, step: Step) -> None:
-        """Fuse a tracked frame, or store it until the last one; of one that was skipped nothing is kept."""
+        """Fuse a tracked frame, store it until the last one, or both; of one that was skipped nothing is kept."""
         if not step.skipped:
             self.fusion.put(step.frame, step.track.map)
 

@@ -22,12 +22,13 @@ _MAX_DIFFERENCE = (0.1, 0.2)  # between these motions: rad, share of the depth
 def track_backwards(pipeline: Pipeline, frames: FrameTable) -> None:
     """Track lost frames backwards; the table of all frames as tracked, and the pipeline's mapper, take the changes.
 
-    Nothing is done where frames are fused at once, where no back end adjusts poses, or where these are smoothed, or
-    lost cameras not looked for.
+    Nothing is done where frames are fused at once, where no back end adjusts poses or merges maps, or where poses are
+    smoothed, or lost cameras not looked for.
     """
     config, rows = pipeline.config, frames.rows
     looked_for = config.tracking.relocalisation_keyframes > 0 and config.smoothing.method == "none"
-    if not (looked_for and pipeline.fusion.at_end and pipeline.mapper.adjusts):
+    merges = pipeline.mapper.adjusts and config.mapping.min_loop_inliers > 0
+    if not (looked_for and pipeline.fusion.at_end and merges):
         return
     for place in range(1, len(rows)):
         start = rows[place]

@@ -32,7 +32,9 @@ _MOVING_SHARE = 0.1  # of the picture: less may be chance, such as a few false m
 class Limits:
     """What a run without an end may keep; None: no limit.
 
-    frames : in the table; beyond it every second one of the older half is forgotten, again and again. maps : those of
+    stored : frames on disk, to be corrected after the last one; beyond them, and beyond `frames`, the poses stay as
+    tracked and the surface as it is shown. frames : in the table; beyond it every second one of the older half is
+    forgotten, again and again. maps : those of
     most frames, beside the present one, keep a surface. blocks : of 8^3 voxels in all surfaces, 12 KiB each; beyond it
     all maps but the present one lose theirs, and then nothing more is fused.
     """
@@ -40,6 +42,13 @@ class Limits:
     frames: int | None = None
     maps: int | None = None
     blocks: int | None = None
+    stored: int | None = None
+
+    def exceeded(self, *, frames: int, stored: int) -> bool:
+        """Return whether a run has so many frames in its table, or stored, that none is corrected at the end."""
+        return any(
+            limit is not None and count > limit for count, limit in ((frames, self.frames), (stored, self.stored))
+        )
 
 
 def motion_notices(frames: FrameTable, config: Config, *, confirmed: bool) -> list[Notice]:

@@ -32,7 +32,7 @@ from scopemap.runner.estimators import CustomEstimators, largest_depth_mm
 from scopemap.runner.memory import memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import Limits, provenance_of, scale_facts
-from scopemap.runner.run import Clock, KeptMaps, Progress, Run, overlapped
+from scopemap.runner.run import Clock, FrameWriter, KeptMaps, Progress, Run, overlapped
 
 
 class Reconstructor:
@@ -81,6 +81,7 @@ class Reconstructor:
         )
         self._store = FrameStore()
         self._pipeline = Pipeline(self.config, estimators, self._store)
+        self._pipeline.fusion.shown = True
         plan, kept = memory_plan(self.config, self._sequence), KeptMaps(limits or Limits())
         self._run = Run(self._sequence, self._pipeline, clock, (), progress, plan, kept)
         self._last, self._closed = -1, False
@@ -122,9 +123,9 @@ class Reconstructor:
             yield step
 
     def surface(self) -> trimesh.Trimesh:
-        """Return the surface of the current map so far, world mm, with colours; empty unless fused at once.
+        """Return the surface of the current map so far, as tracked, world mm, with colours; empty unless fused at once.
 
-        At once fuse the presets that need no back end, such as `realtime`; not while `steps` waits for a picture.
+        Frames are fused at once where `fusion.voxel_mm` is set, as in `realtime`; not while `steps` waits for one.
         """
         return self._pipeline.fusion.surface(self._run.kept_maps.map)
 
@@ -151,13 +152,16 @@ class Reconstructor:
         """Whether the scale is measured or anchored; False: millimetres are a guess."""
         return bool(scale_facts(self._pipeline.estimators)["known"])
 
-    def result(self) -> Result:
+    def result(self, final: FrameWriter | None = None) -> Result:
         """Return poses, surface and the table of all frames, adjusted by the back end; the last call.
+
+        final : called with each frame that is corrected, when its depth and pose are final.
 
         `trajectory.T_world_camera` holds the poses (N, 4, 4), NaN where lost; `mesh` vertices, faces and colours;
         `save(folder)` writes it. Raises `InputError` where no frame was tracked.
         """
         self._refuse_closed()
+        self._run.writers = () if final is None else (final,)
         try:
             result = self._run.result(self._notices)
             result.provenance.update(stated_input(self._sequence.path, None))

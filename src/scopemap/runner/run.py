@@ -169,9 +169,15 @@ class Run:
         if not fusion.at_end:
             for write in self.writers:
                 write(step.frame)
-        if fusion.at_once:
-            self.checked[step.track.map].put(step.frame, fusion.store if limits.maps is None else None)
+        # Stored frames are checked as corrected, unless they become too many.
+        if fusion.at_once and (not fusion.at_end or limits != Limits()):
+            in_memory = fusion.at_end or limits.maps is not None
+            self.checked[step.track.map].put(step.frame, None if in_memory else fusion.store)
         self.frames.append(step.row)
+        is_beyond = limits.exceeded(frames=len(self.frames), stored=len(fusion.store))
+        if fusion.at_end and fusion.at_once and is_beyond:
+            fusion.stay_at_once()
+            self.pipeline.mapper.stay_as_tracked()
         for number in self.kept_maps.beyond(step.track, is_full=fusion.is_full):
             fusion.forget(number)
             self.checked.pop(number, None)
@@ -272,7 +278,7 @@ class _Finishing:
             TrackedFrames(frames["index"], frames["time_s"], frames["T_world_camera"], frames["median_depth_mm"]),
             self.run.sequence.camera,
             keeps_depth=bool(self.run.writers),
-            checked=self.run.checked.pop(submap.main, None),
+            checked=None if self.run.pipeline.fusion.at_end else self.run.checked.pop(submap.main, None),
         )
         with closing(finishing):
             timed("free space", finishing.carve)

@@ -1,4 +1,4 @@
-"""The twelve tables of bench/results/: made at one commit, and checked for being older than the code.
+"""The thirteen tables of bench/results/: made at one commit, and checked for being older than the code.
 
     python -m scopemap_bench.scripts.record --all --data FOLDER       make all; the commit must be whole
     python -m scopemap_bench.scripts.record NAME ... --data FOLDER    make some
@@ -31,6 +31,7 @@ PLAN = "env SCOPEMAP_WEIGHTS_DIR=DATA/weights python -m scopemap bench"
 TABLES: dict[str, tuple[str, str]] = {
     "overview": (f"{SCRIPT}.overview --data DATA --out OUT --repeat 3", ""),
     "real": (f"{SCRIPT}.real --data DATA --out OUT/real", ""),
+    "earns": (f"{SCRIPT}.earns --data DATA --out OUT/earns", ""),
     "inside-out": (f"{SCRIPT}.inside_out --out OUT/inside-out", ""),
     "surface": (f"{SCRIPT}.surface --data DATA --out OUT", ""),
     "clinical-phantoms": (f"{SCRIPT}.clinical_phantoms", ""),

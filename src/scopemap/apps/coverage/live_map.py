@@ -61,6 +61,11 @@ class KeptDepth:
         """Return the table of the frames that are kept of a map, as that of a result."""
         return FrameTable.of(self._maps.get(number, []))
 
+    def final(self, frame: Frame) -> None:
+        """Replace the depth of a frame that is kept by its corrected one."""
+        if (self.folder / "depth" / f"{frame.index:06d}.png").is_file():
+            self._write(frame)
+
     def move_to(self, folder: Path) -> None:
         """Move the depth to a result's folder."""
         if self._of is not None:

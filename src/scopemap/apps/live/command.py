@@ -76,7 +76,7 @@ def live(
     """
     if port is not None and not in_app:
         raise typer.BadParameter("it is that of --app", param_hint="--port")
-    config = _config(near_far, scope, settings or [])
+    config = _config(near_far, scope, settings or [], writes=out is not None)
 
     from scopemap.apps.coverage.live_map import KeptDepth, LiveCoverage
     from scopemap.apps.live.live import LiveSession, finished
@@ -119,8 +119,8 @@ def live(
                 stack.enter_context(shown.watch(session))
             stack.enter_context(_controls(session, seconds, silent=silent))
             reconstructor = session.run()
-            result = finished(reconstructor, reading)
-            covered.settle()
+            covered.settle()  # it reads the depth that is corrected now
+            result = finished(reconstructor, reading, kept.final if folder is not None else None)
             if folder is not None:
                 result.save(folder)
                 pictures.save(folder)
@@ -136,11 +136,13 @@ def live(
         raise typer.Exit(interruption.exit_code)
 
 
-def _config(near_far: str | None, scope: str | None, settings: list[str]) -> Config:
+def _config(near_far: str | None, scope: str | None, settings: list[str], *, writes: bool) -> Config:
+    """Return the settings; writes : whether a result is written, for which all keyframes are adjusted at the end."""
     from scopemap.engine.config import Config
 
     chosen: dict[str, Any] = {"depth.near_far_mm": options.parse_near_far(near_far)} if near_far else {}
     chosen |= {"input.scope": scope} if scope else {}
+    chosen |= {} if writes else {"mapping.method": "local"}
     return Config.load("realtime", settings=chosen | {"input.focal": "assume"} | options.parse_settings(settings))
 
 

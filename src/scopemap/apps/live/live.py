@@ -23,10 +23,10 @@ from scopemap.input.sequence import Sequence
 from scopemap.result.result import Result
 from scopemap.runner.provenance import Limits
 from scopemap.runner.reconstructor import Reconstructor
-from scopemap.runner.run import Progress
+from scopemap.runner.run import FrameWriter, Progress
 
-LIMITS = Limits(frames=50_000, maps=8, blocks=80_000)
-"""Of a session: about 60 MB of rows and 1 GB of surfaces."""
+LIMITS = Limits(frames=50_000, maps=8, blocks=80_000, stored=9_000)
+"""Of a session: about 60 MB of rows, 1 GB of surfaces, and on disk 4 GB of frames: ten minutes at 15 frames/s."""
 _REMEMBERED = 300  # latencies
 _AHEAD = 1
 _LOST = "lost: move back slowly"
@@ -172,9 +172,9 @@ class LiveSession:
         self._last_snapshot = str(stem.with_suffix(".png"))
 
 
-def finished(reconstructor: Reconstructor, source: LiveSource) -> Result:
-    """Return a session's result, its provenance with the frames that were dropped."""
-    result = reconstructor.result()
+def finished(reconstructor: Reconstructor, source: LiveSource, final: FrameWriter | None = None) -> Result:
+    """Return a session's result, its provenance with the frames that were dropped; final : as `result` takes it."""
+    result = reconstructor.result(final)
     if source.dropped:
         dropped = Notice("frames-dropped", {"dropped": source.dropped, "read": source.read})
         result.provenance["notices"].append(dropped.as_json())

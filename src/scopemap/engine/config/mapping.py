@@ -18,17 +18,20 @@ class MappingSettings(StageSettings):
         "full": {},
         "none": {"local_window": 0, "global_adjustment": False},
         "local": {"triangulate_depth": False, "min_loop_inliers": 0, "global_adjustment": False},
+        "realtime": {"triangulate_depth": False, "min_loop_inliers": 0, "moving_tissue": False},
         "rigid": {"moving_tissue": False},
     }
     method: str = Field(
         "full",
         description="none: poses as tracked, frame by frame; local: each keyframe adjusted as it comes, with those "
-        "before it; full: all adjusted at the end. Where depth is predicted: measured depth tracks as well or better "
-        "without",
+        "before it; realtime: all adjusted at the end, too; full: with loop closure, depth of several views and moving "
+        "tissue. Where depth is predicted: measured depth tracks as well or better without",
     )
 
     min_loop_inliers: NonNegativeInt = advanced(
-        25, "inliers of PnP that a loop closure needs; 0: no loop closure, no map merging", "by hand"
+        25,
+        "inliers of PnP that a loop closure needs; 0: no loop closure, no map merging, no tracking backwards",
+        "by hand",
     )
     triangulate_depth: bool = advanced(
         True,

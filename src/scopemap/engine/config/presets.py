@@ -49,6 +49,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fusion.voxel_mm": 1.5,
         "fusion.truncation_mm": 5.0,
         "fusion.max_depth_mm": 100.0,
-        "mapping.method": "local",
+        "mapping.method": "realtime",
     },
 }

@@ -74,8 +74,10 @@ class StoredFile:
         self.size, self.crc = self.size + len(content), zlib.crc32(content, self.crc)
 
     def clear(self) -> None:
-        """Forget all that was put in."""
+        """Forget all that was put in, and free the disk."""
         self.size = self.crc = 0
+        if self._file is not None:
+            self._file.truncate(0)
 
     def read(self, start: int, size: int) -> bytes:
         """Return `size` bytes from `start` on; where they are all, by their checksum."""
@@ -212,6 +214,12 @@ class FrameStore:
         if frame.T_world_camera is not None:
             entry["has_pose"], entry["T_world_camera"] = True, frame.T_world_camera
         self._entries.append(entry)
+        self._known = None
+
+    def clear(self) -> None:
+        """Forget the frames; tables stay."""
+        self._images.clear()
+        self._entries.keep(np.zeros(len(self), bool))
         self._known = None
 
     @contextmanager

@@ -207,7 +207,10 @@ class FusedSurface:
 
 
 class SurfaceFusion:
-    """Fuses tracked frames: at once, or after the last one where they are corrected then or voxels follow the scene."""
+    """Fuses tracked frames: after the last one where they are corrected then or voxels follow the scene, else at once.
+
+    corrected : whether frames are corrected after the last one.
+    """
 
     store: Kept[FrameStore]
     _volumes: Kept[dict[int, TsdfVolume]]
@@ -216,9 +219,13 @@ class SurfaceFusion:
     def __init__(self, settings: FusionSettings, store: FrameStore, *, corrected: bool) -> None:
         self.settings, self.store = settings, store
         self.at_end = corrected or (settings.enabled and settings.voxel_mm is None)
-        """Whether frames are stored until the last one."""
+        """Whether frames are stored, and fused after the last one."""
+        self.shown = False
+        """Whether the surface so far is looked at: frames whose voxels have a size are then fused at once, too, and
+        anew once they are corrected."""
         self.most_blocks: int | None = None
-        """Blocks in all volumes beyond which nothing more is fused at once; None: no limit."""
+        """Blocks in all volumes beyond which nothing more is fused at once, and voxels of stored frames become larger;
+        None: no limit."""
         self.coarser_beyond: int | None = None
         """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
         self._volumes = defaultdict(partial(TsdfVolume, settings))
@@ -227,7 +234,7 @@ class SurfaceFusion:
     @property
     def at_once(self) -> bool:
         """Whether frames are fused as they come."""
-        return self.settings.enabled and not self.at_end
+        return self.settings.enabled and self.settings.voxel_mm is not None and (self.shown or not self.at_end)
 
     @property
     def is_full(self) -> bool:
@@ -249,19 +256,19 @@ class SurfaceFusion:
         self._volumes.pop(map_number, None)
 
     def put(self, frame: Frame, map_number: int = 0) -> None:
-        """Store a frame, or fuse it in its map's volume if it has a pose and `NewViews` chooses it."""
+        """Store a frame, and fuse it in its map's volume if it has a pose and `NewViews` chooses it; or one of both."""
         if self.at_end:
             self.store.put(frame)
-        elif self.at_once and frame.T_world_camera is not None:
+        if self.at_once and frame.T_world_camera is not None:
             volume = self._volumes[map_number]
             if not self.is_full and (chosen := self._views.chosen(frame, map_number)) is not None:
                 volume.integrate(chosen)
-                self._coarsen(list(self._volumes.values()))
+                _coarsen(list(self._volumes.values()), self.coarser_beyond)
 
-    def _coarsen(self, volumes: list[TsdfVolume]) -> None:
-        """Make the voxels of the largest volume larger until all are within the limit."""
-        while self.coarser_beyond is not None and sum(volume.block_count for volume in volumes) > self.coarser_beyond:
-            max(volumes, key=lambda volume: volume.block_count).coarsen()
+    def stay_at_once(self) -> None:
+        """Drop the stored frames: the surface stays what is fused at once."""
+        self.at_end = False
+        self.store.clear()
 
     def fuse(self, frames: Iterable[Frame], median_mm: float | None, map_number: int = 0) -> FusedSurface:
         """Return the surface of stored frames, as `NewViews` chose them, or of those fused at once.
@@ -269,13 +276,16 @@ class SurfaceFusion:
         frames : all are consumed. median_mm : of the depth of those that the TSDF parameters follow. map_number : of
         those fused at once.
         """
+        if self.at_end:
+            self._volumes.clear()  # of frames that were not corrected
         volume, settings = self._volumes.get(map_number), self.settings
         if self.at_end and settings.enabled and (median_mm or settings.voxel_mm):
             volume = TsdfVolume(settings, choose_parameters(settings, median_mm))
+        limit = self.most_blocks if self.coarser_beyond is None else self.coarser_beyond
         for frame in frames:
             if volume is not None:
                 volume.integrate(frame)
-                self._coarsen([volume])
+                _coarsen([volume], limit)
         if volume is None:
             return FusedSurface(trimesh.Trimesh(), settings, [])
         notices = [] if settings.voxel_mm is not None else [volume.parameters.notice]
@@ -287,6 +297,12 @@ class SurfaceFusion:
             notices.append(Notice("fusion-farther", depths))
         used = settings.model_copy(update=volume.parameters._asdict())
         return FusedSurface(volume.extract_mesh(), used, notices)
+
+
+def _coarsen(volumes: list[TsdfVolume], most_blocks: int | None) -> None:
+    """Make the voxels of the largest volume larger until all are within the limit."""
+    while most_blocks is not None and sum(volume.block_count for volume in volumes) > most_blocks:
+        max(volumes, key=lambda volume: volume.block_count).coarsen()
 
 
 def depth_notices(medians_mm: list[float], settings: FusionSettings) -> list[Notice]:

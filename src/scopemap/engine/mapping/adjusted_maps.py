@@ -90,13 +90,10 @@ class MapKeyframes:
 
     def depth_fields(self, points: Points, found: BundleSolution) -> tuple[DepthCorrectionField, ...]:
         """Return the depth correction field of each keyframe by a solution; () where depth is only scaled."""
-        step_sigma = self.settings.depth_step_sigma
-        if step_sigma <= 0:
-            return ()
         as_tracked = replace(points, log_depth=points.log_depth + self.log_drift[points.host])
         change = found.state.log_depth - points.log_depth - found.state.log_scale[points.host]
         count, sigma = len(self.index), found.log_depth_sigma
-        return fit_depth_corrections(self.camera, as_tracked, count, change, sigma, step_sigma)
+        return fit_depth_corrections(self.camera, as_tracked, count, change, sigma, self.settings.depth_step_sigma)
 
     def depth_contradiction(
         self, found: BundleSolution, fields: tuple[DepthCorrectionField, ...] = ()

@@ -75,7 +75,7 @@ def fit_depth_correction(
 
     position : (n, 2), x and y over the image's width and height, 0..1. log_depth : (n,) ln mm as estimated. error :
     (n,) triangulated minus estimated ln depth. sigma : (n,) standard deviation of `error`; infinite: the point is not
-    used. step_sigma : standard deviation of the change from node to node.
+    used. step_sigma : standard deviation of the change from node to node, above 0.
 
     Least squares with Cauchy's weights, because points on tissue that moved are outliers:
 
@@ -103,7 +103,12 @@ def fit_depth_correction(
 def fit_depth_corrections(
     camera: PinholeCamera, points: Points, count: int, error: np.ndarray, sigma: np.ndarray, step_sigma: float
 ) -> tuple[DepthCorrectionField, ...]:
-    """Return the correction field of each of `count` keyframes, hosts of points with error, sigma (P,)."""
+    """Return the correction field of each of `count` keyframes, hosts of points with error, sigma (P,).
+
+    step_sigma : as `fit_depth_correction` takes it; 0: there is no field, and () is returned.
+    """
+    if step_sigma == 0:
+        return ()
     pixels = points.pixel * [1.0, camera.fy / camera.fx] + [camera.cx, camera.cy]
     position, fields = (pixels + 0.5) / [camera.width, camera.height], []
     for k in range(count):

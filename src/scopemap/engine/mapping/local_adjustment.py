@@ -213,4 +213,5 @@ class LocalAdjustment:
         alone = Points(points.host[own] - last, points.pixel[own], points.log_depth[own], points.sigma[own])
         error = state.log_depth[own] - alone.log_depth - log_scale
         step_sigma = self._settings.depth_step_sigma
-        return KeyframeCorrection(log_scale, fit_depth_corrections(camera, alone, 1, error, sigma[own], step_sigma)[0])
+        fields = fit_depth_corrections(camera, alone, 1, error, sigma[own], step_sigma)
+        return KeyframeCorrection(log_scale, *fields)

@@ -141,6 +141,10 @@ class Mapper:
         if self._backend is not None:
             self._backend.most_observations = observations
 
+    def stay_as_tracked(self) -> None:
+        """Adjust nothing after the last frame; any thread may call it."""
+        self._backend = None
+
     def settle(self) -> None:
         """Wait for what was begun in other threads."""
         if self._backend is not None:
@@ -162,10 +166,11 @@ class Mapper:
 
         matches : what is known of its feature tracks. step : by how much it was moved as it came.
         """
-        if self._backend is not None:
+        backend = self._backend  # another thread may have the frames stay as tracked
+        if backend is not None:
             observed = self._last is not None and self._last[0] == track.index
             tracked = self._last[1] if self._last and observed else self._pose(track)
-            self._backend.add(keyframe, tracked, matches, step)
+            backend.add(keyframe, tracked, matches, step)
 
     def submaps(self) -> tuple[list[Submap], list[Notice]]:
         """Return the submaps, most frames first, and a notice of frames that are not in the first.

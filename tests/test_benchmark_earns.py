@@ -1,0 +1,50 @@
+"""The table of what each part of a run earns: its switches and clips exist, and its cells say what they should."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_phantom import write_tiny
+
+from scopemap import Config, open_sequence, reconstruct
+from scopemap_bench.scripts import earns, measuring
+from scopemap_bench.scripts.real import RealClip
+
+QUICK = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 2}
+
+
+def test_each_switch_turns_something_off() -> None:
+    default = Config.load()
+    for switch in earns.SWITCHES:
+        name, value = switch.split("=")
+        assert Config.load(settings={name: value}) != default
+
+
+def test_the_phantoms_are_eight_and_those_of_the_other_tables() -> None:
+    found = earns.phantoms()
+    assert len(found) == 8
+    assert all({"--scene", "--frames", "--seed"} <= set(words) for words in found.values())
+
+
+def test_a_cell_has_the_error_of_the_path_and_the_verdict_or_that_the_run_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    phantom, asked = write_tiny(tmp_path / "phantom"), list[tuple[Any, ...]]()
+
+    def run_once(source: Path, out: Path, *words: object) -> Path:
+        asked.append(words)
+        if "mapping.method=none" in words:
+            raise subprocess.CalledProcessError(1, "scopemap")
+        reconstruct(open_sequence(source), Config.load(settings=QUICK), out=out)
+        return out
+
+    monkeypatch.setattr(measuring, "run_once", run_once)
+    clip = RealClip("a clip", phantom, arguments=("--fov", "70"))
+    error, word = earns.cell(clip, "", tmp_path).split(", ")
+    assert 0 < float(error) < 5
+    assert word in ("good", "doubtful", "not usable")
+    assert earns.cell(clip, "mapping.method=none", tmp_path) == "the run fails"
+    assert asked == [("--fov", "70"), ("--fov", "70", "--set", "mapping.method=none")]
