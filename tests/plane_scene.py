@@ -15,6 +15,7 @@ from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, se3, so3_exp, transform
 from scopemap.engine.mapping import Backend, FrameCorrection
+from scopemap.engine.mapping.segments import Segment
 
 CAMERA = PinholeCamera(150.0, 150.0, 119.5, 89.5, 240, 180)
 PLANE_MM = 50.0
@@ -73,9 +74,16 @@ def frame(
     return Frame(index, index / 30, view.rgb, CAMERA, EVERYWHERE, depth_mm, T)
 
 
+def only(segments: list[Segment]) -> FrameCorrection:
+    """The correction of the only segment: one scene explains all keyframes, or the map is too short to be divided."""
+    (segment,) = segments
+    assert segment.correction is not None
+    return segment.correction
+
+
 def adjusted(frames: Iterable[Frame], settings: MappingSettings | None = None) -> FrameCorrection:
     """The back end's correction of keyframes, tracked one after the other."""
     backend = Backend(settings or MappingSettings(), DisFlow())
     for keyframe in frames:
         backend.add(keyframe)
-    return backend.adjust()
+    return only(backend.adjust())

@@ -138,7 +138,7 @@ def test_the_step_of_a_keyframe_that_was_moved_as_it_came_is_spread_over_the_fra
             middle = POSES[number - 1] @ se3_exp(0.5 * se3_log(inverse(POSES[number - 1]) @ true))
             half = se3_exp(np.array([0, 0, 0, 0.25, 0, 0]))
             tracked[10 * number - 5] = TrackedPose(0, 10 * number - 10, middle @ half)
-    correction = backend.adjust(0, tracked)
+    correction = plane_scene.only(backend.adjust(0, tracked))
     for number in range(1, len(POSES)):
         before, own, after = (correction.pose(i, tracked[i].T_world_camera) for i in np.arange(-10, 1, 5) + 10 * number)
         between = 0.5 * (before + after)[:3, 3]
@@ -196,7 +196,7 @@ def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
     assert correction.sigma_px > 0.8
     assert correction.depth_factor(20) == 1.0
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
-    assert "not rigid" in correction.notice.text
+    assert "no rigid scene" in correction.notice.text
 
 
 def test_an_adjustment_says_what_determines_the_shape() -> None:

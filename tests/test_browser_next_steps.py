@@ -47,9 +47,6 @@ def test_choices_and_values() -> None:
     (one,) = next_runs("Run again with --set mapping.method=local.", result)
     assert one.label(*one.choices) == "Run again with --set mapping.method=local"
     assert one.arguments(*one.choices) == ["--set", "mapping.method=local"]
-    (moment,) = next_runs("Run again with --surface-at SECONDS for it.", result)
-    assert moment.number is not None
-    assert moment.number[1] <= moment.number[0] <= moment.number[2]
     assert next_runs("Look at the 2 submaps in maps/.", result) == next_runs("", result) == []
 
 

@@ -19,6 +19,7 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.depth.mapis import DenseCorrespondence
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.mapping.submaps import Submap
 from scopemap.engine.tracking.causes import ADVICE, LossCause, causes_of_loss
 from scopemap.engine.tracking.relocalisation import RotationFollower, rotation_by_flow
@@ -165,7 +166,9 @@ def _frames_at_a_wall() -> FrameTable:
         row["T_world_camera"], row["rotation"] = None if is_lost else T, None if rotation is None else rotation[:3, :3]
         rows.append(row)
     frames = frozenset({0, 1, 2, 6})
-    return frames_of_submap(0, [Submap(0, (0,), frames, frames)], FrameTable.of(rows))
+    return frames_of_submap(
+        0, [Submap(0, (0,), frames, frames, (Segment(max(frames), frames=frames),))], FrameTable.of(rows)
+    )
 
 
 def test_rotations_are_marked_where_a_wall_filled_the_picture_and_not_counted_as_tracked() -> None:

@@ -11,7 +11,7 @@ import pytest
 from tiny_phantom import write_tiny
 
 from scopemap import Config, Result, open_sequence, reconstruct
-from scopemap.engine.finishing import SubmapFinishing, SubmapSurface, TrackedFrames
+from scopemap.engine.finishing import SegmentFinishing, SegmentSurface, TrackedFrames
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.pipeline import Pipeline
@@ -21,7 +21,7 @@ from scopemap.runner.estimators import create_estimators
 SETTINGS = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 2}
 
 
-def _engine_alone(folder: Path, config: Config) -> tuple[SubmapSurface, list[Frame]]:
+def _engine_alone(folder: Path, config: Config) -> tuple[SegmentSurface, list[Frame]]:
     """The surface and the final frames of a clip that stays in one map."""
     sequence, final = open_sequence(folder), list[Frame]()
 
@@ -35,7 +35,8 @@ def _engine_alone(folder: Path, config: Config) -> tuple[SubmapSurface, list[Fra
         table = FrameTable.of(pipeline.step(pipeline.preprocess(frame)).row for frame in sequence.frames())
         tracked = TrackedFrames(*(table[name] for name in ("index", "time_s", "T_world_camera", "median_depth_mm")))
         (submap,), _ = pipeline.mapper.submaps()
-        with closing(SubmapFinishing(pipeline, submap, tracked, sequence.camera)) as finishing:
+        (segment,) = submap.segments
+        with closing(SegmentFinishing(pipeline, submap, segment, tracked, sequence.camera)) as finishing:
             finishing.carve()
             fused = finishing.fuse(finishing.as_fused(noted(finishing.frames())))
         return finishing.check(finishing.finish(fused)), final

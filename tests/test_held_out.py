@@ -145,7 +145,7 @@ def test_the_frames_of_a_run_give_its_surface_again(run_folder: Path) -> None:
     own = trimesh.load_mesh(run_folder / "mesh.ply", process=False)
     with closing(RunFrames(run_folder)) as frames:
         assert frames.indices == list(range(12))
-        again, fewer = frames.fuse(), frames.fuse(without=range(6))
+        (again,), (fewer,) = frames.fuse().values(), frames.fuse(without=range(6)).values()
     assert len(again.faces) == pytest.approx(len(own.faces), rel=0.01)
     assert distances_mm(np.asarray(own.vertices), again).mean() < 0.02
     assert fewer.area < again.area

@@ -49,6 +49,7 @@ def test_an_assumed_lens_is_replaced_and_no_doubt_of_it_stays(clip: Path) -> Non
         ({}, WIDER._replace(free_px=0.295)),  # hardly better
         ({}, WIDER._replace(held_px=0.9, free_px=0.6)),  # tissue moves
         ({}, WIDER._replace(sigma=0.2)),
+        ({}, WIDER._replace(sigma=0.05)),  # told badly: with what depth adds 25 %
         ({}, WIDER._replace(log_focal=math.log(0.1))),  # no endoscope
     ],
 )

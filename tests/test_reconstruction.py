@@ -30,7 +30,7 @@ from scopemap.result.depth_maps import DEPTH_SCALE_MM, DepthReader, DepthWriter
 from scopemap.result.trajectories import read_trajectory
 from scopemap.result.verdict import verdict
 
-COLUMNS = "index time_s name status reason map keyframe residual inlier_share correlation overlap iterations"
+COLUMNS = "index time_s name status reason map segment keyframe residual inlier_share correlation overlap iterations"
 COLUMNS += " depth_scale warped_share usable sharpness motion quality cause orientation"
 COLUMNS += " moving_share moving_x moving_y"
 LOST = 6
@@ -57,10 +57,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> _Run:
 
 def test_contents(run: _Run) -> None:
     names = "SHA256SUMS camera.yaml config.toml depth depth_preview depth_sigma frames.csv mesh.glb mesh.ply"
-    names += " provenance.json source_camera.yaml trajectory.tum"
+    names += " provenance.json source_camera.yaml surfaces trajectory.tum"
     assert sorted(path.name for path in run.out.iterdir()) == names.split()
     depth = [f"{i:06d}.png" for i in range(FRAMES) if i != LOST]
     assert sorted(path.name for path in (run.out / "depth").iterdir()) == [*depth, "depth.json"]
+    assert sorted(path.name for path in (run.out / "surfaces").iterdir()) == ["segment_000.ply", "segments.csv"]
+    assert (run.out / "surfaces" / "segment_000.ply").read_bytes() == (run.out / "mesh.ply").read_bytes()
 
 
 def test_frames_table(run: _Run) -> None:

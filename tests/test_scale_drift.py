@@ -63,7 +63,7 @@ def test_every_map_gets_the_millimetres_of_the_network(anchored: bool, refused: 
         keyframe = plane_scene.frame(true, n, T, chained[number])
         backend.add(replace(keyframe, depth_scale=chained[number]), poses[n])
     for number in (0, 1):
-        correction = backend.adjust(number, among=())
+        correction = plane_scene.only(backend.adjust(number, among=()))
         assert bool(correction.refused) == refused
         correction = replace(correction, tracked=dict(enumerate(poses)))
         own, mm = range(6 * number, 6 * number + 6), 1.3 if anchored else 1.0

@@ -94,15 +94,12 @@ def test_frames_of_different_states_agree_with_one_surface() -> None:
     assert np.nanmedian(sigma_mm) == pytest.approx(0.01 * Z_MM, rel=0.1)  # that of the depth itself
 
 
-def test_the_surface_is_in_the_most_usual_state_or_that_of_a_second() -> None:
+def test_the_surface_is_in_the_most_usual_state() -> None:
     states = sliding(np.eye(4))
     curves = np.array([0, 0.1, 1, 0.1, 0.12, 0])[:, None]
     index = np.arange(6)
     many = TissueStates(states.nodes, states.modes, index, index / 10, curves, np.zeros(1))
-    assert many.with_reference(None).reference == pytest.approx([0.1])
-    assert many.with_reference(0.22).reference_s == pytest.approx(0.2)
-    assert many.with_reference(99.0).reference == pytest.approx(curves[-1])
-    assert many.with_reference(0.2).change(0) == pytest.approx([-1])
+    assert many.in_usual_state().reference == pytest.approx([0.1])
 
 
 def test_a_result_keeps_its_states(tmp_path: Path) -> None:

@@ -1,13 +1,13 @@
-"""After the last frame: the frames of a submap become its surface. Files, clock and threads: see `runner/run.py`.
+"""After the last frame: the frames of each segment become a surface. Files, clock and threads: see `runner/run.py`.
 
     carve       find what other frames look through: it is no tissue
     frames      correct poses and depth -> triangulate the depth of keyframes, which the others take over -> carve
-    as_fused    move what was seen of moving tissue into one state, or weight it as seen at one second
+    as_fused    move what was seen of moving tissue into one state
     fuse        TSDF -> mesh
     finish      close holes, smooth, simplify
     check       render the mesh at the poses of some frames, and compare
 
-The submaps, and the correction of each, come from `Mapper.submaps`.
+The submaps, with their segments and the correction of each, come from `Mapper.submaps`.
 """
 
 from __future__ import annotations
@@ -25,11 +25,13 @@ from scopemap.engine.fusion.agreement import surface_agreement, surface_views, v
 from scopemap.engine.fusion.finish import finished, with_normals_alone
 from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.fusion.free_space import FreeSpace, views_among
-from scopemap.engine.fusion.moving_tissue import MovingTissue, SeenAt, block_edge_mm
+from scopemap.engine.fusion.moving_tissue import MovingTissue, block_edge_mm
 from scopemap.engine.fusion.new_views import NewViews
 from scopemap.engine.fusion.reference_state import SurfaceState
 from scopemap.engine.fusion.surface_fusion import FusedSurface, depth_notices
+from scopemap.engine.mapping.frame_correction import FrameCorrection
 from scopemap.engine.mapping.multiview_depth import KeyframeDepths
+from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.mapping.submaps import FinalFrames, Submap
 from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.engine.notices import Notice
@@ -49,9 +51,9 @@ class TrackedFrames:
     T_world_camera: np.ndarray
     median_depth_mm: np.ndarray
 
-    def of(self, submap: Submap) -> TrackedFrames:
-        """Return the frames of a submap."""
-        own = np.isin(self.index, list(submap.frames))
+    def of(self, segment: Segment) -> TrackedFrames:
+        """Return the frames of a segment."""
+        own = np.isin(self.index, list(segment.frames))
         return TrackedFrames(self.index[own], self.time_s[own], self.T_world_camera[own], self.median_depth_mm[own])
 
     @property
@@ -61,8 +63,8 @@ class TrackedFrames:
 
 
 @dataclass(frozen=True)
-class SubmapSurface:
-    """The surface of a submap.
+class SegmentSurface:
+    """The surface of a segment.
 
     mesh : world mm, may be empty; its vertices have `confidence`, the share `moving` of frames in which they move, and
     the standard deviation `sigma_mm`. settings : with the TSDF parameters that were used. agreement : figures of
@@ -78,8 +80,8 @@ class SubmapSurface:
     notices: list[Notice]
 
 
-class SubmapFinishing:
-    """Finishes one submap; the methods are called in the order above, each once, and `close` after `fuse`.
+class SegmentFinishing:
+    """Finishes a segment of a submap; the methods are called in the order above, each once, and `close` after `fuse`.
 
     tracked : all frames of the run. camera : of all frames. keeps_depth : whether final depth is kept, and not only
     fused. checked : frames at which a surface that was fused at once is checked; those of stored frames are added.
@@ -89,6 +91,7 @@ class SubmapFinishing:
         self,
         pipeline: Pipeline,
         submap: Submap,
+        segment: Segment,
         tracked: TrackedFrames,
         camera: PinholeCamera,
         *,
@@ -96,17 +99,17 @@ class SubmapFinishing:
         checked: SpreadFrames | None = None,
     ) -> None:
         self._pipeline, self._fusion, self._submap = pipeline, pipeline.fusion, submap
+        self._correction = segment.correction
         self._run, self._checked = tracked, SpreadFrames() if checked is None else checked
-        own, at_end = tracked.of(submap), self._fusion.at_end
-        self._final = FinalFrames(submap, own.poses if at_end else {}, self._fusion.store.frame)
+        own, at_end = tracked.of(segment), self._fusion.at_end
+        self._final = FinalFrames(segment.correction, own.poses if at_end else {}, self._fusion.store.frame)
         # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
         main = submap.main_frames if at_end else ()
         self._median_mm = self._fusion.store.median_depth_mm(main, submap.depth_factor)
-        self._states = _tissue_states(submap, own, self._fusion.settings.surface_at_s)
+        self._states = _tissue_states(segment.correction, own)
         self._state = None if self._states is None else SurfaceState(self._states)
         self._moving = MovingTissue(block_edge_mm(self._median_mm))
         self._free_space = FreeSpace([])
-        self._seen_at: SeenAt | None = None
         self._depths = self._triangulation(camera) if keeps_depth or self._fusion.settings.enabled else None
 
     def carve(self) -> None:
@@ -122,15 +125,14 @@ class SubmapFinishing:
 
     def as_fused(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Yield final frames that are fused, as they are; note where tissue moves in all, and some for `check`."""
-        self._seen_at, views = self._at_second(), NewViews(self._fusion.settings.every)
+        views = NewViews(self._fusion.settings.every)
         for frame in frames:
             if frame.nonrigidity is not None and frame.T_world_camera is not None:
                 usable_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
                 self._moving.put(usable_mm, frame.nonrigidity, frame.camera, frame.T_world_camera)
             self._checked.put(frame)
             if (chosen := views.chosen(frame)) is not None:
-                in_state = chosen if self._state is None else self._state.fused(chosen)
-                yield in_state if self._seen_at is None else self._seen_at.fused(in_state)
+                yield chosen if self._state is None else self._state.fused(chosen)
 
     def fuse(self, frames: Iterable[Frame]) -> FusedSurface:
         """Return the surface of the frames that `as_fused` yields, or of those that were fused at once."""
@@ -147,7 +149,7 @@ class SubmapFinishing:
         mesh.vertex_attributes["moving"] = self._moving.shares(mesh.vertices).astype(np.float32)
         return replace(fused, mesh=mesh)
 
-    def check(self, fused: FusedSurface) -> SubmapSurface:
+    def check(self, fused: FusedSurface) -> SegmentSurface:
         """Return the finished surface with its agreement with some frames, and what there is to say about it."""
         mesh = fused.mesh
         views = surface_views(mesh, self._checked.frames(self._fusion.store), self._states)
@@ -156,7 +158,7 @@ class SubmapFinishing:
         adjusted = self._adjustment_notices()
         confirmed = bool(adjusted) or self._pipeline.estimators.anchor.is_measured
         notices = adjusted + self._fusion_notices(fused)
-        return SubmapSurface(with_normals_alone(mesh), fused.settings, agreement, self._states, confirmed, notices)
+        return SegmentSurface(with_normals_alone(mesh), fused.settings, agreement, self._states, confirmed, notices)
 
     def _triangulation(self, camera: PinholeCamera) -> KeyframeDepths | None:
         """Return what triangulates the depth of keyframes; None where nothing can."""
@@ -166,24 +168,14 @@ class SubmapFinishing:
             return None
         return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow, self._states)
 
-    def _at_second(self) -> SeenAt | None:
-        """Return the weights of frames for the surface as seen at `fusion.surface_at_s`; None where that is not set."""
-        at_s = self._fusion.settings.surface_at_s
-        if at_s is None:
-            return None
-        # What one curve does not explain is as the frames around that second have it.
-        frames = self._final.frames(None)
-        at_rest = frames if self._state is None else map(self._state.fused, frames)
-        return SeenAt(at_rest, at_s, block_edge_mm(self._median_mm))
-
     def _adjustment_notices(self) -> list[Notice]:
         """Return what was adjusted: at the end, or as keyframes came."""
-        correction = self._submap.correction
+        correction = self._correction
         return self._pipeline.odometry.notices(self._submap.main) if correction is None else correction.notices
 
     def _fusion_notices(self, fused: FusedSurface) -> list[Notice]:
         """Return what depth and surface rest on, and what is not in the surface."""
-        parts = (self._state, self._seen_at, self._depths)
+        parts = (self._state, self._depths)
         found = [part.notice for part in parts if part is not None] + fused.notices
         if self._free_space.notice is not None:
             found.append(self._free_space.notice)
@@ -194,12 +186,11 @@ class SubmapFinishing:
         return found + depth_notices(medians_mm, fused.settings)
 
 
-def _tissue_states(submap: Submap, own: TrackedFrames, at_s: float | None) -> TissueStates | None:
-    """Return the states of a submap's tissue at its frames, that of the surface next to a second; None: at rest."""
-    correction = submap.correction
+def _tissue_states(correction: FrameCorrection | None, own: TrackedFrames) -> TissueStates | None:
+    """Return the states of a segment's tissue at its frames, the surface in the most usual one; None: at rest."""
     if correction is None or correction.tissue is None:
         return None
     motion = correction.tissue.deformation
     curves = np.column_stack([np.interp(own.index, correction.index, curve) for curve in motion.basis.T])
     states = TissueStates(motion.nodes, motion.modes, own.index, own.time_s, curves, curves[0])
-    return states.with_reference(at_s)
+    return states.in_usual_state()

@@ -185,6 +185,12 @@ KINDS: dict[str, _Kind] = {
         _OTHER_STATES,
         unsaid=("keyframes", "nodes", "px", "rigid_px"),
     ),
+    "mapping-worse": _Kind(
+        "doubtful",
+        "Bundle adjustment was rejected: tracks left out of it fit worse ({error_px:.2f} px) than as tracked "
+        "({tracked_px:.2f} px).",
+        unsaid=("merged",),
+    ),
     "mapping-depth-disagrees": _Kind(
         "doubtful",
         "Bundle adjustment was rejected: keyframe depths would differ by {adjusted:.0%} ({tracked:.0%} before).",
@@ -207,9 +213,6 @@ KINDS: dict[str, _Kind] = {
         "info",
         "Voxels measure {voxel_mm:g} mm instead of {finest_mm:g} mm, so that the surface fits into memory.",
         "Allow more with --memory.",
-    ),
-    "fusion-at-one-moment": _Kind(
-        "note", "The surface shows moving tissue as seen at second {second:g}: {where}.", in_verdict=False
     ),
     "fusion-free-space": _Kind(
         "note",

@@ -33,7 +33,9 @@ def measured_mesh(run: Result, frame: int) -> trimesh.Trimesh:
 
     A vertex is off by a part of the shown triangles' size, which is far below the errors of depth.
     """
-    mesh = simplified(run.mesh, FACES_OF_OTHERS if run.is_submap else MOST_FACES)
+    segment = run.segment_at(frame)
+    is_main = segment == run.main_segment and not run.is_submap
+    mesh = simplified(run.surface(segment), MOST_FACES if is_main else FACES_OF_OTHERS)
     low, spread, levels = levels_of(mesh)
     shown = trimesh.Trimesh(low + levels / LARGEST_LEVEL * spread, mesh.faces, process=False)
     return shown if run.states is None else run.states.moved(shown, frame)

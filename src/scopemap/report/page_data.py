@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from base64 import b64encode
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,12 @@ import numpy as np
 import trimesh
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import ScopemapError
 from scopemap.engine.geometry.align import align_trajectories
 from scopemap.engine.notices import notices_of
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
+from scopemap.report.shown_maps import MapOnPage, shown_maps, shown_place
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
 from scopemap.report.video_parts import video_parts
 from scopemap.result.frame_table import NOT_USED
@@ -30,15 +29,12 @@ from scopemap.result.result import Result
 from scopemap.result.run_input import PLACES, places_of_input
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.result.verdict import (
-    WORDS,
     frames_per_s,
-    level_of_submap,
     scale_is_known,
     scale_source,
     verdict,
 )
 
-_MOST_MAPS = 8
 MEASUREMENTS = "measurements.json"
 COVERAGE = "coverage"
 _MOST_BYTES = 7_500_000
@@ -59,13 +55,13 @@ class _Picture:
 
 
 def shown_meshes(run: Result, most_faces: int) -> list[trimesh.Trimesh]:
-    """Return the meshes of the maps that the page shows, the result's first, with most faces.
+    """Return the meshes of `shown_maps`, the result's first, with most faces.
 
     Others are simplified.
     """
-    submaps: Sequence[Result] = run.submaps[:_MOST_MAPS]
-    most = [most_faces] + [min(most_faces, FACES_OF_OTHERS)] * (_MOST_MAPS - 1)
-    return [simplified(submap.mesh, faces) for submap, faces in zip(submaps, most, strict=False)]
+    maps = shown_maps(run)
+    most = [most_faces] + [min(most_faces, FACES_OF_OTHERS)] * (len(maps) - 1)
+    return [simplified(one.mesh, faces) for one, faces in zip(maps, most, strict=True)]
 
 
 def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", share: float = 1.0) -> dict[str, Any]:
@@ -76,18 +72,18 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
     camera, pictures = run.camera, _within_budget(_pictures(run), share * _MOST_BYTES)
     near_mm, far_mm = _depth_range([p.depth_mm for p in pictures if p.depth_mm is not None])
     source = str(run.provenance.get("input", ""))
-    found = verdict(run)
+    found, maps = verdict(run), shown_maps(run)
     return {
         "name": name or Path(source).name or source,
         "input": source,
         "verdict": asdict(found) | {"word": found.word},
-        "words": [WORDS[level_of_submap(submap)] for submap in run.submaps],
+        "titles": [one.facts for one in maps],
         "scale_known": scale_is_known(run.provenance),
         "scale_source": scale_source(run.provenance),
         "notes": [str(notice) for notice in notices_of(run.provenance) if not notice.in_verdict],
         "frames_per_s": frames_per_s(run),
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
-        "frames": _frames(run),
+        "frames": _frames(run, maps),
         "depth_range": [near_mm, far_mm],
         "pictures": [_picture_data(p) for p in pictures],
         "depth_unit_mm": float(np.float32(run.depth.scale_mm)),
@@ -96,14 +92,14 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
         "measuring": share >= 1,
         "measurements": read_measurements(run.folder),
         "coverage": _coverage(run),
-        "maps": _maps(run, meshes, camera, pictures),
+        "maps": _maps(run, maps, meshes, pictures),
         "losses": [
             {"row": loss.first, "when": loss.when, "frames": loss.frames, "cause": loss.cause, "advice": loss.advice}
             for loss in losses(run.frames)
         ],
         "used_part": part_of_input(run.provenance),
         "parts": [asdict(part) for part in video_parts(run)],
-        "not_shown_maps": max(len(run.submaps) - _MOST_MAPS, 0),
+        "not_shown_maps": len(run.submaps) - len({id(one.result) for one in maps}),
         "albedo": tomllib.loads(run.config_text).get("fusion", {}).get("colours") != "raw",
         "truth": _truth(run),
         "config": run.config_text,
@@ -111,7 +107,7 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
     }
 
 
-def _frames(run: Result) -> dict[str, Any]:
+def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:
     """Return the columns of all frames; a pose is (3, 4), row by row, NaN where there is none."""
     frames, place = run.frames, run.frames.place
     poses = np.full((len(frames), 3, 4), np.nan)
@@ -135,7 +131,7 @@ def _frames(run: Result) -> dict[str, Any]:
         "cause": base64_of(np.searchsorted(causes, frames["cause"]), "i1"),
         "index": base64_of(frames["index"], "i4"),
         "time_s": base64_of(frames["time_s"], "f4"),
-        "place": base64_of(place, "i2"),
+        "place": base64_of(shown_place(run, maps), "i2"),
         "pose": base64_of(poses, "f8"),
         "curves": {name: base64_of(values, "f4") for name, values in curves.items()},
         "reasons": different,
@@ -256,24 +252,24 @@ def _picture_data(picture: _Picture) -> dict[str, Any]:
 
 
 def _maps(
-    run: Result, meshes: list[trimesh.Trimesh], camera: PinholeCamera, pictures: list[_Picture]
+    run: Result, maps: list[MapOnPage], meshes: list[trimesh.Trimesh], pictures: list[_Picture]
 ) -> list[dict[str, Any]]:
     """Return the meshes of the maps, the result first, each with its place in time and what is said of its inliers."""
     found, submaps = [], submaps_in_time(run.frames)
     turn, worst = {one.number: k for k, one in enumerate(submaps)}, most_doubtful(submaps)
     inliers = {one.number: one.inliers + ", most doubtful" * (one is worst) for one in submaps}
-    place, indices = run.frames.place, run.frames["index"].tolist()
-    for number, (submap, mesh) in enumerate(zip(run.submaps, meshes, strict=False)):
-        pose_of = _pose_of(submap)
+    place, indices = shown_place(run, maps), run.frames["index"].tolist()
+    for number, (one, mesh) in enumerate(zip(maps, meshes, strict=False)):
+        pose_of, states = _pose_of(one.result), one.result.states
         looking = [p for p in pictures if place[p.row] == number and p.depth_mm is not None]
         looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
         seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
-        data = mesh_data(mesh, seen, camera, submap.states) | {"errors": measure_errors(submap)}
-        if (states := submap.states) is not None and len(mesh.vertices):
+        data = mesh_data(mesh, seen, run.camera, states) | {"errors": measure_errors(one.result)}
+        if states is not None and len(mesh.vertices):
             data["changes"] = [states.change(index).tolist() for index in indices]
         if len(mesh.faces) > (most := MOST_FACES if number == 0 else FACES_OF_OTHERS):
-            data["measured"] = shape_data(simplified(mesh, most), submap.states)
-        facts = {"frames": len(pose_of), "all_faces": len(submap.mesh.faces)}
+            data["measured"] = shape_data(simplified(mesh, most), states)
+        facts = {"frames": int((place == number).sum()), "all_faces": len(one.mesh.faces)}
         found.append(data | facts | {"turn": turn.get(number, number), "inliers": inliers.get(number, "")})
     return found
 

@@ -34,6 +34,7 @@ _FORMATS = {
     "status": "",
     "reason": "",
     "map": "d",
+    "segment": "d",
     "keyframe": "d",
     "residual": ".5g",
     "inlier_share": ".5g",
@@ -72,8 +73,9 @@ ROW = np.dtype(
         ("rotation", np.float64, (3, 3)),
     ]
 )
-_STORED = np.dtype([*((name, ROW[name]) for name in ROW.names or () if name not in _TEXTS), ("text", "i8", (3,))])
-"""A row on disk; `text` : where name and reason begin, and where they end."""
+_TRACKED = [name for name in ROW.names or () if name not in (*_TEXTS, "segment")]
+_STORED = np.dtype([*((name, ROW[name]) for name in _TRACKED), ("text", "i8", (3,))])
+"""A row on disk, as tracked; `text` : where name and reason begin, and where they end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +83,9 @@ class FrameTable:
     """What is known of each frame of a run besides its images; `table["status"]` is a column, (N,).
 
     Columns as in frames.csv (docs/formats.md); -1, NaN or "" is unknown. `map` : as tracked, that of the tracker; in a
-    result the number of the submap, 0 for the result and N for `maps/N`, -1 where the frame is in none. `cause` : as
-    the tracker judged it; in a result by `causes_of_loss`. Beside these:
+    result the number of the submap, 0 for the result and N for `maps/N`, -1 where the frame is in none. `segment` : in
+    a result the number of the segment of this submap, -1 where the frame is in none. `cause` : as the tracker judged
+    it; in a result by `causes_of_loss`. Beside these:
 
     relocalised : whether features found the lost camera again in this frame. median_depth_mm : as tracked.
     T_world_camera : (N, 4, 4), NaN where the frame has no pose in this submap, but for the rotation where that was
@@ -234,7 +237,7 @@ class GrowingFrameTable:
         """Put a row in, by column as in `FrameTable.of`."""
         one = FrameTable.of([row]).rows
         stored = np.zeros(1, _STORED)
-        for name in set(ROW.names or ()) - {*_TEXTS}:
+        for name in _TRACKED:
             stored[name] = one[name]
         # A file's name may hold bytes that are no UTF-8.
         texts = [one[name][0].encode("utf-8", "surrogateescape") for name in _TEXTS]
@@ -247,7 +250,8 @@ class GrowingFrameTable:
         """Return all rows."""
         stored, texts = self._rows.read(), self._texts.read().tobytes()
         rows = np.zeros(len(stored), ROW)
-        for name in set(ROW.names or ()) - {*_TEXTS}:
+        rows["segment"] = -1
+        for name in _TRACKED:
             rows[name] = stored[name]
         for column, name in enumerate(_TEXTS):
             ends = stored["text"][:, column : column + 2].tolist()

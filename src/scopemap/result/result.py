@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Sequence as Several
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
@@ -28,6 +29,8 @@ from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import Trajectory, write_tum
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.frame_table import FrameTable
+from scopemap.result.stated_verdict import StatedVerdict
+from scopemap.result.surface_segments import SurfaceSegment, read_segments, save_segments, surface_file
 from scopemap.result.trajectory_folders import read_frames, submap_folders
 
 if TYPE_CHECKING:
@@ -39,13 +42,6 @@ if TYPE_CHECKING:
 
 _SCALE_NOT_STATED = "scale unknown (the run does not state it): compare shapes, not sizes"
 _MOST_PX = 1 << 15
-
-
-class StatedVerdict(NamedTuple):
-    """The verdict on a result: the level (good, doubtful, bad) and the codes of its reasons, worst first."""
-
-    level: str
-    codes: tuple[str, ...]
 
 
 class Result:
@@ -90,8 +86,14 @@ class Result:
             "source_camera": source_camera,
             "others": [],
             "states": states,
+            "segments": [],
         }
         return result
+
+    def with_segments(self, segments: Several[SurfaceSegment], surfaces: Several[trimesh.Trimesh]) -> Result:
+        """Return this result in memory with its segments and the surface of each."""
+        self.__dict__ |= {"segments": [*segments], "_surfaces": dict(enumerate(surfaces))}
+        return self
 
     @property
     def folder(self) -> Path:
@@ -191,9 +193,34 @@ class Result:
         """The states of tissue that moves, of which `mesh` shows one; None where it is taken to be at rest."""
         return TissueStates.read(self.folder)
 
+    @cached_property
+    def segments(self) -> list[SurfaceSegment]:
+        """The parts of its time that have a surface of their own, in order; [] in results of earlier versions."""
+        return read_segments(self.folder)
+
+    @property
+    def main_segment(self) -> int:
+        """The number of the segment whose surface `mesh` is: the longest of the best level."""
+        return int(self.provenance.get("main_segment", 0))
+
+    def segment_at(self, index: int) -> int:
+        """Return the number of the segment of the frame with this number; that of `mesh` where the frame has none."""
+        found = self.frames["segment"][self.frames["index"] == index]
+        return int(found[0]) if found.size and found[0] >= 0 else self.main_segment
+
+    def surface(self, segment: int) -> trimesh.Trimesh:
+        """Return the surface of the segment with this number, as `mesh`."""
+        if segment == self.main_segment:
+            return self.mesh
+        surfaces: dict[int, trimesh.Trimesh] = self.__dict__.setdefault("_surfaces", {})
+        if segment not in surfaces:
+            surfaces[segment] = read_mesh(surface_file(self.folder, segment))
+        return surfaces[segment]
+
     def mesh_at(self, index: int) -> trimesh.Trimesh:
-        """Return the surface in the state of the frame with this number; `mesh` itself where tissue is at rest."""
-        return self.mesh if self.states is None else self.states.moved(self.mesh, index)
+        """Return the surface that fits the frame with this number: that of its segment, in its state of the tissue."""
+        mesh = self.surface(self.segment_at(index))
+        return mesh if self.states is None else self.states.moved(mesh, index)
 
     @cached_property
     def camera(self) -> PinholeCamera:
@@ -345,6 +372,8 @@ class Result:
             scale = scale_words(self.provenance.get("scale", {}))
             write_tum(folder / "trajectory.tum", self.trajectory, comment=scale)
             save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb", comment=scale)
+            surfaces = [self.surface(one.segment) for one in self.segments]
+            save_segments(self.segments, surfaces, folder, comment=scale)
             if self.states is not None:
                 self.states.save(folder)
                 save_mesh_over_time(self.mesh, self.states, folder / "mesh_over_time.glb", comment=scale)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from scopemap.result.input_part import part_of_input
 from scopemap.result.losses import losses, main_cause
 from scopemap.result.result import Result
 from scopemap.result.submap_summaries import doubt_words, submaps_in_time
+from scopemap.result.surface_segments import GOOD_DISAGREEMENT, SurfaceSegment, segment_of_facts
 
 Level = Literal["good", "doubtful", "bad", "note", "info"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
@@ -26,7 +28,6 @@ LEAST_SEGMENT_S = 3.0
 GOOD_COVERAGE = 0.8
 LEAST_COVERAGE = 0.5
 """Mean share of what the frames see that the surface covers."""
-GOOD_DISAGREEMENT = 0.05
 MOST_DISAGREEMENT = 0.15
 """Median relative difference between the surface's depth and the frames' depth."""
 GOOD_WITHIN = 0.75
@@ -37,8 +38,8 @@ MOST_MOVING = 0.5
 """Share of the frames in which tissue moves on its own."""
 LEAST_TRIANGULATED = 0.5
 """Share of the keyframes above which several views agree on depth."""
-_ONE_STATE = {"fusion-at-one-moment", "fusion-in-one-state"}
-"""Notices of a surface that shows moving tissue at one moment."""
+_MOST_RANGES = 3
+"""Parts of the time that the verdict's sentence names, the longest."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,33 @@ class Verdict:
 def verdict(run: Result) -> Verdict:
     """Return the verdict on a run, from its frames and its provenance."""
     found = [*_of_end(run), *_of_notices(run), *_of_adjustment(run), _of_frames(run), *_of_maps(run)]
-    found += [*_of_surface(run), *_of_camera(run)]
+    found += [*_of_surface(run.provenance.get("surface") or {}, len(run.mesh.faces)), *_of_segments(run)]
+    found += _of_camera(run)
     order: tuple[Level, ...] = ("bad", "doubtful", "note", "good")
     reasons = sorted(found, key=lambda reason: order.index(reason.level))
-    level: Level = next((reason.level for reason in reasons if reason.level in ("bad", "doubtful")), "good")
+    level = _worst(reasons)
     return Verdict(level, _advice(run, level), _sentence(run), reasons)
+
+
+def graded(segments: Sequence[dict[str, Any]]) -> list[SurfaceSegment]:
+    """Return the segments of a result, each with the level of the verdict on it by itself, from what a run has of them.
+
+    segments : as `provenance.json` has them.
+    """
+    return [segment_of_facts(number, facts, _level_of_segment(facts)) for number, facts in enumerate(segments)]
+
+
+def _level_of_segment(facts: dict[str, Any]) -> Level:
+    reasons = [*_of_surface(facts["surface"], facts["faces"])]
+    reasons += [_reason(notice, notice.level) for notice in notices_of(facts) if notice.in_verdict]
+    if facts["frames"] < LEAST_FRAMES:
+        reasons.append(Reason("segment-short", "doubtful", "So few frames confirm no shape."))
+    return _worst(reasons)
+
+
+def _worst(reasons: Sequence[Reason]) -> Level:
+    levels = {reason.level for reason in reasons}
+    return "bad" if "bad" in levels else "doubtful" if "doubtful" in levels else "good"
 
 
 def state_verdict(result: Result) -> None:
@@ -143,7 +166,9 @@ def longest_segment(outside: np.ndarray) -> int:
 def _advice(run: Result, level: Level) -> str:
     if level == "bad":
         return "Do not use this result."
-    use = "The shape can be used." if level == "good" else "Use it with care: read the cautions first."
+    use = _usable(run)
+    if not use:
+        use = "The shape can be used." if level == "good" else "Use it with care: read the cautions first."
     if _scale_is_stated(run.provenance):
         return f"{use} Sizes rest on your {scale_source(run.provenance)}: check a length that you know."
     if scale_is_known(run.provenance):
@@ -155,7 +180,10 @@ def _sentence(run: Result) -> str:
     inside, used = frames_in_result(run.frames)
     surface = run.provenance.get("surface") or {}
     judged = _submaps_in_words(run)
-    facts = [f"{inside} of {used} frames are in the result" + (f", others in {judged}" if judged else "")]
+    facts = [
+        *_usable(run),
+        f"{inside} of {used} frames are in the result" + (f", others in {judged}" if judged else ""),
+    ]
     known = "The scale is as you stated it" if _scale_is_stated(run.provenance) else "The scale is known"
     facts.append(known if scale_is_known(run.provenance) else "The scale is unknown")
     if not len(run.mesh.faces):
@@ -166,6 +194,28 @@ def _sentence(run: Result) -> str:
     return "".join(f"{fact}. " for fact in facts).rstrip()
 
 
+def _usable(run: Result) -> str:
+    """Return which parts of the time can be used, and what for; "" where one surface stands for all frames."""
+    if len(run.segments) < 2:
+        return ""
+    usable = [segment for segment in run.segments if segment.level != "bad"]
+    if not usable:
+        return "No part of the video can be used."
+    ranges: list[list[float]] = []
+    for before, segment in zip([None, *usable], usable, strict=False):
+        if before is not None and before.segment == segment.segment - 1:
+            ranges[-1][1] = segment.end_s
+        else:
+            ranges.append([segment.start_s, segment.end_s])
+    longest = sorted(sorted(ranges, key=lambda ends: ends[0] - ends[1])[:_MOST_RANGES])
+    words = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in longest)
+    words += f" and {len(ranges) - len(longest)} shorter parts" if len(ranges) > len(longest) else ""
+    _, used = frames_in_result(run.frames)
+    share = _percent(np.isin(run.frames["segment"], [segment.segment for segment in usable]).sum() / max(used, 1))
+    good = any(segment.level == "good" for segment in usable)
+    return f"Usable: {words}, {share} of the video{'' if good else ', for looking, not for measuring'}."
+
+
 def _of_frames(run: Result) -> Reason:
     inside, used = frames_in_result(run.frames)
     part = part_of_input(run.provenance)
@@ -174,13 +224,18 @@ def _of_frames(run: Result) -> Reason:
         few = f"Only {inside} of {used}{chosen} frames are in the result: too few for a shape.{which}"
         return Reason("frames-too-few", "bad", few)
     place = run.frames.place[run.frames.place != NOT_USED]
-    found = np.isin(place, [0, *_segments(run)])
-    share, apart = found.mean(), int(found.sum()) - inside
+    found = np.isin(place, [0, *_long_submaps(run)])
+    apart = int(found.sum()) - inside
+    bad = [segment.segment for segment in run.segments if segment.level == "bad"]
+    if len(bad) < len(run.segments):  # that no surface can be used is another reason
+        found &= ~((place == 0) & np.isin(run.frames["segment"][run.frames.place != NOT_USED], bad))
+    share = found.mean()
     lost_in_a_row = longest_segment(~found)
     longest = f"; the longest gap is {lost_in_a_row} frames" if lost_in_a_row else ""
     last = run.provenance.get("interrupted_at_frame")
     until = "" if last is None else f" until frame {last}"
-    where, counted = "in the result", f"{inside} of {used}"
+    inside = int(found.sum()) - apart
+    where, counted = "in usable segments" if bad else "in the result", f"{inside} of {used}"
     if apart:
         where += f" or in usable submaps of {LEAST_SEGMENT_S:g} s and more"
         counted = f"{inside} and {apart} of {used}"
@@ -188,7 +243,7 @@ def _of_frames(run: Result) -> Reason:
     return Reason("frames-in-result", _level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
 
 
-def _segments(run: Result) -> list[int]:
+def _long_submaps(run: Result) -> list[int]:
     """Return the numbers of the submaps that stand for their part of the video."""
     place, times_s = run.frames.place, run.frames["time_s"]
     period_s = np.median(np.diff(times_s)) if len(times_s) > 1 else np.nan
@@ -230,10 +285,23 @@ def _of_maps(run: Result) -> list[Reason]:
     return found
 
 
-def _of_surface(run: Result) -> list[Reason]:
-    if not len(run.mesh.faces):
+def _of_segments(run: Result) -> list[Reason]:
+    """Return that several surfaces, each for a part of the time, make up the result."""
+    if len(run.segments) < 2:
+        return []
+    levels = [segment.level for segment in run.segments]
+    counts = ", ".join(f"{levels.count(level)} {word}" for level, word in WORDS.items() if level in levels)
+    text = f"The scene changes, so {len(levels)} segments of the video have a surface each ({counts})."
+    loose = sum(not facts.get("joined", True) for facts in run.provenance.get("segments", []))
+    text += f" {loose} are joined by tracking alone." if loose else ""
+    return [Reason("segments", "note", text, "See surfaces/segments.csv.")]
+
+
+def _of_surface(surface: dict[str, float], faces: int) -> list[Reason]:
+    """Return how well a surface agrees with its frames."""
+    if not faces:
         return [Reason("surface-missing", "bad", "There is no surface.")]
-    surface, found = run.provenance.get("surface") or {}, []
+    found = []
     if "coverage_mean" in surface:
         coverage, least = float(surface["coverage_mean"]), _percent(float(surface["coverage_least"]))
         text = f"The surface covers {_percent(coverage)} of the tissue in its own frames (worst frame: {least})"
@@ -266,12 +334,11 @@ def _of_notices(run: Result) -> list[Reason]:
     codes = {notice.code for notice in notices_of(run.provenance)}
     if "camera-at-rest-stated" in codes:
         return [_reason(n, n.level) for n in found if n.code != "camera-at-rest"]
-    return [_reason(n, _level_of(n), done=bool(codes & _ONE_STATE) and n.code == "tissue-moves") for n in found]
+    return [_reason(n, _level_of(n)) for n in found]
 
 
-def _reason(notice: Notice, level: Level, *, done: bool = False) -> Reason:
-    """Return a notice as a reason; done : its next step was taken."""
-    return Reason(notice.code, level, notice.text, "" if done else notice.next_step)
+def _reason(notice: Notice, level: Level) -> Reason:
+    return Reason(notice.code, level, notice.text, notice.next_step)
 
 
 def _level_of(notice: Notice) -> Level:

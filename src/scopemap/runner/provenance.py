@@ -11,11 +11,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scopemap.engine.config import Config
 from scopemap.engine.depth.estimate import DepthEstimator, PerceptualDistance
 from scopemap.engine.errors import InputError
 from scopemap.engine.estimators import Estimators
+from scopemap.engine.finishing import SegmentSurface
 from scopemap.engine.flow.estimator import FlowEstimator
+from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.notices import Notice, of_input
 from scopemap.engine.tracking.features import FeatureDetector
 from scopemap.input.frame_choice import selection_text
@@ -120,6 +124,23 @@ def provenance_of(
         "seconds": {part: round(seconds, 3) for part, seconds in seconds.items()},
         "versions": package_versions(),
         "machine": f"{platform.system()} {platform.machine()}, {platform.processor() or 'unknown processor'}",
+    }
+
+
+def facts_of_segment(segment: Segment, surface: SegmentSurface, frames: FrameTable) -> dict[str, Any]:
+    """Return what `provenance.json` has of a segment: its frames, how its surface agrees with them, its notices."""
+    own = frames.rows[np.isin(frames["index"], list(segment.frames))]
+    first, last = own[0], own[-1]
+    return {
+        "first_frame": int(first["index"]),
+        "last_frame": int(last["index"]),
+        "start_s": float(first["time_s"]),
+        "end_s": float(last["time_s"]),
+        "frames": len(own),
+        "joined": segment.is_joined,
+        "surface": surface.agreement,
+        "faces": len(surface.mesh.faces),
+        "notices": [notice.as_json() for notice in surface.notices],
     }
 
 

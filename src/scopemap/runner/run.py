@@ -14,11 +14,12 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numba.core.event import TimingListener, register
 
-from scopemap.engine.finishing import SubmapFinishing, SubmapSurface, TrackedFrames
+from scopemap.engine.finishing import SegmentFinishing, SegmentSurface, TrackedFrames
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.lens_test import LensTest
+from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.mapping.submaps import Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
@@ -27,9 +28,11 @@ from scopemap.engine.tracking.track import Track
 from scopemap.input.sequence import Sequence
 from scopemap.result.frame_table import FrameTable, GrowingFrameTable
 from scopemap.result.result import Result
+from scopemap.result.surface_segments import main_segment
+from scopemap.result.verdict import graded
 from scopemap.runner.backwards import track_backwards
 from scopemap.runner.memory import MemoryPlan, trim_memory
-from scopemap.runner.provenance import Limits, motion_notices, notices_of_end, provenance_of
+from scopemap.runner.provenance import Limits, facts_of_segment, motion_notices, notices_of_end, provenance_of
 from scopemap.runner.submap_frames import check_tracked, frames_of_submap
 
 Observer = Callable[[Step], bool | None]
@@ -213,7 +216,7 @@ class Run:
     @property
     def lens(self) -> LensTest:
         """What left-out tracks of the largest submap tell of the focal length."""
-        correction = self.submaps[0][0].correction
+        correction = self.submaps[0][0].segments[0].correction
         return LensTest() if correction is None else correction.lens
 
     def result(self, prepared: list[Notice]) -> Result:
@@ -249,16 +252,24 @@ class _Finishing:
         return results[0]
 
     def _submap_result(self, number: int, submaps: list[Submap]) -> Result:
-        """Finish a submap; its final frames are written meanwhile."""
+        """Finish a submap, one segment after the other; its final frames are written meanwhile."""
         trim_memory()
-        sequence, submap = self.run.sequence, submaps[number]
-        surface = self._surface(submap, sum(len(submap.frames) for submap in submaps))
-        frames, config = frames_of_submap(number, submaps, self.frames), self.run.pipeline.config
+        sequence, submap, config = self.run.sequence, submaps[number], self.run.pipeline.config
+        count = sum(len(submap.frames) for submap in submaps)
+        surfaces = [self._surface(submap, segment, count) for segment in submap.segments]
+        frames = frames_of_submap(number, submaps, self.frames)
+        segments = graded(
+            facts := [facts_of_segment(*each, frames) for each in zip(submap.segments, surfaces, strict=True)]
+        )
+        main = main_segment(segments)
+        surface = surfaces[main]
         moving = motion_notices(frames, config, confirmed=surface.is_confirmed)
         provenance = provenance_of(sequence, self.run.pipeline.estimators, self.run.clock.seconds, frames)
         provenance["notices"] += [notice.as_json() for notice in self.notices + moving + surface.notices]
         provenance["surface"] = surface.agreement
-        provenance["loops"] = [] if submap.correction is None else submap.correction.loop_frames
+        provenance["segments"], provenance["main_segment"] = facts, main
+        corrections = [segment.correction for segment in submap.segments if segment.correction is not None]
+        provenance["loops"] = [frames for correction in corrections for frames in correction.loop_frames]
         return Result.in_memory(
             sequence.camera,
             frames.with_skipped(sequence.skipped),
@@ -267,14 +278,15 @@ class _Finishing:
             provenance,
             source_camera=sequence.rectifier.source,
             states=surface.states,
-        )
+        ).with_segments(segments, [one.mesh for one in surfaces])
 
-    def _surface(self, submap: Submap, count: int) -> SubmapSurface:
-        """Return the surface of a submap; count : frames of all submaps."""
+    def _surface(self, submap: Submap, segment: Segment, count: int) -> SegmentSurface:
+        """Return the surface of a segment of a submap; count : frames of all submaps."""
         frames, timed = self.frames, self.run.clock.timed
-        finishing = SubmapFinishing(
+        finishing = SegmentFinishing(
             self.run.pipeline,
             submap,
+            segment,
             TrackedFrames(frames["index"], frames["time_s"], frames["T_world_camera"], frames["median_depth_mm"]),
             self.run.sequence.camera,
             keeps_depth=bool(self.run.writers),
@@ -287,7 +299,7 @@ class _Finishing:
             with closing(seen):
                 fused = timed("fuse", finishing.fuse, seen)
         fused = timed("finish mesh", finishing.finish, fused)
-        surface: SubmapSurface = timed("check surface", finishing.check, fused)
+        surface: SegmentSurface = timed("check surface", finishing.check, fused)
         return surface
 
     def _written(self, frames: Iterator[Frame], count: int) -> Iterator[Frame]:

@@ -52,10 +52,11 @@ def _correct(rows: np.ndarray, places: np.ndarray, submap: Submap) -> None:
             row["status"] = "ok"
             row["reason"] = row["reason"] if row["map"] in maps else "first frame of a merged map"
         maps.add(int(row["map"]))
-        if submap.correction is not None:
-            index = int(row["index"])
-            row["T_world_camera"] = submap.correction.pose(index, row["T_world_camera"])
-            row["depth_scale"] *= submap.depth_factor(index)
+        index = int(row["index"])
+        row["segment"] = submap.segment_of(index)
+        if (correction := submap.correction(index)) is not None:
+            row["T_world_camera"] = correction.pose(index, row["T_world_camera"])
+            row["depth_scale"] *= correction.depth_factor(index)
 
 
 def _rotate(rows: np.ndarray) -> None:

@@ -7,8 +7,8 @@ the others; depth is the median of |ln ratio|; in brackets is what the coloured 
 AbsRel is that of all depth maps with one scale. Runs of `overview --out FOLDER` are used again. Second table:
 `--camera-at-rest` on EndoNeRF's `pulling_soft_tissues`: median of |z - stereo| at the vertices of each frame's surface
 outside `gt_masks`, with one scale for all. Third table: laparoscopy phantoms, a part of whose tissue is pushed by 8 mm
-in the middle of three seconds: the mesh of all frames and that of `--surface-at` against the frame of that second,
-where tissue moved by 2 mm or more, and against its true depth there, with one scale where tissue is at rest.
+in the middle of three seconds: the surface of a frame's segment against that frame, where tissue moved by 2 mm or more,
+and against its true depth there, with one scale where tissue is at rest.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from scopemap.engine.fusion.agreement import compare_with_frame
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.result.depth_maps import DepthReader
+from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reread_frames import open_truth
 from scopemap_bench.scripts import measuring
@@ -96,11 +97,11 @@ def moved_part(source: Path, run: Path, index: int) -> np.ndarray:
 
 
 def agreement_there(source: Path, run: Path, index: int) -> str:
-    """Return the depth error and the SSIM of a run's mesh against frame `index`, where tissue moves, and to truth."""
+    """Return depth error and SSIM of a run's surface against a frame where tissue moves, and its error to truth."""
     frame, truth = next(pair for pair in open_truth(run, source) if pair[0].index == index)
     depth_mm, T = DepthReader(run).read(index), read_trajectory(run).T_world_camera[index]
     moved = moved_part(source, run, index) & frame.valid
-    mesh = trimesh.load(run / "mesh.ply", process=False)
+    mesh = Result(run).mesh_at(index)
     known_mm = np.where(moved, depth_mm, np.nan)
     found, _ = compare_with_frame(mesh, frame.camera, T, frame.rgb, known_mm, albedo=True)
     assert truth is not None
@@ -112,13 +113,12 @@ def agreement_there(source: Path, run: Path, index: int) -> str:
 
 
 def print_at_a_second(out: Path) -> None:
-    """Run a poked phantom as a whole and at its first and last second; print the third table."""
+    """Run a poked phantom; print the third table."""
     source = measuring.phantom(out / "phantoms" / "poke", *POKED)
-    whole = measuring.run_once(source, out / "poke-whole")
-    measuring.print_head("second", "all frames: depth, SSIM, to truth", "`--surface-at`: depth, SSIM, to truth")
+    run = measuring.run_once(source, out / "poke-whole")
+    measuring.print_head("second", "surface of its segment: depth, SSIM, to truth")
     for index, second in SECONDS.items():
-        at = measuring.run_once(source, out / f"poke-{index}", "--surface-at", second)
-        measuring.print_row(f"{second:.1f}", *(agreement_there(source, run, index) for run in (whole, at)))
+        measuring.print_row(f"{second:.1f}", agreement_there(source, run, index))
 
 
 def measure(options: argparse.Namespace, out: Path) -> None:

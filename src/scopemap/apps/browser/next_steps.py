@@ -56,9 +56,6 @@ def next_runs(step: str, run: Result) -> list[NextRun]:
             found.append(NextRun(option, tuple(known) or _SCOPES))
         elif option == "fov":
             found.append(NextRun(option, number=(70.0, 5.0, 170.0)))
-        elif option == "surface-at" and len(times_s := run.tracked["time_s"]):
-            first, last = float(times_s.min()), float(times_s.max())
-            found.append(NextRun(option, number=(round(float(np.median(times_s)), 2), first, last)))
     return found
 
 

@@ -41,6 +41,7 @@ class ResultView:
         self.rows = np.flatnonzero(whole.frames.place != NOT_USED).tolist()
         self.row = self.rows[0] if self.rows else 0
         self.number, self.surface = 0, ShownSurface(whole)
+        self._surfaces: dict[tuple[int, int | None], ShownSurface] = {(0, None): self.surface}
         self.in_state = self.surface.moves
         self._inside = False
         self._click_words = LOOKING
@@ -117,9 +118,21 @@ class ResultView:
             self._see()
 
     def show_row(self, row: int) -> None:
-        """Show the frame of a row."""
+        """Show the frame of a row, and the surface of its segment."""
         self.row = row
+        if self.pose is not None and (segment := self.run.segment_at(self.index)) != self.surface.segment:
+            self._show_surface(segment)
         for call in self._of_frame:
+            call()
+
+    def _show_surface(self, segment: int | None = None) -> None:
+        """Show the surface of a segment of the submap that is shown; None: its main one."""
+        if (self.number, segment) not in self._surfaces:
+            run = self.whole.submaps[self.number]
+            self._surfaces[self.number, segment] = ShownSurface(run, segment=segment)
+        self.surface = self._surfaces[self.number, segment]
+        self.in_state = self.surface.moves
+        for call in self._of_submap:
             call()
 
     def show_frame(self, index: int) -> None:
@@ -128,10 +141,8 @@ class ResultView:
 
     def show_submap(self, number: int) -> None:
         """Show the surface of another submap, and its first frame."""
-        self.number, self.surface = number, ShownSurface(self.whole.submaps[number])
-        self.in_state = self.surface.moves
-        for call in self._of_submap:
-            call()
+        self.number = number
+        self._show_surface()
         inside = np.flatnonzero(self.whole.frames.place == number)
         self.show_row(int(inside[0]) if len(inside) else self.row)
         self.look_at_all()

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.surface_measures import meet_surface
 from scopemap.report.shown_mesh import simplified
+from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 
 MOST_FACES = 200_000
@@ -26,10 +27,14 @@ class SurfacePick:
 
 
 class ShownSurface:
-    """The surface of a result, or of one of its submaps, of at most 200,000 triangles."""
+    """The surface of a segment of a result, or of one of its submaps, of at most 200,000 triangles.
 
-    def __init__(self, run: Result, most_faces: int = MOST_FACES) -> None:
-        self.run, self.mesh = run, simplified(run.mesh, most_faces)
+    segment : its number; None: the main one.
+    """
+
+    def __init__(self, run: Result, most_faces: int = MOST_FACES, *, segment: int | None = None) -> None:
+        self.run, self.segment = run, run.main_segment if segment is None else segment
+        self.mesh = simplified(run.surface(self.segment), most_faces)
         self.faces = np.asarray(self.mesh.faces)
 
     @property
@@ -45,7 +50,14 @@ class ShownSurface:
     @cached_property
     def facing(self) -> np.ndarray:
         """Cosines (V,), 0 to 1, at which the nearest camera sees the vertices."""
-        return facing_of(self.mesh, self.run.tracked["T_world_camera"][:, :3, 3])
+        return facing_of(self.mesh, self._frames["T_world_camera"][:, :3, 3])
+
+    @property
+    def _frames(self) -> FrameTable:
+        """The frames whose segment it is."""
+        tracked = self.run.tracked
+        own = tracked["segment"] == self.segment
+        return tracked.only(own) if own.any() else tracked
 
     @cached_property
     def _vertices(self) -> np.ndarray:

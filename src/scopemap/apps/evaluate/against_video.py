@@ -10,6 +10,7 @@ import csv
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,7 @@ class RunFrames:
         # Of those that are read here.
         self._fusion = fusion.model_copy(update={"every": fusion.every and 1})
         self.states = folder.states
+        self._segment_of = folder.segment_at
         self.indices: list[int] = []
         """Numbers of the frames: the tracked ones that are fused."""
         tracked = folder.frames.rows[folder.frames.tracked][:: fusion.every or 1]
@@ -121,9 +123,13 @@ class RunFrames:
         """Delete the unnamed file."""
         self._store.close()
 
-    def fuse(self, without: Collection[int] = ()) -> trimesh.Trimesh:
-        """Return the surface of all frames but those with the given numbers."""
-        fused = set(self.indices) - set(without)
+    def fuse(self, without: Collection[int] = ()) -> dict[int, trimesh.Trimesh]:
+        """Return the surface of each segment, by its number, of all its frames but those with the given numbers."""
+        fused = sorted(set(self.indices) - set(without), key=self._segment_of)
+        return {segment: self._fused({*own}) for segment, own in groupby(fused, self._segment_of)}
+
+    def _fused(self, fused: Collection[int]) -> trimesh.Trimesh:
+        """Return the surface of the frames with these numbers."""
         fusion = SurfaceFusion(self._fusion, self._store, corrected=True)
         frames = NewViews(self._fusion.every).among(self.frames(fused))
         if (states := self.states) is not None:
@@ -144,11 +150,12 @@ class RunFrames:
         if not held_out:
             which = f"every {_HELD_OUT_EVERY}th"
             raise InputError(f"the run {self._run} has too few tracked frames to keep {which} out of fusion")
-        mesh, missing = self.fuse(without=held_out), _lpips_missing()
+        surfaces, missing = self.fuse(without=held_out), _lpips_missing()
         perceptual = None if missing else create_perceptual("lpips")
         found = SurfaceAgreement(lpips_missing=missing)
         views: list[tuple[float, Frame, Rendering]] = []
         for frame in self.frames():
+            mesh = surfaces.get(self._segment_of(frame.index), trimesh.Trimesh())
             then = mesh if self.states is None else self.states.moved(mesh, frame.index)
             view, depth_mm = render_mesh(then, frame.camera, _pose(frame)), _usable_depth(frame)
             if self._fusion.colours == "albedo":

@@ -57,16 +57,16 @@ def write_surface(run: Result, file: Path, unit: Unit, axes: Axes) -> None:
 
 
 def write_surfaces(run: Result, folder: Path, unit: Unit, axes: Axes) -> None:
-    """Write the surface in the state of each tracked frame, as `000000.ply`, ..., named by the frame's number.
+    """Write the surface that fits each tracked frame, as `000000.ply`, ..., named by the frame's number.
 
-    Raises `InputError` where the run has no surface, or its tissue is taken to be at rest.
+    Raises `InputError` where the run has no surface, or one that fits all frames.
     """
-    if run.states is None:
+    if run.states is None and len(run.segments) < 2:
         raise InputError(f"{run.path}: its tissue is taken to be at rest; export its one surface as ply")
     folder.mkdir(parents=True, exist_ok=True)
-    shown, about, R = _surface_of(run, unit, axes), _about(run, unit, axes), _R_FILE_WORLD[axes]
+    about = _about(run, unit, axes)
     for index in run.tracked.trajectory.indices.tolist():
-        shown.vertices = run.states.moved(run.mesh, index).vertices @ R.T / MM_PER_UNIT[unit]
+        shown = _converted(run.mesh_at(index), unit, axes)
         (folder / f"{index:06d}.ply").write_bytes(ply_bytes(shown, about))
 
 
@@ -107,6 +107,11 @@ def _about(run: Result, unit: Unit, axes: Axes) -> list[str]:
 def _surface_of(run: Result, unit: Unit, axes: Axes) -> trimesh.Trimesh:
     if not len(run.mesh.faces):
         raise InputError(f"{run.path}: the run has no surface to export")
-    vertices = run.mesh.vertices @ _R_FILE_WORLD[axes].T / MM_PER_UNIT[unit]
-    colours, attributes = vertex_colours(run.mesh), vertex_attributes(run.mesh, unit)
-    return trimesh.Trimesh(vertices, run.mesh.faces, vertex_colors=colours, vertex_attributes=attributes, process=False)
+    return _converted(run.mesh, unit, axes)
+
+
+def _converted(mesh: trimesh.Trimesh, unit: Unit, axes: Axes) -> trimesh.Trimesh:
+    """Return a surface, world mm, in another unit and with other axes."""
+    vertices = mesh.vertices @ _R_FILE_WORLD[axes].T / MM_PER_UNIT[unit]
+    colours, attributes = vertex_colours(mesh), vertex_attributes(mesh, unit)
+    return trimesh.Trimesh(vertices, mesh.faces, vertex_colors=colours, vertex_attributes=attributes, process=False)

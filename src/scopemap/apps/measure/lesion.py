@@ -114,7 +114,7 @@ def _outline(run: Result, index: int, mask: np.ndarray) -> np.ndarray:
     pixels = max(contours, key=len)[:, 0]
     pixels = pixels[:: -(-len(pixels) // _OUTLINE_POINTS)]
     pose = run.tracked.trajectory.T_world_camera[run.tracked.trajectory.indices == index][0]
-    depth_mm = render_mesh(_at(run, run.mesh, index), run.camera, pose).depth_mm[pixels[:, 1], pixels[:, 0]]
+    depth_mm = render_mesh(run.mesh_at(index), run.camera, pose).depth_mm[pixels[:, 1], pixels[:, 0]]
     known = np.isfinite(depth_mm)
     return transform(pose, run.camera.unproject(pixels[known]) * depth_mm[known, None])
 
@@ -201,8 +201,11 @@ def shaft_width(folder: Path, file: Path) -> np.ndarray:
 
 
 def carried_masks(run: Result, frame: int, mask: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the masks (H, W) bool of what a mask of one frame shows, in all frames that see it, by number."""
-    poses = dict(zip(run.tracked.trajectory.indices.tolist(), run.tracked.trajectory.T_world_camera, strict=True))
+    """Return the masks (H, W) bool of what a mask of one frame shows, by number, in all frames of its segment that see
+    it.
+    """
+    own = run.tracked.only(run.tracked["segment"] == run.segment_at(frame)) if len(run.segments) > 1 else run.tracked
+    poses = dict(zip(own.trajectory.indices.tolist(), own.trajectory.T_world_camera, strict=True))
     surface = _marked(run, frame, mask, poses[frame])
     middle = np.asarray(surface.vertices)[vertex_colours(surface)[:, 0] > 127].mean(axis=0)
     pixels = {n: run.camera.project(transform(inverse(pose), middle[None]))[0] for n, pose in poses.items()}
@@ -234,7 +237,7 @@ def _at(run: Result, mesh: trimesh.Trimesh, index: int) -> trimesh.Trimesh:
 
 def _marked(run: Result, frame: int, mask: np.ndarray, pose: np.ndarray) -> trimesh.Trimesh:
     """Return the surface, its vertices white where a frame sees them inside a mask, black elsewhere."""
-    mesh = run.mesh
+    mesh = run.surface(run.segment_at(frame))
     seen = render_mesh(_at(run, mesh, frame), run.camera, pose).depth_mm
     points = transform(inverse(pose), np.asarray(_at(run, mesh, frame).vertices))
     with np.errstate(divide="ignore", invalid="ignore"):

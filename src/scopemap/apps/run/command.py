@@ -65,10 +65,6 @@ def run(
             "--camera-at-rest", help="State that the camera does not move: write one surface per frame to surfaces/."
         ),
     ] = False,
-    surface_at: Annotated[
-        float | None,
-        options.advanced(metavar="SECONDS", help="Show moving tissue as seen at this second of the video."),
-    ] = None,
     near_far: options.NearFar = None,
     depth: Annotated[
         str | None,
@@ -154,7 +150,6 @@ def run(
         "tracking.camera_at_rest": camera_at_rest or None,
         "networks.flow": flow,
         "networks.device": device,
-        "fusion.surface_at_s": surface_at,
         "fusion.colours": colours,
         "fusion.mesh_faces": mesh_faces,
         "fusion.mesh_smooth": mesh_smooth,

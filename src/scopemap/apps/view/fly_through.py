@@ -87,15 +87,17 @@ def smoothed_poses(T_world_camera: np.ndarray, time_s: np.ndarray) -> np.ndarray
 
 def _pictures(run: Result, source: Path | None, painting: Painting | None) -> Iterator[np.ndarray]:
     """Yield the pictures of the film, (H, W, 3) uint8."""
-    tracked, mesh = run.frames.only(run.frames.tracked), simplified(run.mesh, MOST_FACES)
+    tracked, meshes = run.frames.only(run.frames.tracked), dict[int, trimesh.Trimesh]()
     painted = None if painting is None else simplified(painting.mesh, MOST_FACES)
     indices, poses = tracked["index"].tolist(), tracked["T_world_camera"]
     smooth = dict(zip(indices, smoothed_poses(poses, tracked["time_s"]), strict=True))
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)))
     way, lumen = dict(zip(indices, along, strict=True)), centreline_of(run)
     for frame in reread_frames(run.folder, set(indices), source):
-        pose = smooth[frame.index]
-        surface, known_mm = _surface(run, mesh, frame, pose)
+        pose, segment = smooth[frame.index], run.segment_at(frame.index)
+        if segment not in meshes:
+            meshes[segment] = simplified(run.surface(segment), MOST_FACES)
+        surface, known_mm = _surface(run, meshes[segment], frame, pose)
         if painted is not None:
             colours = render_mesh(_at(run, painted, frame), frame.camera, pose)
             half = (surface.astype(np.uint16) + colours.rgb) // 2

@@ -120,11 +120,6 @@ class FusionSettings(StageSettings):
         description="depth beyond this is not fused, mm; default: 200 voxels, or 3.3 times a median depth beyond that",
     )
     every: int = Field(0, ge=0, description="fuse every n-th tracked frame; 0: those that show tissue anew")
-    surface_at_s: float | None = Field(
-        None,
-        description="the surface as seen at this second, by the time stamps, where tissue moves on its own "
-        "(moving_share in frames.csv); default: the mean of all frames there, too",
-    )
     colours: Literal["albedo", "raw"] = Field(
         "albedo",
         description="albedo: without the lamp's fall-off, in one exposure for all frames; raw: of the video",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def save_mesh(
     if ply_file is not None:
         ply_file.write_bytes(ply_bytes(mesh, [_PLY_AXES, comment]))
     if glb_file is not None and len(mesh.faces):
-        glb_file.write_bytes(_glb(mesh, comment))
+        glb_file.write_bytes(_glb([mesh], comment))
 
 
 def read_mesh(file: Path) -> trimesh.Trimesh:
@@ -79,7 +80,68 @@ def save_mesh_over_time(mesh: trimesh.Trimesh, states: TissueStates, glb_file: P
     lowest.vertices = mesh.vertices + np.tensordot(low - states.reference, motion, 1)
     targets = spread[:, None, None] * motion @ T_GLTF_WORLD[:3, :3].T
     at_rest, weights = (states.reference - low) / spread, (states.curves - low) / spread
-    glb_file.write_bytes(_animated(_glb(lowest, comment), targets, at_rest, states.time_s, weights))
+    glb_file.write_bytes(_animated(_glb([lowest], comment), targets, at_rest, states.time_s, weights))
+
+
+def save_meshes_in_time(
+    meshes: Sequence[trimesh.Trimesh], starts_s: Sequence[float], glb_file: Path, *, comment: str = ""
+) -> None:
+    """Write meshes as GLB, each of which shows from its start, s, until that of the next one; otherwise as `save_mesh`.
+
+    An animation scales the others to a point (glTF 2.0, section 3.11). Meshes without faces are left out.
+    """
+    shown = [(mesh, start) for mesh, start in zip(meshes, starts_s, strict=True) if len(mesh.faces)]
+    if not shown:
+        return
+    glb = _OpenGlb(_glb([mesh for mesh, _ in shown], comment))
+    times_s = np.array([start for _, start in shown]) - shown[0][1]
+    samplers, channels = [], []
+    for number, node in enumerate(glb.mesh_nodes):
+        scale = np.repeat(np.where(np.arange(len(shown)) == number, 1.0, 0.0)[:, None], 3, axis=1)
+        samplers.append(glb.sampler(times_s, scale, "VEC3") | {"interpolation": "STEP"})
+        channels.append({"sampler": number, "target": {"node": node, "path": "scale"}})
+    glb.tree["animations"] = [{"name": "segments", "samplers": samplers, "channels": channels}]
+    glb_file.write_bytes(glb.content)
+
+
+class _OpenGlb:
+    """A GLB whose JSON can be changed, and to which arrays can be added."""
+
+    def __init__(self, glb: bytes) -> None:
+        (length,) = struct.unpack_from("<I", glb, 12)
+        self.tree, self._binary = json.loads(glb[20 : 20 + length]), bytearray(glb[28 + length :])
+        self._binary.extend(b"\0" * (-len(self._binary) % 4))
+
+    @property
+    def mesh_nodes(self) -> list[int]:
+        """The nodes with a mesh, by the numbers of their meshes."""
+        nodes = [(node["mesh"], number) for number, node in enumerate(self.tree["nodes"]) if "mesh" in node]
+        return [number for _, number in sorted(nodes)]
+
+    def accessor(self, values: np.ndarray, kind: str) -> int:
+        """Add values and return their number."""
+        content = np.ascontiguousarray(values, "<f4")
+        view = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": content.nbytes}
+        self.tree["bufferViews"].append(view)
+        self._binary.extend(content.tobytes())
+        rows = content.reshape(len(content), -1)
+        limits = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+        about = {"bufferView": len(self.tree["bufferViews"]) - 1, "componentType": _FLOAT, "count": len(content)}
+        self.tree["accessors"].append(about | {"type": kind} | limits)
+        return len(self.tree["accessors"]) - 1
+
+    def sampler(self, times_s: np.ndarray, values: np.ndarray, kind: str) -> dict[str, Any]:
+        """Add the values (F, ...) of an animation at times (F,), s."""
+        return {"input": self.accessor(times_s, "SCALAR"), "output": self.accessor(values, kind)}
+
+    @property
+    def content(self) -> bytes:
+        """The file."""
+        self.tree["buffers"][0]["byteLength"] = len(self._binary)
+        text = json.dumps(self.tree).encode()
+        chunks = ((text + b" " * (-len(text) % 4), _JSON), (bytes(self._binary), _BIN))
+        body = b"".join(struct.pack("<II", len(part), kind) + part for part, kind in chunks)
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
 def _animated(glb: bytes, targets: np.ndarray, at_rest: np.ndarray, time_s: np.ndarray, weights: np.ndarray) -> bytes:
@@ -87,33 +149,15 @@ def _animated(glb: bytes, targets: np.ndarray, at_rest: np.ndarray, time_s: np.n
 
     glTF 2.0, sections 3.7.2.2, morph targets, and 3.11, animations.
     """
-    (length,) = struct.unpack_from("<I", glb, 12)
-    tree, binary = json.loads(glb[20 : 20 + length]), bytearray(glb[28 + length :])
-    binary.extend(b"\0" * (-len(binary) % 4))
-
-    def accessor(values: np.ndarray, kind: str) -> int:
-        content = np.ascontiguousarray(values, "<f4")
-        tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": content.nbytes})
-        binary.extend(content.tobytes())
-        rows = content.reshape(len(content), -1)
-        limits = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
-        about = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": _FLOAT, "count": len(content)}
-        tree["accessors"].append(about | {"type": kind} | limits)
-        return len(tree["accessors"]) - 1
-
-    (mesh,) = tree["meshes"]
+    found = _OpenGlb(glb)
+    (mesh,), (node,) = found.tree["meshes"], found.mesh_nodes
     mesh["weights"] = at_rest.tolist()
     for primitive in mesh["primitives"]:
-        primitive["targets"] = [{"POSITION": accessor(target, "VEC3")} for target in targets]
-    node = next(number for number, node in enumerate(tree["nodes"]) if "mesh" in node)
-    sampler = {"input": accessor(time_s - time_s[0], "SCALAR"), "output": accessor(weights.ravel(), "SCALAR")}
+        primitive["targets"] = [{"POSITION": found.accessor(target, "VEC3")} for target in targets]
+    sampler = found.sampler(time_s - time_s[0], weights.ravel(), "SCALAR")
     channel = {"sampler": 0, "target": {"node": node, "path": "weights"}}
-    tree["animations"] = [{"name": "tissue", "samplers": [sampler], "channels": [channel]}]
-    tree["buffers"][0]["byteLength"] = len(binary)
-    text = json.dumps(tree).encode()
-    chunks = ((text + b" " * (-len(text) % 4), _JSON), (bytes(binary), _BIN))
-    body = b"".join(struct.pack("<II", len(content), kind) + content for content, kind in chunks)
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+    found.tree["animations"] = [{"name": "tissue", "samplers": [sampler], "channels": [channel]}]
+    return found.content
 
 
 def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
@@ -125,15 +169,18 @@ def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
     return head + end + rest
 
 
-def _glb(mesh: trimesh.Trimesh, comment: str) -> bytes:
+def _glb(meshes: Sequence[trimesh.Trimesh], comment: str) -> bytes:
     R = T_GLTF_WORLD[:3, :3]
-    rotated = trimesh.Trimesh(
-        mesh.vertices @ R.T,
-        mesh.faces,
-        vertex_normals=mesh.vertex_normals @ np.sign(R),
-        vertex_attributes={_WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])},
-        process=False,
-    )
+    scene = trimesh.Scene()
+    for mesh in meshes:
+        rotated = trimesh.Trimesh(
+            mesh.vertices @ R.T,
+            mesh.faces,
+            vertex_normals=mesh.vertex_normals @ np.sign(R),
+            vertex_attributes={_WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])},
+            process=False,
+        )
+        scene.add_geometry(rotated)
 
     def finish(tree: dict[str, Any]) -> None:
         # Without a material viewers show metal.
@@ -145,7 +192,7 @@ def _glb(mesh: trimesh.Trimesh, comment: str) -> bytes:
             colours = primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_WRITTEN_COLOURS)
             tree["accessors"][colours]["normalized"] = True
 
-    return trimesh.exchange.gltf.export_glb(trimesh.Scene(rotated), include_normals=True, tree_postprocessor=finish)
+    return trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=finish)
 
 
 def _linear_16_bit(srgb: np.ndarray) -> np.ndarray:

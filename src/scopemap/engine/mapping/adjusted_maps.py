@@ -73,6 +73,20 @@ class MapKeyframes:
         """Poses (K, 4, 4) as tracked, in the common world."""
         return np.stack([self.S_common_map[pose.map].transform_poses(pose.T_world_camera) for pose in self.poses])
 
+    def successive(self, first: int, end: int) -> MapKeyframes:
+        """Return the keyframes from `first` to before `end`, in the same world."""
+        part = slice(first, end)
+        poses = self.poses[part]
+        return replace(
+            self,
+            index=self.index[part],
+            poses=poses,
+            steps=self.steps[part],
+            log_drift=self.log_drift[part],
+            grids_mm=self.grids_mm[part],
+            S_common_map={pose.map: self.S_common_map[pose.map] for pose in poses},
+        )
+
     def correction(self, found: BundleSolution) -> FrameCorrection:
         """Return the correction by a solution, without depth correction fields."""
         state = found.state
@@ -95,21 +109,32 @@ class MapKeyframes:
         count, sigma = len(self.index), found.log_depth_sigma
         return fit_depth_corrections(self.camera, as_tracked, count, change, sigma, self.settings.depth_step_sigma)
 
+    @cached_property
+    def tracked_depths(self) -> list[np.ndarray]:
+        """The depths (h, w) as tracked, mm of the common world."""
+        scales = [np.float32(self.S_common_map[pose.map].scale) for pose in self.poses]
+        return [scale * grid for scale, grid in zip(scales, self.grids_mm, strict=True)]
+
+    def adjusted_depths(
+        self, found: BundleSolution, fields: tuple[DepthCorrectionField, ...] = ()
+    ) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Return the poses T_world_camera (K, 4, 4) of a solution, and the depths (h, w) mm that it gives keyframes."""
+        log_scale = found.state.log_scale - self.log_drift
+        after = [np.exp(log) * grid for log, grid in zip(log_scale, self.tracked_depths, strict=True)]
+        if fields:
+            factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, self.tracked_depths, strict=True)]
+            after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
+        return inverse(found.state.T_camera_world), after
+
     def depth_contradiction(
         self, found: BundleSolution, fields: tuple[DepthCorrectionField, ...] = ()
     ) -> Notice | None:
         """Return that the depths of keyframes agree less than as tracked; None: they agree about as well."""
-        scales = [np.float32(self.S_common_map[pose.map].scale) for pose in self.poses]
-        before = [scale * grid for scale, grid in zip(scales, self.grids_mm, strict=True)]
-        log_scale = found.state.log_scale - self.log_drift
-        after = [np.exp(log) * grid for log, grid in zip(log_scale, before, strict=True)]
-        if fields:
-            factors = [np.exp(field.log_factor(grid)) for field, grid in zip(fields, before, strict=True)]
-            after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
+        T_world_camera, after = self.adjusted_depths(found, fields)
         # Farther apart two keyframes may have a few pixels in common, which prove nothing.
         gaps = [gap for gap in self.settings.keyframe_gaps if gap <= MOST_RECENT]
-        adjusted = inverse(found.state.T_camera_world), after
-        grown = growth_of_disagreement(self.camera, (self.T_world_camera, before), adjusted, gaps)
+        before = self.T_world_camera, self.tracked_depths
+        grown = growth_of_disagreement(self.camera, before, (T_world_camera, after), gaps)
         if grown is None:
             return None
         return Notice("mapping-depth-disagrees", {"tracked": grown[0], "adjusted": grown[1], "merged": ""})

@@ -34,6 +34,8 @@ from scopemap.engine.mapping.pose_graph import (
     scale_by_network,
     tracked_pairs,
 )
+from scopemap.engine.mapping.segments import Segment, adjust_interval, choose_segments, joined
+from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.features import FeatureDetector
 
 # Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
@@ -152,12 +154,13 @@ class Backend:
         map_number: int = 0,
         tracked: Mapping[int, TrackedPose] | None = None,
         among: Collection[int] | None = None,
-    ) -> FrameCorrection:
-        """Return the correction of all frames of a map and of the maps merged with it, after the last keyframe.
+    ) -> list[Segment]:
+        """Return the segments of a map and of the maps merged with it, after the last keyframe: one where one scene, at
+        rest or moved by one curve, explains all of it.
 
         tracked : poses as tracked by number of the frame; needed for several maps. among : numbers of the maps that may
-        be merged; None: all. Where it is refused, keyframes stay as tracked, and only their steps are spread over the
-        frames that lead to them. Raises ValueError where the map has no keyframe.
+        be merged; None: all. Where an adjustment is refused, keyframes stay as tracked, and only their steps are spread
+        over the frames that lead to them. Raises ValueError where the map has no keyframe.
         """
         if not self.keyframes(map_number):
             raise ValueError("nothing to adjust: no keyframe was added")
@@ -169,7 +172,29 @@ class Backend:
         allowed = {pose.map for pose in self._tracked} if among is None else set(among)
         alone = self._alone(map_number)
         found, worlds = self._merged_and_adjusted(map_number, allowed, alone)
-        correction = self._tested(found, alone, worlds)
+        correction = self._in_worlds(self._tested(found, alone, worlds), worlds, tracked)
+        whole = Segment(int(correction.index[-1]), correction)
+        return self._segments(found, correction) or [whole] if correction.refused else [whole]
+
+    def _segments(self, found: AdjustedMaps, refused: FrameCorrection) -> list[Segment]:
+        """Return the segments of maps that no one scene explains, each adjusted by itself; [] where there is one.
+
+        found, refused : the adjustment of all, and the correction that was refused.
+        """
+        worlds, tracked = refused.S_common_map, refused.tracked
+        keyframes, problem = self._keyframes_of(worlds), replace(found.problem, start=None)
+        intervals = choose_segments(keyframes, problem)
+        if len(intervals) < 2:
+            return []
+        alone = (adjust_interval(keyframes, problem, interval) for interval in intervals)
+        corrections = [replace(self._in_worlds(one, worlds, tracked), lens=refused.lens) for one in alone]
+        return joined(corrections, intervals, keyframes)
+
+    @staticmethod
+    def _in_worlds(
+        correction: FrameCorrection, worlds: Mapping[int, Similarity], tracked: Mapping[int, TrackedPose] | None
+    ) -> FrameCorrection:
+        """Return a correction that knows all maps with these Sim(3) to the common world, and the poses as tracked."""
         return replace(correction, S_common_map=worlds, tracked=tracked or {})
 
     def _alone(self, map_number: int) -> AdjustedMaps:
@@ -196,6 +221,9 @@ class Backend:
         """
         tested = found if alone.correction.refused else alone
         lens = lens_test(tested.problem, tested.rigid)
+        if lens.is_worse and tested is found and not found.correction.refused:
+            worse = Notice("mapping-worse", {"error_px": lens.held_px, "tracked_px": lens.tracked_px, "merged": ""})
+            return replace(self._keyframes_of(worlds).uncorrected(lens.held_px), refused=worse, lens=lens)
         if len(worlds) > 1 or lens.contradicts:
             return replace(found.correction, lens=lens)
         correction = self._with_moving_tissue(found, worlds)

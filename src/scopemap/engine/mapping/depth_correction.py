@@ -134,7 +134,7 @@ def depth_disagreement(
     whether the scale drifts.
     """
     errors = [
-        np.concatenate([_log_ratios(camera, T_world_camera, grids, k, k + step) for k, step in pairs])
+        np.concatenate([depth_log_ratios(camera, T_world_camera, grids, k, k + step) for k, step in pairs])
         for gap in sorted(set(gaps))
         if (pairs := [(k, s) for s in (gap, -gap) for k in range(len(grids)) if 0 <= k + s < len(grids)])
     ]
@@ -161,7 +161,7 @@ def growth_of_disagreement(
     return None
 
 
-def _log_ratios(
+def depth_log_ratios(
     camera: PinholeCamera, T_world_camera: np.ndarray, grids: Sequence[np.ndarray], one: int, other: int
 ) -> np.ndarray:
     """Return ln of a keyframe's depth over that of another one's points there, (n,), where both are known."""

@@ -68,7 +68,8 @@ class FrameCorrection:
     S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
     number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens : what
     left-out tracks tell of it. tissue : how it moves; None: it is taken to be at rest. shape : what other
-    starts of the adjustment tell of it.
+    starts of the adjustment tell of it. S_world_adjusted : Sim(3) from the adjusted world to that of the submap, which
+    joins a segment to the one before.
     """
 
     index: np.ndarray
@@ -87,6 +88,7 @@ class FrameCorrection:
     lens: LensTest = field(default_factory=LensTest)
     tissue: TissueMotion | None = None
     shape: ShapeTest = field(default_factory=ShapeTest)
+    S_world_adjusted: Similarity = field(default_factory=Similarity.identity)
 
     @property
     def notices(self) -> list[Notice]:
@@ -143,6 +145,7 @@ class FrameCorrection:
             T_world_world=T_new_world @ self.T_world_world @ inverse(T_new_world),
             T_world_world_before=None if before is None else T_new_world @ before @ inverse(T_new_world),
             S_common_map={number: moved.after(S) for number, S in self.S_common_map.items()},
+            S_world_adjusted=moved.after(self.S_world_adjusted).after(moved.inverse()),
             tissue=self.tissue and self.tissue._replace(deformation=self.tissue.deformation.in_world(T_new_world)),
         )
 
@@ -151,7 +154,7 @@ class FrameCorrection:
         before, after, share = self._between(index)
         T_world_camera = self._world(index).transform_poses(T_world_camera)
         poses = [self._moved_with(k, index, T_world_camera) for k in (before, after)]
-        return mean_near(poses[0], [poses[1]], [share])
+        return self.S_world_adjusted.transform_poses(mean_near(poses[0], [poses[1]], [share]))
 
     def depth_factor(self, index: int) -> float:
         """Return the factor of the whole depth of the frame with this number, without its depth correction field."""
@@ -171,7 +174,7 @@ class FrameCorrection:
 
     def _factor(self, index: int, before: int, after: int, share: float) -> float:
         log_scale = (1 - share) * self._log_scale(before, index) + share * self._log_scale(after, index)
-        return float(np.exp(log_scale)) * self._world(index).scale
+        return float(np.exp(log_scale)) * self._world(index).scale * self.S_world_adjusted.scale
 
     def _moved_with(self, k: int, index: int, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the pose (4, 4) of a frame that moves with keyframe k.

@@ -28,8 +28,8 @@ from scopemap.engine.mapping.bundle_adjustment import (
     errors_px,
     log_depth_sigma,
 )
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Priors, State
-from scopemap.engine.mapping.left_out import part_of, placed
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State
+from scopemap.engine.mapping.left_out import halves, placed, successive, successive_state
 from scopemap.engine.notices import Notice
 
 MOST_KEYFRAMES = 60  # by hand
@@ -139,9 +139,11 @@ def with_other_starts(
     whether it explains the observations; where it does not, it cannot win. Of many keyframes those in the middle are
     tested; all, where another start wins there.
     """
-    count = len(problem.T_camera_world)
-    middle = _stretch(problem, found.state, (count - MOST_KEYFRAMES) // 2, MOST_KEYFRAMES)
-    tested, keyframes = (problem, found.state) if count <= MOST_KEYFRAMES else middle
+    tested, keyframes, count = problem, found.state, len(problem.T_camera_world)
+    if count > MOST_KEYFRAMES:
+        first = (count - MOST_KEYFRAMES) // 2
+        tested = successive(problem, first, first + MOST_KEYFRAMES)
+        keyframes = successive_state(problem, found.state, first, first + MOST_KEYFRAMES)
     best, test = _test(tested, keyframes, is_rigid=is_rigid)
     if test.replaced and tested is not problem:
         best, test = _test(problem, found.state, is_rigid=is_rigid)
@@ -152,9 +154,11 @@ def with_other_starts(
 
 def _test(problem: BundleProblem, keyframes: State, *, is_rigid: bool) -> tuple[State, ShapeTest]:
     """Return the keyframes of the start that wins, the given ones where none does, and what the starts tell."""
-    adjusted, left_out = _samples(problem)
-    own = None if left_out is None else _shape(left_out, keyframes)
-    if left_out is None or own is None or own.known.sum() < _LEAST_POINTS:
+    adjusted, left_out = halves(problem, _POINTS)
+    if len(left_out.points.host) < _LEAST_POINTS or len(problem.T_camera_world) < 2:
+        return keyframes, ShapeTest()
+    own = _shape(left_out, keyframes)
+    if own.known.sum() < _LEAST_POINTS:
         return keyframes, ShapeTest()
     mirrored = _shape(left_out, adjust_in_windows(_mirrored(adjusted)).state)
     if is_rigid and own.meets(mirrored):
@@ -170,43 +174,6 @@ def _test(problem: BundleProblem, keyframes: State, *, is_rigid: bool) -> tuple[
     nearest = max((mirrored, flat), key=lambda shape: np.nan_to_num(shape.likeness(own)[0], nan=-1.0))
     other_px = min(mirrored.error_px, flat.error_px)
     return keyframes, ShapeTest("not determined", False, *own.likeness(nearest), own.error_px, other_px)
-
-
-def _samples(problem: BundleProblem) -> tuple[BundleProblem, BundleProblem | None]:
-    """Return the problems of points that are adjusted, and of as many others; None where too few are observed."""
-    observed = np.unique(problem.observations.point)
-    step = max(2, -(-len(observed) // (_POINTS * len(problem.T_camera_world))))
-    adjusted, left_out = np.zeros((2, len(problem.points.host)), bool)
-    adjusted[observed[::step]] = left_out[observed[step // 2 :: step]] = True
-    if left_out.sum() < _LEAST_POINTS or len(problem.T_camera_world) < 2:
-        return problem, None
-    return part_of(problem, adjusted), part_of(problem, left_out)
-
-
-def _stretch(problem: BundleProblem, state: State, first: int, count: int) -> tuple[BundleProblem, State]:
-    """Return the problem of `count` successive keyframes alone, and a solution's state of these."""
-    first = max(first, 0)
-    those = slice(first, first + count)
-    own = (problem.points.host >= first) & (problem.points.host < first + count)
-
-    def of(whole: State) -> State:
-        T, log_scale = whole.T_camera_world[those], whole.log_scale[those]
-        return whole._replace(T_camera_world=T, log_scale=log_scale, log_depth=whole.log_depth[own])
-
-    part = part_of(problem, own)
-    seen = part.observations
-    inside = (seen.keyframe >= first) & (seen.keyframe < first + count)
-    seen = Observations(seen.point[inside], seen.keyframe[inside] - first, seen.pixel[inside])
-    pairs = problem.neighbours[((problem.neighbours >= first) & (problem.neighbours < first + count)).all(1)] - first
-    alone = replace(
-        part,
-        T_camera_world=problem.T_camera_world[those],
-        points=replace(part.points, host=part.points.host - first),
-        observations=seen,
-        neighbours=pairs,
-        start=problem.start and of(problem.start),
-    )
-    return alone, of(state)
 
 
 def _shape(left_out: BundleProblem, keyframes: State) -> _Shape:

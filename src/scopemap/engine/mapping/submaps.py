@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from scopemap.engine.mapping.backend import Backend
 from scopemap.engine.mapping.feature_tracks import KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
 from scopemap.engine.mapping.map_merging import Part
+from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.features import FeatureDetector
 from scopemap.engine.tracking.track import Track
@@ -46,19 +49,32 @@ class Submap:
     Attributes
     ----------
     main : number of its map with most frames. maps : numbers of all maps merged into it.
-    frames : numbers of the frames tracked in these. main_frames : of those tracked in the main map. correction : of
-    poses and depth of these frames; None: they are as tracked.
+    frames : numbers of the frames tracked in these. main_frames : of those tracked in the main map. segments : parts of
+    its time, in order; one surface fits the frames of each.
     """
 
     main: int
     maps: tuple[int, ...]
     frames: frozenset[int]
     main_frames: frozenset[int]
-    correction: FrameCorrection | None = None
+    segments: tuple[Segment, ...]
 
     def depth_factor(self, index: int) -> float:
         """Return the factor of the whole depth of the frame with this number."""
-        return 1.0 if self.correction is None else self.correction.depth_factor(index)
+        correction = self.correction(index)
+        return 1.0 if correction is None else correction.depth_factor(index)
+
+    def correction(self, index: int) -> FrameCorrection | None:
+        """Return the correction of the frame with this number; None: it is as tracked."""
+        return self.segments[self.segment_of(index)].correction
+
+    def segment_of(self, index: int) -> int:
+        """Return the number of the segment that a frame of this number is in."""
+        return min(bisect_left(self._lasts, index), len(self.segments) - 1)
+
+    @cached_property
+    def _lasts(self) -> list[int]:
+        return [segment.last for segment in self.segments]
 
 
 class Mapper:
@@ -184,13 +200,9 @@ class Mapper:
         found: list[Submap] = []
         while frames:
             main = max(frames, key=lambda number: frames[number])
-            correction = None
-            if self._backend is not None and self._backend.keyframes(main):
-                correction = self._backend.adjust(main, self._tracked, among=frames)
-                correction = self._from_first_frame(correction, not_first)
-            maps = (main,) if correction is None else tuple(sorted(correction.S_common_map))
-            found.append(Submap(main, maps, self._frames_of(maps), self._frames_of((main,)), correction))
-            for number in maps:
+            submap = self._submap(main, frames, not_first)
+            found.append(submap)
+            for number in submap.maps:
                 del frames[number]
         found.sort(key=lambda submap: -len(submap.frames))
         kept = found[:1] + [submap for submap in found[1:] if len(submap.frames) >= LEAST_FRAMES]
@@ -212,12 +224,31 @@ class Mapper:
         self._tracked = {index: pose._replace(map=number(pose)) for index, pose in self._tracked.items()}
         return {pose.map for pose in self._tracked.values()} - before
 
-    def _from_first_frame(self, correction: FrameCorrection, not_first: Collection[int]) -> FrameCorrection:
-        """Return the correction to the world of its first frame: that of maps that begin elsewhere is another one."""
-        first = min(self._frames_of(tuple(correction.S_common_map)))
-        if self._tracked[first].map not in not_first:
-            return correction
-        return correction.in_world(inverse(correction.pose(first, self._tracked[first].T_world_camera)))
+    def _submap(self, main: int, among: Collection[int], not_first: Collection[int]) -> Submap:
+        """Return the submap of a map and of those among others that are merged with it, adjusted."""
+        if self._backend is None or not self._backend.keyframes(main):
+            frames = self._frames_of((main,))
+            return Submap(main, (main,), frames, frames, (Segment(max(frames), frames=frames),))
+        adjusted = self._backend.adjust(main, self._tracked, among=among)
+        assert adjusted[0].correction is not None
+        maps = tuple(sorted(adjusted[0].correction.S_common_map))
+        frames = self._frames_of(maps)
+        adjusted[-1] = replace(adjusted[-1], last=max(frames))
+        before, segments = -1, []
+        for segment in self._from_first_frame(adjusted, min(frames), not_first):
+            own = frozenset(index for index in frames if before < index <= segment.last)
+            segments.append(replace(segment, frames=own))
+            before = segment.last
+        return Submap(main, maps, frames, self._frames_of((main,)), tuple(segments))
+
+    def _from_first_frame(self, segments: Sequence[Segment], first: int, not_first: Collection[int]) -> list[Segment]:
+        """Return the segments in the world of the first frame: that of maps that begin elsewhere is another one."""
+        tracked = self._tracked[first]
+        if tracked.map not in not_first:
+            return [*segments]
+        assert segments[0].correction is not None
+        T_first_world = inverse(segments[0].correction.pose(first, tracked.T_world_camera))
+        return [replace(one, correction=one.correction and one.correction.in_world(T_first_world)) for one in segments]
 
     def _frames_of(self, maps: tuple[int, ...]) -> frozenset[int]:
         return frozenset(index for index, pose in self._tracked.items() if pose.map in maps)
@@ -247,7 +278,7 @@ def corrected_frame(frame: Frame, correction: FrameCorrection | None) -> Frame:
 
 
 class FinalFrames:
-    """Frames of a submap, in order, with poses and depth corrected by the back end.
+    """Frames of a segment, in order, with poses and depth corrected by the back end.
 
     Attributes
     ----------
@@ -255,15 +286,16 @@ class FinalFrames:
     none where neither a rigid scene nor one with a rigid core explains the observations.
     """
 
-    def __init__(self, submap: Submap, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]) -> None:
+    def __init__(
+        self, correction: FrameCorrection | None, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]
+    ) -> None:
         """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
-        self._stored, self._correction = read, submap.correction
-        correction = submap.correction
+        self._stored, self._correction = read, correction
         moves = correction is not None and correction.tissue is not None and not correction.tissue.deformation.has_core
         rigid = correction is not None and not correction.refused and not moves
-        correct = submap.correction.pose if submap.correction is not None else lambda _, pose: pose
+        correct = correction.pose if correction is not None else lambda _, pose: pose
         self.T_world_camera = {index: correct(index, pose) for index, pose in sorted(T_world_camera.items())}
-        adjusted = submap.correction.index.tolist() if rigid and submap.correction is not None else []
+        adjusted = correction.index.tolist() if rigid and correction is not None else []
         self.keyframes = [index for index in adjusted if index in self.T_world_camera]
 
     def frames(

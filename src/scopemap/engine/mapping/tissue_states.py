@@ -32,10 +32,9 @@ class TissueStates:
     curves: np.ndarray
     reference: np.ndarray
 
-    def with_reference(self, at_s: float | None) -> TissueStates:
-        """Return the states with the surface in that of the frame next to a second; None: in the most usual one."""
-        far = np.linalg.norm(self.curves - np.median(self.curves, 0), axis=1) if at_s is None else self.time_s - at_s
-        reference = self.curves[np.abs(far).argmin()]
+    def in_usual_state(self) -> TissueStates:
+        """Return the states with the surface in the most usual one."""
+        reference = self.curves[np.linalg.norm(self.curves - np.median(self.curves, 0), axis=1).argmin()]
         return TissueStates(self.nodes, self.modes, self.index, self.time_s, self.curves, reference)
 
     @property

@@ -6,10 +6,24 @@ const CAUSE_TONES = {
 };
 const BAND = { top: 78, height: 26 };
 
+// A map, in words: the result, a submap or a segment; where there are several, by itself.
+function nameOf(run, number) {
+  const { name, word } = run.titles[number];
+  return run.titles.length > 1 && (number || isSegment(run, 0)) ? `${name}, by itself ${word}` : name.toLowerCase();
+}
+
+const isSegment = (run, number) => run.titles[number].name.startsWith("Segment");
+
+// Segments are as good as the verdict on them; a submap is another world.
+function toneOf(run, number) {
+  const { level } = run.titles[number];
+  return style(isSegment(run, number) ? (level === "good" ? "--in" : `--${level}`) : number ? "--other" : "--in");
+}
+
 // What a frame is, in words and as a colour; the same words are the same band.
 function whatIs(run, row) {
   const place = run.places[row], cause = run.causes[run.causeOf[row]];
-  if (place >= 0) return { text: place ? `submap ${place}, by itself ${run.words[place]}` : "the result", tone: style(place ? "--other" : "--in"), place };
+  if (place >= 0) return { text: nameOf(run, place), tone: toneOf(run, place), place };
   if (place === OTHER_MAP) return { text: "submap too short to be kept", tone: style("--line") };
   if (place === NOT_USED) return { text: "left out: repeated, beyond the rate, or of another size", tone: style("--line") };
   return { text: `lost: ${cause || "no cause was kept"}`, tone: CAUSE_TONES[cause] || style(place === ROTATED ? "--rotated" : "--lost") };
@@ -48,7 +62,7 @@ function drawAtlas(canvas, run) {
     context.fillRect(x(first), BAND.top, Math.max(1, x(last + 1) - x(first)), BAND.height);
     if (place === undefined || x(last + 1) - x(first) < 18) continue;
     context.fillStyle = "#fff";
-    context.fillText(place || "R", (x(first) + x(last + 1)) / 2, BAND.top + 17);
+    context.fillText(run.titles[place].short, (x(first) + x(last + 1)) / 2, BAND.top + 17);
   }
   context.strokeStyle = style("--ink");
   for (const part of run.parts) {
@@ -78,7 +92,7 @@ function openAtlas(run, choose) {
     return Math.max(0, Math.min(run.places.length - 1, Math.floor(((event.clientX - box.left) / box.width) * run.places.length)));
   };
   for (const { text, tone, first, last, place } of run.bands) {
-    const name = place ? "other submaps" : text;
+    const name = place && !isSegment(run, place) ? "other submaps" : text;
     frames.set(name, { tone, count: last + 1 - first + (frames.get(name)?.count || 0) });
   }
   const longest = [...frames].sort((one, other) => other[1].count - one[1].count);

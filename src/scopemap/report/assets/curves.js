@@ -25,9 +25,9 @@ function sharpCanvas(canvas) {
 }
 
 function drawStrip(canvas, run) {
-  const { context, width, height } = sharpCanvas(canvas), count = Math.max(run.places.length, 1);
+  const { context, width, height } = sharpCanvas(canvas), count = Math.max(run.worlds.length, 1);
   const colours = { in: style("--in"), other: style("--other"), lost: style("--lost"), rotated: style("--rotated"), skipped: style("--line") };
-  for (const [first, last, kind] of segments(run.places)) {
+  for (const [first, last, kind] of segments(run.worlds)) {
     context.fillStyle = colours[kind];
     context.fillRect((first / count) * width, 0, Math.max(1, ((last + 1 - first) / count) * width), height);
   }
@@ -45,14 +45,14 @@ function ticks(low, high) {
 
 // The curves of a run: title, unit, and lines [name, values].
 function curvesOf(run) {
-  const { count } = run.places.length ? { count: run.places.length } : { count: 0 };
+  const { count } = run.worlds.length ? { count: run.worlds.length } : { count: 0 };
   const positions = [0, 1, 2].map(() => new Float32Array(count).fill(NaN)), rotations = positions.map((p) => p.slice());
   const firsts = new Map();
   for (let row = 0; row < count; row++) {
     const pose = run.poseOf(row);
     if (!pose) continue;
-    if (!firsts.has(run.places[row])) firsts.set(run.places[row], transposed(pose.R));
-    const turn = rotationVector(product(firsts.get(run.places[row]), pose.R));
+    if (!firsts.has(run.worlds[row])) firsts.set(run.worlds[row], transposed(pose.R));
+    const turn = rotationVector(product(firsts.get(run.worlds[row]), pose.R));
     for (let k = 0; k < 3; k++) [positions[k][row], rotations[k][row]] = [pose.t[k], turn[k]];
   }
   const axes = (values) => values.map((line, k) => ["xyz"[k], line]);
@@ -102,7 +102,7 @@ class Curve {
     box.append(holder);
     const pick = (event) => {
       const box = this.canvas.getBoundingClientRect(), share = (event.clientX - box.left - 34) / (box.width - 40);
-      choose(Math.round(Math.max(0, Math.min(1, share)) * (run.places.length - 1)));
+      choose(Math.round(Math.max(0, Math.min(1, share)) * (run.worlds.length - 1)));
     };
     this.canvas.addEventListener("pointerdown", (event) => {
       pick(event);
@@ -112,11 +112,11 @@ class Curve {
   }
 
   draw(row) {
-    const { context, width, height } = sharpCanvas(this.canvas), count = this.run.places.length;
+    const { context, width, height } = sharpCanvas(this.canvas), count = this.run.worlds.length;
     const colours = LINE_COLOURS[document.documentElement.dataset.theme === "dark" ? "dark" : "light"];
     const x = (i) => 34 + (count > 1 ? (i / (count - 1)) * (width - 40) : 0);
     context.globalAlpha = 0.2;
-    for (const [first, last, kind] of segments(this.run.places)) {
+    for (const [first, last, kind] of segments(this.run.worlds)) {
       if (kind === "in") continue;
       context.fillStyle = style(kind === "lost" ? "--lost" : kind === "rotated" ? "--rotated" : kind === "other" ? "--other" : "--soft");
       context.fillRect(x(first) - 0.5, 0, Math.max(1, x(last) - x(first) + 1), height);
@@ -151,7 +151,7 @@ class Curve {
     let drawing = false;
     for (let i = 0; i < values.length; i += every) {
       const some = Array.from(values.subarray(i, i + every)).filter(Number.isFinite);
-      if (!some.length || this.run.places[i] !== this.run.places[Math.max(i - every, 0)]) drawing = false;
+      if (!some.length || this.run.worlds[i] !== this.run.worlds[Math.max(i - every, 0)]) drawing = false;
       if (!some.length) continue;
       for (const value of every > 1 ? [Math.min(...some), Math.max(...some)] : some) {
         if (drawing) context.lineTo(x(i), y(value));

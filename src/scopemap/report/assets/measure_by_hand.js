@@ -61,7 +61,7 @@ async function finishPicks() {
     } else {
       const mm = (reference && Math.max(0, element("reference-mm").value)) || null, number = run.places[picture.row];
       const found = measured(frame, pixels, known, mm).map((one) => ({ ...one, value: Number.isFinite(one.value) ? one.value : null }));
-      const more = known ? ` --reference "${inWords(known)}"${mm ? ` --reference-mm ${mm}` : ""}` : "", folder = number ? `maps/${number}` : ".";
+      const more = known ? ` --reference "${inWords(known)}"${mm ? ` --reference-mm ${mm}` : ""}` : "", { folder } = run.titles[number];
       const command = `scopemap measure ${folder} --frame ${frame.name} --points "${inWords(pixels)}"${more}`;
       hand.list.push({ folder, frame: frame.name, points: pixels, reference: known, reference_mm: mm, found, command, world: points });
       tell(wordsOf(hand.list.at(-1)));

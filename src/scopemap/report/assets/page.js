@@ -15,8 +15,10 @@ function prepared(raw) {
     const p = poses.subarray(12 * i, 12 * i + 12);
     return Number.isFinite(p[0]) ? { R: [p[0], p[1], p[2], p[4], p[5], p[6], p[8], p[9], p[10]], t: [p[3], p[7], p[11]] } : null;
   };
+  // Segments of the result share its world; submaps have their own.
+  const worlds = places.map((place) => (place > 0 && raw.titles[place].folder === "." ? 0 : place));
   return {
-    ...raw, places, curves, poseOf, reasons: frames.reasons, indices: new Int32Array(bytesOf(frames.index)), times: floats(frames.time_s),
+    ...raw, places, worlds, curves, poseOf, reasons: frames.reasons, indices: new Int32Array(bytesOf(frames.index)), times: floats(frames.time_s),
     reasonOf: new Int16Array(bytesOf(frames.reason)), causes: frames.causes, causeOf: new Int8Array(bytesOf(frames.cause)), truth: raw.truth && { ...raw.truth, positions: floats(raw.truth.positions) },
   };
 }
@@ -105,7 +107,7 @@ async function setRow(next) {
   element("slider").setAttribute("aria-valuetext", `frame ${run.indices[row]}, ${time}, ${status}`);
   put("frame-title", `Frame ${run.indices[row]} · ${time}`);
   put("frame-status", status[0].toUpperCase() + status.slice(1));
-  element("frame-status").dataset.place = kindOf(place);
+  element("frame-status").dataset.place = kindOf(run.worlds[row]);
   curves.forEach((curve) => curve.draw(row));
   redraw();
   const near = picture && Math.abs(picture.row - row) <= run.spacing ? picture : null, decoded = near && (await panels.decode(near));
@@ -129,7 +131,7 @@ function showMap(number) {
   shown = number;
   hand.picks = [];
   turn = { yaw: -0.7, pitch: -0.4, distance: 1, shift: [0, 0, 0] };
-  put("submap", run.maps.length > 1 ? (number ? `Submap ${number}: relative pose unknown` : "The result") : "");
+  put("submap", run.maps.length > 1 ? run.titles[number].name + (number && !isSegment(run, number) ? ": relative pose unknown" : "") : "");
   document.querySelectorAll("#submap-list button").forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.map) === number)));
   writeLegend();
 }
@@ -162,20 +164,22 @@ function writeSceneScale(from, distance) {
 }
 
 function writeSubmaps() {
-  element("apart").hidden = element("submap-list").hidden = run.maps.length < 2;
+  element("submap-list").hidden = run.maps.length < 2;
+  element("apart").hidden = !run.titles.some(({ folder }) => folder !== ".");
+  element("in-time").hidden = !isSegment(run, 0);
   const buttons = run.maps.map((map, number) => {
     const button = document.createElement("button"), canvas = document.createElement("canvas"), first = run.places.indexOf(number);
     const note = document.createElement("small");
     button.type = "button";
     button.dataset.map = String(number);
     canvas.setAttribute("role", "img");
-    canvas.setAttribute("aria-label", number ? `Surface of submap ${number}` : "Surface of the result");
-    note.textContent = [`${number ? `verdict: ${run.words[number]}, ` : ""}${map.frames} frames, ${partsInWords(run, number)}`, map.inliers].filter(Boolean).join(", ");
+    canvas.setAttribute("aria-label", `Surface: ${run.titles[number].name}`);
+    note.textContent = [`${number || isSegment(run, 0) ? `verdict: ${run.titles[number].word}, ` : ""}${map.frames} frames, ${partsInWords(run, number)}`, map.inliers].filter(Boolean).join(", ");
     const pair = document.createElement("span"), seen = run.pictures.filter((picture) => run.places[picture.row] === number);
     pair.className = "pair";
     pair.append(canvas);
     if (seen.length) pair.append(Object.assign(new Image(), { src: `data:image/jpeg;base64,${seen[seen.length >> 1].jpg}`, alt: "a frame of this submap" }));
-    button.append(pair, number ? `Submap ${number} (maps/${number})` : "The result", note);
+    button.append(pair, run.titles[number].name, note);
     button.addEventListener("click", () => (showMap(number), setRow(first)));
     if (view && map.vertices) {
       const { centre, radius } = run.balls[number], R = turned(-0.7, -0.4), t = add(centre, scaled(column(R, 2), -2.2 * radius)), lens = lensOf(320, 240, 0.9);

@@ -59,8 +59,7 @@ function writeDetails(run) {
 
 function statusOf(run, row) {
   const place = run.places[row], reason = run.reasons[run.reasonOf[row]];
-  if (place === 0) return "in the result";
-  if (place > 0) return `in submap ${place} (maps/${place})`;
+  if (place >= 0) return `in ${run.titles[place].name.replace(/^./, (first) => first.toLowerCase())}`;
   if (place === OTHER_MAP) return "tracked, but in a submap too short to be saved";
   if (place === ROTATED) return `camera lost, rotation known: ${reason || "reason unknown"}`;
   return place === NOT_USED ? `not used: ${reason || "left out"}` : `camera lost: ${reason || "reason unknown"}`;

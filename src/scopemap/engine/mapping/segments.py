@@ -1,0 +1,237 @@
+"""Segments: the parts of a submap's time in which one scene explains the views, as few and as long as they allow.
+
+Where organs move no surface fits all of a video, but one fits a second or two of it. Pieces of a second are merged with
+their neighbours, the best union first, while one scene explains the union about as well as its parts. Two things tell:
+
+- tracks that were left out of an adjustment of the union: a rigid scene leaves them as small as its parts do
+- where no adjustment is rigid, the depths of the keyframes as tracked: over the union they agree as within its parts
+
+Neighbours share a keyframe, which joins them by Sim(3): the path has no steps.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.least_squares import robust_sigma_2d
+from scopemap.engine.mapping.adjusted_maps import MapKeyframes, adjust_maps
+from scopemap.engine.mapping.bundle_adjustment import RIGID_SIGMA_PX, adjust, errors_px
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, State
+from scopemap.engine.mapping.depth_correction import depth_log_ratios
+from scopemap.engine.mapping.frame_correction import FrameCorrection
+from scopemap.engine.mapping.left_out import halves, placed, successive
+from scopemap.engine.mapping.loop_closure import MOST_RECENT
+from scopemap.engine.notices import Notice
+
+PIECE = 4
+"""Steps between the keyframes of a piece, about a second: five keyframes, as many as are adjusted together as they
+come."""
+# Of the left-out errors of a union over those of its parts, where these are not those of a rigid scene.
+_MOST_GROWTH = 1.1
+# Of ln depth between keyframes as tracked up to which their surface can be used, whatever its parts do: surfaces of
+# such segments differ by 2.5 % from their frames (`scripts.real`, laparoscopies).
+_GOOD_AGREEMENT = 0.025
+# The same after an adjustment: what is left before views triangulate depth, which ends at half of it. Accepted ones of
+# laparoscopies .04 to .056, one whose surface is worse than as tracked .063.
+_MOST_AFTER = 0.055
+# Of a keyframe that are adjusted, and as many that judge: with 100 the segments of real clips are the same.
+_POINTS = 60
+# Of the adjustment that is judged: 20 change left-out errors of real intervals by 1 % at most, 8 by 4 %.
+_ITERATIONS = 12
+# Pixels, or observations, that are compared: fewer tell nothing.
+_LEAST_COMPARED = 50
+
+
+class Interval(NamedTuple):
+    """Successive keyframes, the first and the last of them, and how well one scene explains them.
+
+    error_px, tracked_px : of left-out tracks, robust standard deviation, after an adjustment of the others and as
+    tracked; of a union those that connect its parts, NaN where hardly any does. disagreement, tracked_disagreement : of
+    ln depth between keyframes, mean of the medians of pairs; NaN without any.
+    """
+
+    first: int
+    last: int
+    error_px: float
+    tracked_px: float
+    disagreement: float
+    tracked_disagreement: float
+
+    @property
+    def is_adjusted(self) -> bool:
+        """Whether left-out tracks and depth prefer the adjustment to the poses as tracked."""
+        agrees = self.disagreement <= max(_MOST_AFTER, self.tracked_disagreement)
+        return self.error_px <= self.tracked_px and agrees
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A part of a submap's time that one scene explains.
+
+    last : number of the frame of its last keyframe, with which the next segment begins; of the last segment the number
+    of its last frame. correction : of poses and depth of its frames, to the world of the submap; None: they are as
+    tracked. is_joined : False where it shares no keyframe with the segment before, so that only the motion as tracked
+    joins them. frames : numbers of its frames.
+    """
+
+    last: int
+    correction: FrameCorrection | None = None
+    is_joined: bool = True
+    frames: frozenset[int] = frozenset()
+
+
+class IntervalJudge:
+    """Says how well one scene explains successive keyframes, each pair of keyframes being compared once."""
+
+    def __init__(self, keyframes: MapKeyframes, problem: BundleProblem) -> None:
+        self._keyframes = keyframes
+        self._adjusted, self._left_out = halves(replace(problem, start=None), _POINTS)
+        self._grids_mm = keyframes.tracked_depths
+        self._compared: dict[tuple[int, int], float] = {}
+
+    def judge(self, first: int, last: int, shared: int | None = None) -> Interval:
+        """Return what is known of the keyframes from `first` to `last`; shared : where the parts of a union meet."""
+        adjusted, left_out = (successive(half, first, last + 1) for half in (self._adjusted, self._left_out))
+        found = adjust(adjusted, max_iterations=_ITERATIONS)
+        if shared is not None:
+            left_out = _connecting(left_out, shared - first)
+        error_px, tracked_px = (_error_px(left_out, state) for state in (found.state, left_out.tracked))
+        own = self._keyframes.successive(first, last + 1)
+        T, grids_mm = own.adjusted_depths(found, own.depth_fields(adjusted.points, found))
+        gaps = [gap for gap in own.settings.keyframe_gaps if gap <= MOST_RECENT]
+        pairs = [(k, k + gap) for gap in gaps for k in range(last + 1 - first - gap)]
+        pairs += [(other, one) for one, other in pairs]
+        after = [_disagreement(own.camera, T, grids_mm, *pair) for pair in pairs]
+        tracked = [self._as_tracked(first + one, first + other) for one, other in pairs]
+        return Interval(first, last, error_px, tracked_px, _mean(after), _mean(tracked))
+
+    def judge_union(self, one: Interval, other: Interval) -> Interval:
+        """Return what is known of two neighbours together."""
+        return self.judge(one.first, other.last, other.first)
+
+    def _as_tracked(self, one: int, other: int) -> float:
+        if (one, other) not in self._compared:
+            camera, T = self._keyframes.camera, self._keyframes.T_world_camera
+            self._compared[one, other] = _disagreement(camera, T, self._grids_mm, one, other)
+        return self._compared[one, other]
+
+
+def _disagreement(
+    camera: PinholeCamera, T_world_camera: np.ndarray, grids_mm: Sequence[np.ndarray], one: int, other: int
+) -> float:
+    """Return by how much ln depth of two keyframes differs where both see the same, median; NaN: nowhere."""
+    ratios = depth_log_ratios(camera, T_world_camera, grids_mm, one, other)
+    return float(np.median(np.abs(ratios))) if len(ratios) >= _LEAST_COMPARED else float("nan")
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Return the mean of those that are known; NaN without any."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def choose_segments(keyframes: MapKeyframes, problem: BundleProblem) -> list[Interval]:
+    """Return the intervals of keyframes that one scene explains, in order; neighbours share a keyframe within a map."""
+    judge, most_px = IntervalJudge(keyframes, problem), keyframes.settings.max_sigma_px
+    found = [judge.judge(*piece) for piece in _pieces(keyframes.map_of)]
+    unions = {pair: judge.judge_union(*pair) for pair in itertools.pairwise(found)}
+    while True:
+        ranks = {pair: rank for pair, union in unions.items() if (rank := _rank(union, pair, most_px)) is not None}
+        if not ranks:
+            return found
+        best = min(ranks, key=lambda pair: ranks[pair])
+        union, place = unions[best], found.index(best[0])
+        found[place : place + 2] = [union]
+        near = itertools.pairwise(found[max(place - 1, 0) : place + 2])
+        kept = {pair: unions[pair] for pair in itertools.pairwise(found) if pair in unions}
+        unions = kept | {pair: judge.judge_union(*pair) for pair in near}
+
+
+def adjust_interval(keyframes: MapKeyframes, problem: BundleProblem, interval: Interval) -> FrameCorrection:
+    """Return the correction of an interval by itself: as tracked where left-out tracks or depth prefer that.
+
+    Then nothing more is adjusted: a clip that gets nothing from it does not pay for it twice.
+    """
+    own = keyframes.successive(interval.first, interval.last + 1)
+    if not (interval.is_adjusted and interval.error_px <= keyframes.settings.max_sigma_px):
+        worse = Notice("mapping-not-rigid", {"sigma_px": interval.error_px, "merged": ""})
+        return replace(own.uncorrected(interval.error_px), refused=worse)
+    part = successive(problem, interval.first, interval.last + 1)
+    return adjust_maps(own, part, np.zeros((0, 2), int), own.poses[0].map).correction
+
+
+def _pieces(map_of: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and the last keyframe of each piece; pieces do not reach from one map (K,) into another."""
+    found = []
+    ends = [0, *(np.flatnonzero(np.diff(map_of)) + 1).tolist(), len(map_of)]
+    for begin, end in itertools.pairwise(ends):
+        # Equally long: a last piece of two keyframes would tell nothing.
+        count = max((end - 1 - begin) // PIECE, 1)
+        edges = np.linspace(begin, end - 1, count + 1).round().astype(int).tolist()
+        found += [*itertools.pairwise(edges)]
+    return found
+
+
+def _rank(union: Interval, parts: Sequence[Interval], most_px: float) -> tuple[bool, float] | None:
+    """Return the place of a union in the order of merging, the least first; None where no one scene explains it."""
+    growth = union.error_px / max(_mean([part.error_px for part in parts]), 1e-9)
+    fits = union.error_px <= RIGID_SIGMA_PX or (union.error_px <= most_px and growth <= _MOST_GROWTH)
+    if fits and union.is_adjusted:
+        return False, union.error_px
+    agreed = max(_mean([part.tracked_disagreement for part in parts]), _GOOD_AGREEMENT)
+    return (True, union.tracked_disagreement) if union.tracked_disagreement <= agreed else None
+
+
+def _connecting(problem: BundleProblem, shared: int) -> BundleProblem:
+    """Return the problem with the observations between keyframes before and after one that both parts share."""
+    seen = problem.observations
+    ends = np.column_stack([problem.points.host[seen.point], seen.keyframe])
+    chosen = (ends.min(1) < shared) & (ends.max(1) > shared)
+    return replace(problem, observations=Observations(*(part[chosen] for part in seen.columns)))
+
+
+def _error_px(left_out: BundleProblem, keyframes: State) -> float:
+    """Return the robust standard deviation of the errors of left-out points in the keyframes of a solution, px."""
+    lengths_px = errors_px(left_out, placed(left_out, keyframes))
+    lengths_px = lengths_px[np.isfinite(lengths_px)]
+    return robust_sigma_2d(lengths_px) if len(lengths_px) >= _LEAST_COMPARED else float("nan")
+
+
+def joined(
+    corrections: Sequence[FrameCorrection], intervals: Sequence[Interval], keyframes: MapKeyframes
+) -> list[Segment]:
+    """Return the segments of intervals, each joined to the one before by the keyframe that they share.
+
+    There both have the same pose, and the same median depth. Where they share none, in another map, the motion from the
+    last keyframe before as tracked joins them.
+    """
+    found: list[Segment] = []
+    for number, (correction, interval) in enumerate(zip(corrections, intervals, strict=True)):
+        is_joined = not number or intervals[number - 1].last == interval.first
+        if number:
+            before = found[-1].correction
+            assert before is not None
+            S = _link(before, correction, keyframes, intervals[number - 1].last)
+            correction = replace(correction, S_world_adjusted=S)
+        found.append(Segment(int(keyframes.index[interval.last]), correction, is_joined))
+    return found
+
+
+def _link(before: FrameCorrection, own: FrameCorrection, keyframes: MapKeyframes, k: int) -> Similarity:
+    """Return Sim(3) from the adjusted world of a correction to that of the submap, by a keyframe of the one before."""
+    number = int(keyframes.index[k])
+    T_tracked, grid_mm = keyframes.poses[k].T_world_camera, keyframes.grids_mm[k]
+    T, T_own = before.pose(number, T_tracked), own.pose(number, T_tracked)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = before.depth_factors(number, grid_mm) / own.depth_factors(number, grid_mm)
+    known = ratios[np.isfinite(ratios)]
+    scale = float(np.median(known)) if known.size else 1.0
+    R = T[:3, :3] @ T_own[:3, :3].T
+    return Similarity(scale, R, T[:3, 3] - scale * R @ T_own[:3, 3])
