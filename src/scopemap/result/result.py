@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence as Several
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,7 +89,7 @@ class Result:
         }
         return result
 
-    def with_segments(self, segments: Several[SurfaceSegment], surfaces: Several[trimesh.Trimesh]) -> Result:
+    def with_segments(self, segments: list[SurfaceSegment], surfaces: list[trimesh.Trimesh]) -> Result:
         """Return this result in memory with its segments and the surface of each."""
         self.__dict__ |= {"segments": [*segments], "_surfaces": dict(enumerate(surfaces))}
         return self

@@ -41,7 +41,7 @@ _GOOD_AGREEMENT = 0.025
 # The same after an adjustment: what is left before views triangulate depth, which ends at half of it. Accepted ones of
 # laparoscopies .04 to .056, one whose surface is worse than as tracked .063.
 _MOST_AFTER = 0.055
-# Of a keyframe that are adjusted, and as many that judge: with 100 the segments of real clips are the same.
+# By hand, for time: of a keyframe that are adjusted, and as many that judge.
 _POINTS = 60
 # Of the adjustment that is judged: 20 change left-out errors of real intervals by 1 % at most, 8 by 4 %.
 _ITERATIONS = 12
