@@ -123,16 +123,17 @@ class Reconstructor:
             yield step
 
     def surface(self) -> trimesh.Trimesh:
-        """Return the surface of the current map so far, as tracked, world mm, with colours; empty unless fused at once.
+        """Return the surface of the current map so far, as tracked, world mm, with colours; empty without a frame.
 
-        Frames are fused at once where `fusion.voxel_mm` is set, as in `realtime`; not while `steps` waits for one.
+        Voxels follow the map's first frame where `fusion.voxel_mm` is not set, and all frames in `result`. Nothing is
+        fused while `steps` waits for a frame.
         """
         return self._pipeline.fusion.surface(self._run.kept_maps.map)
 
     def so_far(self, frames: FrameTable) -> tuple[Result, TsdfVolume | None]:
         """Return frames of the current map as a result without a surface, and a copy of the volume that extracts it.
 
-        Copying takes far less time than extracting. None: nothing is fused at once, or not yet.
+        Copying takes far less time than extracting. None: nothing is fused, or not yet.
         """
         provenance = provenance_of(self._sequence, self._pipeline.estimators, {}, frames)
         volume = self._pipeline.fusion.copied(self._run.kept_maps.map)

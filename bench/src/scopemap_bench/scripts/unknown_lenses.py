@@ -2,8 +2,9 @@
 
     python -m scopemap_bench.scripts.unknown_lenses [--out FOLDER]
 
-Phantoms of 120 frames are given as plain pictures, every fourth. First table: lenses of the models that are tried.
-Second table: lenses of endoscopes as published; the median over `SEEDS` of how far fx at the picture's centre is off.
+Phantoms of 120 frames are given as plain pictures, every fourth, to whole runs, which decide the lens in the first
+frames or by the motion of all of them. First table: lenses of the models that are tried. Second table: lenses of
+endoscopes as published; the median over `SEEDS` of how far fx at the picture's centre is off.
 A lens that is the source of its kind's prior (`scopemap.input.scopes`) is marked; its kind cannot be wrong on it.
 """
 
@@ -19,12 +20,10 @@ import numpy as np
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.engine.cameras.rectification import working_size
-from scopemap.engine.config import Config
 from scopemap.input.camera_files.writing import write_calibration
-from scopemap.input.focal_length.from_motion import with_focal_from_motion
 from scopemap.input.opening import open_sequence
 from scopemap.input.scopes import KINDS
-from scopemap.input.sequence import Sequence
+from scopemap.result.result import Result
 from scopemap_bench.datasets import c3vd
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec, SceneName
@@ -138,9 +137,29 @@ def drawn(camera: CameraModel, scene: SceneName, seed: int, folder: Path, *, def
     return folder
 
 
-def off_by(sequence: Sequence, camera: CameraModel) -> float:
-    """Return the focal length at the picture's centre over the true one, less 1."""
-    return float(sequence.camera.fx * camera.width / (camera.central.fx * sequence.camera.width) - 1)
+class Found(NamedTuple):
+    """What a run makes of a lens: focal length at the picture's centre over the true one, less 1, and its source."""
+
+    off: float
+    source: str
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the run has decided it."""
+        return self.source.startswith("estimated")
+
+
+def found_lens(pictures: Path, camera: CameraModel, scope: str = "") -> Found:
+    """Return what a run of pictures through a camera makes of it; scope : kind of the endoscope, if that is stated."""
+    words = ("--scope", scope) if scope else ()
+    run = measuring.run_once(pictures, pictures.with_name(f"{pictures.name}-run{scope and '-scope'}"), *words)
+    ours, facts = Result(run).camera, measuring.provenance(run)["camera"]
+    return Found(off_by(ours, camera), facts["source"])
+
+
+def off_by(ours: PinholeCamera, camera: CameraModel) -> float:
+    """Return the focal length of a working camera over that at the picture's centre, less 1."""
+    return float(ours.fx * camera.width / (camera.central.fx * ours.width) - 1)
 
 
 def print_models(folder: Path) -> None:
@@ -149,11 +168,10 @@ def print_models(folder: Path) -> None:
     for scene, kind, fov_deg, seed, deform in MODELS:
         camera = lens_of(kind, fov_deg)
         pictures = drawn(camera, scene, seed, folder / f"lens-{seed}", deform=deform)
-        found, _ = with_focal_from_motion(open_sequence(pictures), Config())
-        off = off_by(found, camera)
-        verdict = f"{off:+.1%}" if found.camera_source.startswith("estimated") else f"unknown; assumed {off:+.0%}"
+        found = found_lens(pictures, camera)
+        verdict = f"{found.off:+.1%}" if found.is_known else f"unknown; assumed {found.off:+.0%}"
         name = f"{scene}{', breathing' if deform else ''}, {kind}, {fov_deg:g} deg"
-        measuring.print_row(name, f"{camera.central.fx / SIZE[0]:.3f}", verdict, found.camera_source.split(";")[0])
+        measuring.print_row(name, f"{camera.central.fx / SIZE[0]:.3f}", verdict, found.source.split(";")[0])
 
 
 def print_endoscopes(folder: Path) -> None:
@@ -166,13 +184,9 @@ def print_endoscopes(folder: Path) -> None:
         rows, known = [], np.zeros(2, int)
         for seed in SEEDS:
             pictures = drawn(camera, one.scene, seed, folder / f"{number}-{one.kind}-{seed}")
-            assumed = open_sequence(pictures)
-            found = [assumed]
-            for scope in ("", one.kind):
-                config = Config.load(settings={"input.scope": scope})
-                found.append(with_focal_from_motion(open_sequence(pictures, settings=config.input), config)[0])
-            rows.append([abs(off_by(each, camera)) for each in found])
-            known += [each.camera_source.startswith("estimated") for each in found[1:]]
+            found = [found_lens(pictures, camera, scope) for scope in ("", one.kind)]
+            rows.append([abs(off_by(open_sequence(pictures).camera, camera)), *(abs(each.off) for each in found)])
+            known += [each.is_known for each in found]
         table.append(rows)
         cells = [f"{value:.1%}" for value in np.median(rows, axis=0)]
         name = f"{one.name}{' (source of the prior)' if one.is_source else ''}"

@@ -46,9 +46,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "realtime": {
         "depth.method": "realtime",
         "tracking.method": "realtime",
-        "fusion.voxel_mm": 1.5,
-        "fusion.truncation_mm": 5.0,
-        "fusion.max_depth_mm": 100.0,
         "mapping.method": "realtime",
     },
 }

@@ -207,7 +207,7 @@ class FrameStore:
             self._cameras.append(frame.camera)
         entry = np.zeros(1, _ENTRY)
         entry["index"], entry["time_s"], entry["offset"] = frame.index, frame.time_s, offset
-        entry["camera"], entry["median_depth_mm"] = self._cameras.index(frame.camera), _median_depth_mm(frame)
+        entry["camera"], entry["median_depth_mm"] = self._cameras.index(frame.camera), median_depth_of(frame)
         entry["sizes"][0, : len(parts)] = [len(part) for part in parts]
         entry["quality"], entry["crc"] = frame.quality, zlib.crc32(content)
         entry["nonrigidity"] = np.nan if frame.nonrigidity is None else frame.nonrigidity
@@ -343,7 +343,7 @@ class SpreadFrames:
         return [store.frame(one) if isinstance(one, int) else one for one in self._kept]
 
 
-def _median_depth_mm(frame: Frame) -> float:
+def median_depth_of(frame: Frame) -> float:
     """Return the median of the known depth in a frame's usable pixels, mm; NaN where there is none."""
     assert frame.depth_mm is not None
     some_mm = frame.depth_mm[::4, ::4][frame.valid[::4, ::4]]

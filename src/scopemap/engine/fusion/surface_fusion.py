@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -17,7 +15,7 @@ import trimesh
 from scopemap.engine.config import FusionSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.albedo import AlbedoPainter
-from scopemap.engine.fusion.frame_store import FrameStore
+from scopemap.engine.fusion.frame_store import FrameStore, median_depth_of
 from scopemap.engine.fusion.mesh import extract_mesh
 from scopemap.engine.fusion.new_views import NewViews
 from scopemap.engine.fusion.tsdf import (
@@ -94,12 +92,15 @@ class TsdfVolume:
     """An unbounded truncated signed distance field; `ValueError` where the parameters do not set `voxel_mm`."""
 
     parameters: Kept[TsdfParameters]
+    finest_mm: Kept[float]
     _blocks: Kept[VoxelBlocks]
     _painter: Kept[AlbedoPainter | None]
 
     def __init__(self, settings: FusionSettings, parameters: TsdfParameters | None = None) -> None:
         self.settings = settings
         self.parameters = parameters or choose_parameters(settings)
+        self.finest_mm = self.parameters.voxel_mm
+        """Edge of its voxels before they became larger, mm."""
         self._blocks = VoxelBlocks()
         self._painter = AlbedoPainter() if settings.colours == "albedo" else None
 
@@ -209,6 +210,8 @@ class FusedSurface:
 class SurfaceFusion:
     """Fuses tracked frames: after the last one where they are corrected then or voxels follow the scene, else at once.
 
+    Voxels of what is fused at once, and not set, follow the first frame of a map.
+
     corrected : whether frames are corrected after the last one.
     """
 
@@ -221,20 +224,19 @@ class SurfaceFusion:
         self.at_end = corrected or (settings.enabled and settings.voxel_mm is None)
         """Whether frames are stored, and fused after the last one."""
         self.shown = False
-        """Whether the surface so far is looked at: frames whose voxels have a size are then fused at once, too, and
-        anew once they are corrected."""
+        """Whether the surface so far is looked at: frames are then fused at once, too, and anew after the last one."""
         self.most_blocks: int | None = None
         """Blocks in all volumes beyond which nothing more is fused at once, and voxels of stored frames become larger;
         None: no limit."""
         self.coarser_beyond: int | None = None
         """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
-        self._volumes = defaultdict(partial(TsdfVolume, settings))
+        self._volumes = {}
         self._views = NewViews(settings.every)
 
     @property
     def at_once(self) -> bool:
         """Whether frames are fused as they come."""
-        return self.settings.enabled and self.settings.voxel_mm is not None and (self.shown or not self.at_end)
+        return self.settings.enabled and (self.shown or not self.at_end)
 
     @property
     def is_full(self) -> bool:
@@ -259,11 +261,15 @@ class SurfaceFusion:
         """Store a frame, and fuse it in its map's volume if it has a pose and `NewViews` chooses it; or one of both."""
         if self.at_end:
             self.store.put(frame)
-        if self.at_once and frame.T_world_camera is not None:
-            volume = self._volumes[map_number]
-            if not self.is_full and (chosen := self._views.chosen(frame, map_number)) is not None:
-                volume.integrate(chosen)
-                _coarsen(list(self._volumes.values()), self.coarser_beyond)
+        if not self.at_once or frame.T_world_camera is None or self.is_full:
+            return
+        if (chosen := self._views.chosen(frame, map_number)) is not None:
+            if map_number not in self._volumes:
+                # Where voxels are set the largest depth follows them alone: the scene is not known yet.
+                median_mm = None if self.settings.voxel_mm else median_depth_of(chosen)
+                self._volumes[map_number] = TsdfVolume(self.settings, choose_parameters(self.settings, median_mm))
+            self._volumes[map_number].integrate(chosen)
+            _coarsen(list(self._volumes.values()), self.coarser_beyond)
 
     def stay_at_once(self) -> None:
         """Drop the stored frames: the surface stays what is fused at once."""
@@ -289,8 +295,8 @@ class SurfaceFusion:
         if volume is None:
             return FusedSurface(trimesh.Trimesh(), settings, [])
         notices = [] if settings.voxel_mm is not None else [volume.parameters.notice]
-        if volume.parameters.voxel_mm > (finest := choose_parameters(settings, median_mm)).voxel_mm:
-            sizes = {"voxel_mm": volume.parameters.voxel_mm, "finest_mm": finest.voxel_mm}
+        if volume.parameters.voxel_mm > volume.finest_mm:
+            sizes = {"voxel_mm": volume.parameters.voxel_mm, "finest_mm": volume.finest_mm}
             notices = [Notice("fusion-coarsened", sizes)]
         if settings.voxel_mm is not None and volume.parameters.max_depth_mm > choose_parameters(settings).max_depth_mm:
             depths = {"max_depth_mm": volume.parameters.max_depth_mm, "median_mm": median_mm}
