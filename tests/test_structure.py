@@ -262,9 +262,9 @@ def import_closure(start: str) -> set[str]:
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.engine.pipeline")
     assert "scopemap.engine.mapping.backend" in closure
-    # With notices, causes of losses, local adjustment, its lens, other starts, moving tissue, the skin of its states,
-    # the judging of an adjustment, segments, the parts of all stages, which frames can be tracked and are fused, what
-    # stages keep, and how kernels are compiled.
+    # With notices, causes of losses, local adjustment, its lens, other starts, where tissue moves, the judging of an
+    # adjustment, segments, the parts of all stages, which frames can be tracked and are fused, what stages keep, and
+    # how kernels are compiled.
     assert len(closure) <= 82, "\n".join(sorted(closure))
 
 
