@@ -186,6 +186,7 @@ def _result() -> Result:
         "main_segment": main_segment(segments),
         "surface": facts[1]["surface"],
         "notices": [],
+        "camera": {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
     }
     meshes = [_square(z_mm) for z_mm in (10.0, 20.0, 30.0)]
     result = Result.in_memory(CAMERA, FrameTable.of(rows), meshes[1], Config(), provenance)
