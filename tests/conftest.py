@@ -32,7 +32,7 @@ NEEDS = {
 }
 # Others of which some tests skip without the networks.
 PARTLY_NETWORKS = {"test_alike", "test_depth_benchmark", "test_weights"}
-BROWSER = {"test_browser_result_chromium", "test_browser_start", "test_report_browser", "test_tissue_states"}
+BROWSER = {"test_browser_result_chromium", "test_browser_start", "test_report_browser"}
 CLUSTER = {"test_engines", "test_addresses"}
 # Runs of whole clips, or of many processes: a module takes more than three seconds on an idle core. In other modules
 # single tests are marked `slow`, for the same reason.
@@ -62,7 +62,6 @@ SLOW = {
     "test_depth_preview",
     "test_documented_commands",
     "test_documented_runs",
-    "test_evaluation_deformation",
     "test_faulty_frames",
     "test_file_names",
     "test_films",

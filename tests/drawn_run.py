@@ -17,7 +17,6 @@ from scopemap.engine.config import Config
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import se3, so3_exp
-from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.engine.notices import of_input
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import write_tum
@@ -104,17 +103,7 @@ def placed_frames(place: list[int], **columns: list[Any]) -> FrameTable:
     return FrameTable.of(rows)
 
 
-def wavering() -> TissueStates:
-    """Tissue whose near half is pulled aside, by more from frame to frame."""
-    nodes = tube().vertices[:: len(tube().vertices) // 40]
-    modes = np.where(nodes[:, 2:] < np.median(nodes[:, 2]), [[0.2, 0.1, 0.0]], 0.0)[None]
-    index = np.arange(FRAMES)
-    return TissueStates(nodes, modes, index, index / 25, index[:, None].astype(float), np.array([3.0]))
-
-
-def draw_run(
-    folder: Path, *, pictures: bool = True, name: str = "video.mp4", states: TissueStates | None = None, **facts: Any
-) -> Path:
+def draw_run(folder: Path, *, pictures: bool = True, name: str = "video.mp4", **facts: Any) -> Path:
     """Write the run's folder with its frames' pictures; `facts` replace those of its provenance."""
     mesh, kept, write = tube(), FramePictures(), DepthWriter(folder)
     for index in range(FRAMES):
@@ -126,7 +115,7 @@ def draw_run(
         kept(Shown(frame))
     if pictures:
         kept.save(folder)
-    changed(drawn_result(name, **facts), states=states).save(folder)
+    drawn_result(name, **facts).save(folder)
     return folder
 
 

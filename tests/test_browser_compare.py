@@ -66,7 +66,7 @@ def moved(
         if run.frames.tracked[number] and number >= first:
             row |= {"map": 0, "status": "ok", "reason": "", "T_world_camera": poses[number]}
         rows.append(row)
-    changed(run, mesh=surface, frames=FrameTable.of(rows), others=[], states=None).save(folder)
+    changed(run, mesh=surface, frames=FrameTable.of(rows), others=[]).save(folder)
     return folder
 
 

@@ -25,7 +25,7 @@ KNOWN = {"known": True, "source": "a ruler", "measured": True}
 def picked(surface: ShownSurface, *pixels: tuple[float, float], frame: int = 4) -> list[SurfacePick]:
     """The places on the surface at pixels of a frame."""
     pose = pose_of(frame)
-    found = [surface.pick(pose[:3, 3], pose[:3, :3] @ CAMERA.unproject(np.array(pixel)), frame) for pixel in pixels]
+    found = [surface.pick(pose[:3, 3], pose[:3, :3] @ CAMERA.unproject(np.array(pixel))) for pixel in pixels]
     return [one for one in found if one is not None]
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import CAMERA, IN_RESULT, draw_run, pose_of, tube, wavering
+from drawn_run import CAMERA, IN_RESULT, draw_run, pose_of, tube
 
 from scopemap.apps.browser.seen_by import frames_that_saw
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
@@ -34,7 +34,7 @@ def tone_mapped(linear: np.ndarray) -> np.ndarray:
 def looked_at(surface: ShownSurface, pixel: tuple[float, float], frame: int = FRAME) -> SurfacePick:
     """The place on the surface at a pixel of a frame."""
     pose = pose_of(frame)
-    found = surface.pick(pose[:3, 3], pose[:3, :3] @ CAMERA.unproject(np.array(pixel)), frame)
+    found = surface.pick(pose[:3, 3], pose[:3, :3] @ CAMERA.unproject(np.array(pixel)))
     assert found is not None
     return found
 
@@ -141,19 +141,3 @@ def test_a_frame_with_something_in_front_did_not_see_it(tmp_path: Path) -> None:
     # Without depth the surface itself decides.
     file.unlink()
     assert FRAME in [sight.frame for sight in frames_that_saw(surface, [pick])]
-
-
-def test_moving_tissue_is_met_in_the_state_of_the_frame(tmp_path: Path) -> None:
-    surface = ShownSurface(Result(draw_run(tmp_path, states=wavering())))
-    assert surface.moves
-    pick = looked_at(surface, (70.0, 40.0), 10)
-    pixel = CAMERA.project(transform(inverse(pose_of(10)), surface.position(pick, 10)))
-    np.testing.assert_allclose(pixel, (70.0, 40.0), atol=1e-6)
-    moved = surface.position(pick, 10) - surface.position(pick)
-    np.testing.assert_allclose(
-        moved,
-        surface.run.mesh_at(10).vertices[surface.faces[pick.face]].T @ pick.weights
-        - surface.run.mesh.vertices[surface.faces[pick.face]].T @ pick.weights,
-        atol=1e-4,
-    )
-    assert np.linalg.norm(moved) > 0.5

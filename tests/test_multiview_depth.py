@@ -16,7 +16,6 @@ from scopemap.engine.mapping.multiview_depth import (
     normalised_contrast,
     triangulate_depth,
 )
-from scopemap.engine.mapping.tissue_states import TissueStates
 
 CAMERA = PinholeCamera(fx=110.0, fy=110.0, cx=79.5, cy=63.5, width=160, height=128)
 WALL_MM = 60.0
@@ -136,21 +135,3 @@ def test_frames_and_keyframes_that_fail_take_the_depth_of_the_keyframes_around_t
     assert all(one is not None for one in found)
     assert _error(found[MIDDLE].depth_mm) < 0.03
     assert np.median(np.abs(found[3].log_factor + _bias())[16:-16, 24:-24]) < 0.04
-
-
-def test_frames_that_see_tissue_moved_along_the_epipolar_line_count_less() -> None:
-    def read(number: int) -> tuple[np.ndarray, np.ndarray]:
-        rgb, depth_mm = _seen(_pose(number), 1.5 * (number > MIDDLE))
-        return rgb, (depth_mm * np.exp(_bias())).astype(np.float32)
-
-    nodes = np.column_stack([np.random.default_rng(0).uniform(-40, 40, (30, 2)), np.full(30, WALL_MM)])
-    curve, motion = (np.arange(FRAMES) > MIDDLE).astype(float)[:, None], np.tile([1.5, 0, 0], (1, 30, 1))
-    states = TissueStates(nodes, motion, np.arange(FRAMES), np.arange(FRAMES) / 30, curve, np.zeros(1))
-    errors, poses = [], {number: _pose(number) for number in range(FRAMES)}
-    for known in (None, states):
-        depths = KeyframeDepths(read, poses, [MIDDLE], CAMERA, DisFlow(), known)
-        found = depths.depth(MIDDLE, read(MIDDLE)[1])
-        depths.close()
-        errors.append(np.inf if found is None else _error(found.depth_mm))
-    assert errors[0] > 0.06
-    assert errors[1] < 0.03

@@ -15,12 +15,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of, wavering
+from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of
 from front_door import call
 
 from scopemap.apps.measure.measure import measure
 from scopemap.engine.errors import InputError
-from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.report.page import keep_measurements, write_comparison, write_report
 from scopemap.result.result import Result
 
@@ -280,9 +279,8 @@ def click(opened: Opened, selector: str, *shares: tuple[float, float]) -> None:
         opened.page.wait_for_timeout(100)
 
 
-@pytest.mark.parametrize("states", [None, wavering()], ids=["at rest", "moving"])
-def test_measuring_by_hand_agrees_with_the_command(browser: Any, tmp_path: Path, states: TissueStates | None) -> None:
-    folder = draw_run(tmp_path, scale={"known": True, "measured": True, "source": "measured depth"}, states=states)
+def test_measuring_by_hand_agrees_with_the_command(browser: Any, tmp_path: Path) -> None:
+    folder = draw_run(tmp_path, scale={"known": True, "measured": True, "source": "measured depth"})
     opened = Opened(browser, write_report(folder)[0])
     opened.slide(6)
     assert opened.text("#scene-scale") == "10 mm at the middle of the surface"

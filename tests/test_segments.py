@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from scopemap.apps.export.formats import export_run
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import Config, MappingSettings
 from scopemap.engine.errors import InputError
+from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, se3, so3_exp, transform
 from scopemap.engine.mapping.adjusted_maps import MapKeyframes
@@ -184,6 +186,7 @@ def _result() -> Result:
         "main_segment": main_segment(segments),
         "surface": facts[1]["surface"],
         "notices": [],
+        "camera": {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
     }
     meshes = [_square(z_mm) for z_mm in (10.0, 20.0, 30.0)]
     result = Result.in_memory(CAMERA, FrameTable.of(rows), meshes[1], Config(), provenance)
@@ -240,6 +243,19 @@ def test_the_surfaces_are_shown_one_after_the_other(tmp_path: Path) -> None:
     np.testing.assert_array_equal(shown, np.eye(3))
     scene = trimesh.load(tmp_path / "mesh_over_time.glb")
     assert len(scene.geometry) == 3
+
+
+def test_the_surface_that_fits_each_frame_is_exported(tmp_path: Path) -> None:
+    (result := _result()).save(run := tmp_path / "run")
+    export_run(run, "surfaces", tmp_path / "out", unit="m", axes="ras")
+    assert len(list((tmp_path / "out").iterdir())) == 80
+    for index, z_mm in ((5, 10.0), (40, 20.0), (70, 30.0)):
+        vertices = np.asarray(read_mesh(tmp_path / "out" / f"{index:06d}.ply").vertices)
+        np.testing.assert_allclose(vertices, result.mesh_at(index).vertices * [-0.001, -0.001, 0.001], atol=1e-6)
+        np.testing.assert_allclose(vertices[:, 2], 0.001 * z_mm, atol=1e-6)
+    result.with_segments([], []).save(tmp_path / "rigid")
+    with pytest.raises(InputError, match="one surface fits all frames"):
+        export_run(tmp_path / "rigid", "surfaces", tmp_path / "none")
 
 
 def test_a_damaged_table_of_segments_is_refused(tmp_path: Path) -> None:

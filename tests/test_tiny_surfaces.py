@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import changed, draw_run, drawn_result, wavering
+from drawn_run import changed, draw_run, drawn_result
 from front_door import call
 
 from scopemap import Result
 from scopemap.apps.export.formats import FORMATS
 from scopemap.engine.fusion.finish import finished, with_normals_alone
-from scopemap.engine.mapping.tissue_states import TissueStates
 
 
 def _surface(vertices: int, faces: int) -> trimesh.Trimesh:
@@ -53,12 +52,11 @@ COMMANDS = {
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A run by the name of its surface; in that of a triangle tissue moves."""
+    """A run by the name of its surface."""
     folder, found = tmp_path_factory.mktemp("runs"), {}
     for name, surface in SURFACES.items():
         found[name] = draw_run(folder / name.replace(" ", "-"))
-        states = wavering() if name == "a triangle" else None
-        changed(drawn_result(), mesh=surface(), states=states).save(found[name])
+        changed(drawn_result(), mesh=surface()).save(found[name])
     return found
 
 
@@ -77,13 +75,10 @@ def test_each_command_ends_well(
 
 
 @pytest.mark.parametrize("surface", SURFACES)
-@pytest.mark.parametrize("states", [None, wavering()])
-def test_what_fusion_leaves_is_finished_saved_and_read(
-    surface: str, states: TissueStates | None, tmp_path: Path
-) -> None:
+def test_what_fusion_leaves_is_finished_saved_and_read(surface: str, tmp_path: Path) -> None:
     result = drawn_result()
     mesh = with_normals_alone(finished(SURFACES[surface](), result.config.fusion))
-    changed(result, mesh=mesh, states=states).save(tmp_path)
+    changed(result, mesh=mesh).save(tmp_path)
     read = Result(tmp_path)
     assert len(read.mesh.faces) == len(mesh.faces) == (surface == "a triangle")
     assert len(read.mesh_at(3).faces) == len(mesh.faces)

@@ -2,7 +2,7 @@
 
     carve       find what other frames look through: it is no tissue
     frames      correct poses and depth -> triangulate the depth of keyframes, which the others take over -> carve
-    as_fused    move what was seen of moving tissue into one state
+    as_fused    choose the frames that show tissue anew
     fuse        TSDF -> mesh
     finish      close holes, smooth, simplify
     check       render the mesh at the poses of some frames, and compare
@@ -27,13 +27,10 @@ from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.fusion.free_space import FreeSpace, views_among
 from scopemap.engine.fusion.moving_tissue import MovingTissue, block_edge_mm
 from scopemap.engine.fusion.new_views import NewViews
-from scopemap.engine.fusion.reference_state import SurfaceState
 from scopemap.engine.fusion.surface_fusion import FusedSurface, depth_notices
-from scopemap.engine.mapping.frame_correction import FrameCorrection
 from scopemap.engine.mapping.multiview_depth import KeyframeDepths
 from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.mapping.submaps import FinalFrames, Submap
-from scopemap.engine.mapping.tissue_states import TissueStates
 from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
 
@@ -68,14 +65,12 @@ class SegmentSurface:
 
     mesh : world mm, may be empty; its vertices have `confidence`, the share `moving` of frames in which they move, and
     the standard deviation `sigma_mm`. settings : with the TSDF parameters that were used. agreement : figures of
-    `surface_agreement`. states : of tissue that moves, and in which `mesh` is; None: it is at rest. is_confirmed :
-    whether depth was measured or keyframes were adjusted.
+    `surface_agreement`. is_confirmed : whether depth was measured or keyframes were adjusted.
     """
 
     mesh: trimesh.Trimesh
     settings: FusionSettings
     agreement: dict[str, float]
-    states: TissueStates | None
     is_confirmed: bool
     notices: list[Notice]
 
@@ -106,8 +101,6 @@ class SegmentFinishing:
         # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
         main = submap.main_frames if at_end else ()
         self._median_mm = self._fusion.store.median_depth_mm(main, submap.depth_factor)
-        self._states = _tissue_states(segment.correction, own)
-        self._state = None if self._states is None else SurfaceState(self._states)
         self._moving = MovingTissue(block_edge_mm(self._median_mm))
         self._free_space = FreeSpace([])
         self._depths = self._triangulation(camera) if keeps_depth or self._fusion.settings.enabled else None
@@ -124,7 +117,7 @@ class SegmentFinishing:
         return self._final.frames(triangulated, self._free_space.without)
 
     def as_fused(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Yield final frames that are fused, as they are; note where tissue moves in all, and some for `check`."""
+        """Yield final frames that are fused; note where tissue moves in all, and some for `check`."""
         views = NewViews(self._fusion.settings.every)
         for frame in frames:
             if frame.nonrigidity is not None and frame.T_world_camera is not None:
@@ -132,7 +125,7 @@ class SegmentFinishing:
                 self._moving.put(usable_mm, frame.nonrigidity, frame.camera, frame.T_world_camera)
             self._checked.put(frame)
             if (chosen := views.chosen(frame)) is not None:
-                yield chosen if self._state is None else self._state.fused(chosen)
+                yield chosen
 
     def fuse(self, frames: Iterable[Frame]) -> FusedSurface:
         """Return the surface of the frames that `as_fused` yields, or of those that were fused at once."""
@@ -152,13 +145,13 @@ class SegmentFinishing:
     def check(self, fused: FusedSurface) -> SegmentSurface:
         """Return the finished surface with its agreement with some frames, and what there is to say about it."""
         mesh = fused.mesh
-        views = surface_views(mesh, self._checked.frames(self._fusion.store), self._states)
+        views = surface_views(mesh, self._checked.frames(self._fusion.store))
         agreement = surface_agreement(views, fused.settings)
         mesh.vertex_attributes["sigma_mm"] = vertex_sigmas(len(mesh.vertices), views)
         adjusted = self._adjustment_notices()
         confirmed = bool(adjusted) or self._pipeline.estimators.anchor.is_measured
         notices = adjusted + self._fusion_notices(fused)
-        return SegmentSurface(with_normals_alone(mesh), fused.settings, agreement, self._states, confirmed, notices)
+        return SegmentSurface(with_normals_alone(mesh), fused.settings, agreement, confirmed, notices)
 
     def _triangulation(self, camera: PinholeCamera) -> KeyframeDepths | None:
         """Return what triangulates the depth of keyframes; None where nothing can."""
@@ -166,7 +159,7 @@ class SegmentFinishing:
         wanted = self._pipeline.config.mapping.triangulate_depth
         if not (wanted and final.keyframes) or flow.name == "none":
             return None
-        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow, self._states)
+        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow)
 
     def _adjustment_notices(self) -> list[Notice]:
         """Return what was adjusted: at the end, or as keyframes came."""
@@ -175,8 +168,8 @@ class SegmentFinishing:
 
     def _fusion_notices(self, fused: FusedSurface) -> list[Notice]:
         """Return what depth and surface rest on, and what is not in the surface."""
-        parts = (self._state, self._depths)
-        found = [part.notice for part in parts if part is not None] + fused.notices
+        found = [] if self._depths is None else [self._depths.notice]
+        found += fused.notices
         if self._free_space.notice is not None:
             found.append(self._free_space.notice)
         if (masks := self._pipeline.estimators.masks) is not None:
@@ -184,13 +177,3 @@ class SegmentFinishing:
         known_mm = self._run.median_depth_mm[np.isfinite(self._run.median_depth_mm)]
         medians_mm = known_mm.tolist() if self._median_mm is None else [self._median_mm]
         return found + depth_notices(medians_mm, fused.settings)
-
-
-def _tissue_states(correction: FrameCorrection | None, own: TrackedFrames) -> TissueStates | None:
-    """Return the states of a segment's tissue at its frames, the surface in the most usual one; None: at rest."""
-    if correction is None or correction.tissue is None:
-        return None
-    motion = correction.tissue.deformation
-    curves = np.column_stack([np.interp(own.index, correction.index, curve) for curve in motion.basis.T])
-    states = TissueStates(motion.nodes, motion.modes, own.index, own.time_s, curves, curves[0])
-    return states.in_usual_state()

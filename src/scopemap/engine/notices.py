@@ -32,7 +32,6 @@ class _Kind:
 
 _HOLDS_STILL = "Use the segments in which it holds still, or a part with --frames A:B."
 _MORE_MOTION = "Do not trust the relief; try a part with sideways motion (--frames A:B)."
-_OTHER_STATES = "See mesh_over_time.glb for the other states."
 
 KINDS: dict[str, _Kind] = {
     # What readers of files found: free text, by which nothing is decided.
@@ -179,12 +178,6 @@ KINDS: dict[str, _Kind] = {
         _MORE_MOTION,
         unsaid=("error_px", "other_px", "merged"),
     ),
-    "mapping-tissue-moves": _Kind(
-        "doubtful",
-        "Tissue moved by up to {moved:.0%} of the median depth{periodic}; the surface shows one state of it.",
-        _OTHER_STATES,
-        unsaid=("keyframes", "nodes", "px", "rigid_px"),
-    ),
     "mapping-worse": _Kind(
         "doubtful",
         "Bundle adjustment was rejected: tracks left out of it fit worse ({error_px:.2f} px) than as tracked "
@@ -219,9 +212,6 @@ KINDS: dict[str, _Kind] = {
         "{share:.1%} of the pixels in {frames:frame} were not fused: others look through there, or an instrument "
         "is near.",
         in_verdict=False,
-    ),
-    "fusion-in-one-state": _Kind(
-        "info", "The surface shows moving tissue in its state at second {second:.2f}.", _OTHER_STATES
     ),
     "fusion-too-far": _Kind(
         "doubtful",

@@ -37,8 +37,7 @@ def measured_mesh(run: Result, frame: int) -> trimesh.Trimesh:
     is_main = segment == run.main_segment and not run.is_submap
     mesh = simplified(run.surface(segment), MOST_FACES if is_main else FACES_OF_OTHERS)
     low, spread, levels = levels_of(mesh)
-    shown = trimesh.Trimesh(low + levels / LARGEST_LEVEL * spread, mesh.faces, process=False)
-    return shown if run.states is None else run.states.moved(shown, frame)
+    return trimesh.Trimesh(low + levels / LARGEST_LEVEL * spread, mesh.faces, process=False)
 
 
 def measured_depth(run: Result, frame: int) -> np.ndarray | None:

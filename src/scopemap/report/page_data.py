@@ -260,15 +260,13 @@ def _maps(
     inliers = {one.number: one.inliers + ", most doubtful" * (one is worst) for one in submaps}
     place, indices = shown_place(run, maps), run.frames["index"].tolist()
     for number, (one, mesh) in enumerate(zip(maps, meshes, strict=False)):
-        pose_of, states = _pose_of(one.result), one.result.states
+        pose_of = _pose_of(one.result)
         looking = [p for p in pictures if place[p.row] == number and p.depth_mm is not None]
         looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
         seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
-        data = mesh_data(mesh, seen, run.camera, states) | {"errors": measure_errors(one.result)}
-        if states is not None and len(mesh.vertices):
-            data["changes"] = [states.change(index).tolist() for index in indices]
+        data = mesh_data(mesh, seen, run.camera) | {"errors": measure_errors(one.result)}
         if len(mesh.faces) > (most := MOST_FACES if number == 0 else FACES_OF_OTHERS):
-            data["measured"] = shape_data(simplified(mesh, most), states)
+            data["measured"] = shape_data(simplified(mesh, most))
         facts = {"frames": int((place == number).sum()), "all_faces": len(one.mesh.faces)}
         found.append(data | facts | {"turn": turn.get(number, number), "inliers": inliers.get(number, "")})
     return found

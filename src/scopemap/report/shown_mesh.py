@@ -12,7 +12,6 @@ import trimesh
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.se3 import inverse
-from scopemap.engine.mapping.tissue_states import TissueStates
 
 _SAME_SURFACE = 0.1
 _CELLS_PER_FACE = 2.5  # faces of a surface that crosses a grid, times a cell's area, over its area
@@ -86,9 +85,7 @@ def times_seen(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCa
     return count
 
 
-def mesh_data(
-    mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCamera, states: TissueStates | None = None
-) -> dict[str, Any]:
+def mesh_data(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCamera) -> dict[str, Any]:
     """Return a mesh for the page: base64 arrays; `seen` is how often each vertex was seen, 255 = in all frames.
 
     positions: uint16 between `low` and `high`, mm. normals: int8. colours, confidence, moving, seen: uint8.
@@ -101,7 +98,7 @@ def mesh_data(
     seen = times_seen(mesh, frames, camera)
     return {
         "vertices": len(mesh.vertices),
-        **shape_data(mesh, states),
+        **shape_data(mesh),
         "normals": base64_of(np.round(127 * np.asarray(mesh.vertex_normals)), "i1"),
         "colours": base64_of(vertex_colours(mesh)[:, :3], "u1"),
         "confidence": base64_of(np.round(255 * np.clip(confidence.ravel(), 0, 1)), "u1"),
@@ -111,12 +108,10 @@ def mesh_data(
     }
 
 
-def shape_data(mesh: trimesh.Trimesh, states: TissueStates | None = None) -> dict[str, Any]:
-    """Return the part of `mesh_data` that is measured on: positions and faces; motion, float32, where tissue moves."""
+def shape_data(mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """Return the part of `mesh_data` that is measured on: positions and faces."""
     low, spread, levels = levels_of(mesh)
     shape: dict[str, Any] = {"low": low.tolist(), "spread": spread.tolist(), "high": (low + spread).tolist()}
-    if states is not None and len(mesh.vertices):
-        shape["motion"] = base64_of(states.motion(low + levels / LARGEST_LEVEL * spread), "f4")
     return shape | {"positions": base64_of(levels, "u2"), "faces": base64_of(mesh.faces, "u4")}
 
 

@@ -2,7 +2,7 @@
 
 out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frames.csv  config.toml  provenance.json
       depth/000000.png (16 bit, depth/depth.json has the scale)  depth_sigma/000000.png (8 bit, relative)
-      depth_preview/000000.jpg (colours)  tissue_motion.npz mesh_over_time.glb (where tissue moves)
+      depth_preview/000000.jpg (colours)  mesh_over_time.glb (of several segments)
       maps/1 (the same for submaps that are not merged), ...
 """
 
@@ -21,8 +21,7 @@ from numpy.typing import ArrayLike
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError, reporting
-from scopemap.engine.fusion.mesh_files import read_mesh, save_mesh, save_mesh_over_time
-from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.engine.fusion.mesh_files import read_mesh, save_mesh
 from scopemap.engine.notices import scale_words
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import Trajectory, write_tum
@@ -70,7 +69,6 @@ class Result:
         provenance: dict[str, Any] | None = None,
         *,
         source_camera: CameraModel | None = None,
-        states: TissueStates | None = None,
     ) -> Result:
         """Return a result that is in no folder yet, without other submaps; the parameters are its attributes."""
         result = cls.__new__(cls)
@@ -84,7 +82,6 @@ class Result:
             "provenance": {} if provenance is None else provenance,
             "source_camera": source_camera,
             "others": [],
-            "states": states,
             "segments": [],
         }
         return result
@@ -188,11 +185,6 @@ class Result:
         return read_mesh(self.folder / "mesh.ply")
 
     @cached_property
-    def states(self) -> TissueStates | None:
-        """The states of tissue that moves, of which `mesh` shows one; None where it is taken to be at rest."""
-        return TissueStates.read(self.folder)
-
-    @cached_property
     def segments(self) -> list[SurfaceSegment]:
         """The parts of its time that have a surface of their own, in order; [] in results of earlier versions."""
         return read_segments(self.folder)
@@ -217,9 +209,8 @@ class Result:
         return surfaces[segment]
 
     def mesh_at(self, index: int) -> trimesh.Trimesh:
-        """Return the surface that fits the frame with this number: that of its segment, in its state of the tissue."""
-        mesh = self.surface(self.segment_at(index))
-        return mesh if self.states is None else self.states.moved(mesh, index)
+        """Return the surface that fits the frame with this number: that of its segment."""
+        return self.surface(self.segment_at(index))
 
     @cached_property
     def camera(self) -> PinholeCamera:
@@ -373,9 +364,6 @@ class Result:
             save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb", comment=scale)
             surfaces = [self.surface(one.segment) for one in self.segments]
             save_segments(self.segments, surfaces, folder, comment=scale)
-            if self.states is not None:
-                self.states.save(folder)
-                save_mesh_over_time(self.mesh, self.states, folder / "mesh_over_time.glb", comment=scale)
             sigma_px = self.provenance.get("camera", {}).get("focal_sigma_px")
             write_calibration(self.camera, folder / "camera.yaml", focal_sigma_px=sigma_px)
             if (source := self.source_camera) is not None:

@@ -38,8 +38,7 @@ _REPLACED = "replaced"
 _MOVING = "moving"
 _OWN_FILES = (
     "trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv", "config.toml",
-    "provenance.json", "report.html", "summary.png", "SHA256SUMS", "measurements.json", "tissue_motion.npz",
-    "mesh_over_time.glb",
+    "provenance.json", "report.html", "summary.png", "SHA256SUMS", "measurements.json", "mesh_over_time.glb",
 )  # fmt: skip
 _OWN_FOLDERS = ("depth", "depth_sigma", "depth_preview", "frames", "pictures", "maps", "against_video", "surfaces")
 # Files by which a run's folder is recognised.

@@ -277,7 +277,6 @@ class _Finishing:
             config.model_copy(update={"fusion": surface.settings}),
             provenance,
             source_camera=sequence.rectifier.source,
-            states=surface.states,
         ).with_segments(segments, [one.mesh for one in surfaces])
 
     def _surface(self, submap: Submap, segment: Segment, count: int) -> SegmentSurface:

@@ -16,7 +16,6 @@ from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reread_frames import open_truth
-from scopemap_bench.evaluation.deformation import estimated_displacement
 
 THRESHOLDS_PX = (4, 8, 16, 32, 64)
 
@@ -32,7 +31,7 @@ def accuracy(found_px: np.ndarray, true_px: np.ndarray) -> dict[str, float]:
 
 
 def followed(run: Path, clip: Path, start_px: np.ndarray) -> np.ndarray:
-    """Return where points (N, 2) px of the first frame are in the last, by a run's depth, poses and motion of tissue.
+    """Return where points (N, 2) px of the first frame are in the last, by a run's depth and poses.
 
     NaN where a frame is lost, or the depth is not known.
     """
@@ -45,7 +44,4 @@ def followed(run: Path, clip: Path, start_px: np.ndarray) -> np.ndarray:
         inside = (row >= 0) & (row < depth_mm.shape[0]) & (column >= 0) & (column < depth_mm.shape[1])
         points[inside] = depth_mm[row[inside], column[inside], None] * rays[inside]
     points = transform(path.T_world_camera[0], points)
-    known = np.isfinite(points).all(1)
-    moved = estimated_displacement(run, points[known], path.times_s[[0, -1]])
-    points[known] += moved[1] - moved[0]
     return sequence.rectifier.source.project(transform(inverse(path.T_world_camera[-1]), points))

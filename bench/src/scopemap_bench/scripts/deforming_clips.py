@@ -12,7 +12,7 @@ from pathlib import Path
 
 from scopemap.input.opening import open_source
 from scopemap_bench.datasets.stir import StirClip
-from scopemap_bench.evaluation.deformation import structured_light_errors
+from scopemap_bench.evaluation.structured_light import structured_light_errors
 from scopemap_bench.evaluation.tattoos import THRESHOLDS_PX, accuracy, followed
 from scopemap_bench.scripts import measuring
 
@@ -20,7 +20,7 @@ _SHARES = [f"within_{limit}_px" for limit in THRESHOLDS_PX]
 
 
 def print_points(run: Path, clip: StirClip) -> None:
-    """Print the figures of a clip of STIR, if nothing moves / as the result has it."""
+    """Print the figures of a clip of STIR, if nothing moves / by the result's depth and poses."""
     start, end = clip.tattoos()
     both = [accuracy(points, end) for points in (start, followed(run, clip.path, start))]
     names = ("accuracy", *_SHARES, "median_px")

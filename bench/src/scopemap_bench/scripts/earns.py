@@ -18,7 +18,7 @@ from pathlib import Path
 
 from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
-from scopemap_bench.scripts import clinical_phantoms, measuring, moving_tissue
+from scopemap_bench.scripts import clinical_phantoms, measuring
 from scopemap_bench.scripts.real import RealClip, clips, depth_figures
 
 SWITCHES = (
@@ -27,7 +27,6 @@ SWITCHES = (
     "mapping.triangulate_depth=false",
     "mapping.min_loop_inliers=0",
     "mapping.other_starts=false",
-    "mapping.moving_tissue=false",
     "mapping.depth_step_sigma=0",
     "fusion.free_space=false",
     "tracking.relocalisation_keyframes=0",
@@ -41,17 +40,22 @@ CLINICAL = (
     "dark omentum before a lit wall, narrow beam, 45 degrees, sideways",
 )
 """Of `clinical_phantoms`: what the switches are for (losses, instruments, outliers, a wrong relief)."""
-MOVING = ("breath", "rebound", "pulled")
-"""Of `moving_tissue`: periodic, once, and with an instrument."""
-SEED = 31  # of the phantoms whose tissue moves, as in `moving_tissue`
+MOVING = {
+    "breath": ("--scene", "colon", "--deform", "--set", "breath_mm=4", "--set", "breath_frames=60"),
+    "rebound": ("--scene", "laparoscopy", "--events", "rebound:20-80"),
+    "pulled": ("--scene", "laparoscopy", "--events", "grasp:10-90"),
+}
+"""Phantoms whose tissue moves: it breathes by 4 mm, a push is let go, an instrument pulls."""
+FRAMES = 100
+SEED = 31
 
 
 def phantoms() -> dict[str, tuple[object, ...]]:
     """Return the words that draw each phantom, by name."""
     clinical = ("--frames", clinical_phantoms.FRAMES, "--seed", clinical_phantoms.SEED)
-    moving = ("--frames", moving_tissue.FRAMES, "--seed", SEED)
+    moving = ("--frames", FRAMES, "--seed", SEED)
     found = {f"phantom: {name}": (*clinical, *clinical_phantoms.PHANTOMS[name]) for name in CLINICAL}
-    return found | {f"phantom: {name}": (*moving, *moving_tissue.PHANTOMS[name]) for name in MOVING}
+    return found | {f"phantom: {name}": (*moving, *words) for name, words in MOVING.items()}
 
 
 def drawn(out: Path, wanted: list[str]) -> Iterator[RealClip]:

@@ -70,7 +70,7 @@ class FrameImages:
             unit = " mm" if view.whole.scale_known else ""
             parts.append((f"depth {near:.2g}-{far:.2g}{unit}", colour_depth(depth_mm, near, far), True))
         if view.pose is not None and not view.surface.is_empty:
-            parts.append(("surface", self._rendered(index, view.pose, picture, depth_mm), True))
+            parts.append(("surface", self._rendered(view.pose, picture, depth_mm), True))
         if not parts:
             return np.full((8, _WIDTH, 3), _EMPTY, np.uint8)
         # One large at the left, two of half its size at the right.
@@ -86,12 +86,10 @@ class FrameImages:
         out[: half[1], size[0] :], out[half[1] : 2 * half[1], size[0] :] = tiles[1], tiles[2]
         return out
 
-    def _rendered(
-        self, index: int, pose: np.ndarray, picture: np.ndarray | None, depth_mm: np.ndarray | None
-    ) -> np.ndarray:
+    def _rendered(self, pose: np.ndarray, picture: np.ndarray | None, depth_mm: np.ndarray | None) -> np.ndarray:
         """Return the surface (H, W, 3) uint8 from a pose, lit as the lamp lights the picture where that is known."""
         camera = self._view.whole.camera
-        seen = render_mesh(self._view.surface.at(index), camera, pose)
+        seen = render_mesh(self._view.surface.mesh, camera, pose)
         if picture is not None and depth_mm is not None and is_albedo(self._view.run):
             rgb = cv2.resize(picture, (camera.width, camera.height))
             seen = lit_like(seen, camera, rgb, depth_mm)

@@ -95,7 +95,7 @@ class FramePart:
 
     def _mark(self, pick: SurfacePick) -> None:
         view = self._view
-        place = view.surface.position(pick, view.state)[None]
+        place = view.surface.position(pick)[None]
         draw_marks(view.window.scene, _CLICKED, place, view.surface.size_mm, colour=CLICKED)
 
     def close(self) -> None:

@@ -84,7 +84,7 @@ class LesionPart:
     def _show(self) -> None:
         view = self._view
         self._button.visible = len(self._picks) >= _FEWEST
-        points = np.array([view.surface.position(pick, view.state) for pick in self._picks])
+        points = np.array([view.surface.position(pick) for pick in self._picks])
         draw_marks(view.window.scene, _OUTLINE, points, view.surface.size_mm)
         self._changed()
 
@@ -126,7 +126,7 @@ def corners_in(surface: ShownSurface, frame: int, picks: list[SurfacePick]) -> n
     row = np.flatnonzero(tracked["index"] == frame)
     if not len(row):
         raise InputError(f"frame {frame} has no pose in this submap: choose a tracked frame")
-    places = np.array([surface.position(pick, frame) for pick in picks])
+    places = np.array([surface.position(pick) for pick in picks])
     return surface.run.camera.project(transform(inverse(tracked["T_world_camera"][row[0]]), places))
 
 

@@ -42,7 +42,7 @@ class MeasurePart:
         self._forget = window.on(forget, self._forget_reference)
         self._lesion = LesionPart(view, lambda: self._reference, self._say_mode)
         self._measured = MeasuredList(view)
-        view.follow(submap=self._follow_submap, frame=self._follow_frame)
+        view.follow(submap=self._follow_submap)
         self._refer_to(None)
 
     @property
@@ -121,11 +121,6 @@ class MeasurePart:
         self._refer_to(None)
         self._lesion.begin(shown=self.mode == "Lesion")
 
-    def _follow_frame(self) -> None:
-        # Tissue may be in another state.
-        if self._view.state is not None:
-            self._show()
-
     def _show(self) -> None:
         view, picks, scene = self._view, self._picks, self._view.window.scene
         two = self.mode == "Distance" and len(picks) == 2
@@ -142,7 +137,7 @@ class MeasurePart:
         self._say_mode()
 
     def _places(self, picks: list[SurfacePick]) -> np.ndarray:
-        return np.array([self._view.surface.position(pick, self._view.state) for pick in picks])
+        return np.array([self._view.surface.position(pick) for pick in picks])
 
     def _say_mode(self) -> None:
         """Say what the next click does, and offer to take back where there is something."""

@@ -81,7 +81,7 @@ class ResultPage:
 
     def click(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Take a click by its ray, (3,) each, in the world of the submap that is shown, mm."""
-        pick, frames = self._view.surface.pick(origin, direction, self._view.state), self._frames
+        pick, frames = self._view.surface.pick(origin, direction), self._frames
         assert frames is not None
         if pick is None:
             self._view.note("There is no surface there.")

@@ -42,7 +42,6 @@ class ResultView:
         self.row = self.rows[0] if self.rows else 0
         self.number, self.surface = 0, ShownSurface(whole)
         self._surfaces: dict[tuple[int, int | None], ShownSurface] = {(0, None): self.surface}
-        self.in_state = self.surface.moves
         self._inside = False
         self._click_words = LOOKING
         self._of_note: list[Callable[[], None]] = []
@@ -60,11 +59,6 @@ class ResultView:
     def index(self) -> int:
         """The number of the frame that is shown."""
         return int(self.whole.frames["index"][self.row]) if len(self.whole.frames) else -1
-
-    @property
-    def state(self) -> int | None:
-        """The frame in whose state tissue is shown; None: in that of the result."""
-        return self.index if self.in_state and self.surface.moves else None
 
     @property
     def pose(self) -> np.ndarray | None:
@@ -131,7 +125,6 @@ class ResultView:
             run = self.whole.submaps[self.number]
             self._surfaces[self.number, segment] = ShownSurface(run, segment=segment)
         self.surface = self._surfaces[self.number, segment]
-        self.in_state = self.surface.moves
         for call in self._of_submap:
             call()
 

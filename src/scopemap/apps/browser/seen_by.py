@@ -35,9 +35,8 @@ def frames_that_saw(surface: ShownSurface, picks: Sequence[SurfacePick]) -> list
     run, found = surface.run, []
     tracked, camera = run.tracked, run.camera
     normals = np.array([surface.normal(pick) for pick in picks])
-    at_rest = None if surface.moves else np.array([surface.position(pick) for pick in picks])
+    places = np.array([surface.position(pick) for pick in picks])
     for index, pose in zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True):
-        places = at_rest if at_rest is not None else np.array([surface.position(pick, index) for pick in picks])
         points = transform(inverse(pose), places)
         if (points[:, 2] <= 0).any():
             continue
@@ -48,9 +47,9 @@ def frames_that_saw(surface: ShownSurface, picks: Sequence[SurfacePick]) -> list
             far_mm = np.linalg.norm(rays, axis=1)
             facing = np.abs((normals * rays).sum(1)) / far_mm
             clear = float((np.maximum(facing, _LEAST_COSINE) * camera.fx / far_mm).min())
-            found.append((Sight(index, pixels, clear), points[:, 2], places))
+            found.append((Sight(index, pixels, clear), points[:, 2]))
     tried = found[:: -(-len(found) // _MOST_TRIED) or 1]
-    seen = [sight for sight, depth_mm, places in tried if _is_seen(surface, sight, depth_mm, places)]
+    seen = [sight for sight, depth_mm in tried if _is_seen(surface, sight, depth_mm, places)]
     return sorted(seen, key=lambda sight: -sight.px_per_mm)
 
 
@@ -68,9 +67,9 @@ def _is_clear(surface: ShownSurface, index: int, depth_mm: float, far_mm: float,
     if np.isfinite(depth_mm):
         return abs(depth_mm / far_mm - 1) < _SAME_SURFACE
     eye = pose_of(surface.run, index)[:3, 3]
-    met = surface.pick(eye, place - eye, index)
+    met = surface.pick(eye, place - eye)
     return met is not None and bool(
-        np.linalg.norm(surface.position(met, index) - place) < _SAME_SURFACE * np.linalg.norm(place - eye)
+        np.linalg.norm(surface.position(met) - place) < _SAME_SURFACE * np.linalg.norm(place - eye)
     )
 
 

@@ -1,4 +1,4 @@
-"""The surface of a result as the window draws it and as clicks meet it: few triangles, in the state of any frame."""
+"""The surface of a result as the window draws it and as clicks meet it: few triangles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOST_FACES = 200_000
 
 @dataclass(frozen=True)
 class SurfacePick:
-    """A place on a surface, whatever state it is in: its triangle, and the weights (3,) of the triangle's corners."""
+    """A place on a surface: its triangle, and the weights (3,) of the triangle's corners."""
 
     face: int
     weights: np.ndarray
@@ -60,62 +60,35 @@ class ShownSurface:
         return tracked.only(own) if own.any() else tracked
 
     @cached_property
-    def _vertices(self) -> np.ndarray:
+    def vertices(self) -> np.ndarray:
+        """Its vertices (V, 3), mm."""
         return np.asarray(self.mesh.vertices)
-
-    @cached_property
-    def _motion(self) -> np.ndarray | None:
-        states = self.run.states
-        return None if states is None or self.is_empty else states.motion(self._vertices)
-
-    @property
-    def moves(self) -> bool:
-        """Whether its tissue moves from frame to frame."""
-        return self._motion is not None
 
     @cached_property
     def size_mm(self) -> float:
         """How large it is without its outermost parts, or how far the camera moves where there is none."""
-        points = self._vertices if len(self._vertices) else self.run.tracked["T_world_camera"][:, :3, 3]
+        points = self.vertices if len(self.vertices) else self.run.tracked["T_world_camera"][:, :3, 3]
         low, high = np.percentile(points, [5, 95], axis=0)
         return float(np.linalg.norm(high - low)) or 1.0
 
-    def vertices_at(self, index: int | None) -> np.ndarray:
-        """Return the vertices (V, 3), mm, in the state of the frame with this number; None: in that of the result."""
-        states = self.run.states
-        if index is None or states is None or self._motion is None:
-            return self._vertices
-        return np.asarray(self._vertices + np.tensordot(states.change(index), self._motion, 1))
-
-    def at(self, index: int | None) -> trimesh.Trimesh:
-        """Return the surface in the state of a frame, in its colours."""
-        if not self.moves or index is None:
-            return self.mesh
-        return trimesh.Trimesh(self.vertices_at(index), self.faces, vertex_colors=self.colours, process=False)
-
-    def pick(self, origin: np.ndarray, direction: np.ndarray, index: int | None = None) -> SurfacePick | None:
-        """Return where a ray, origin and direction (3,), first meets the surface in the state of a frame; or None."""
+    def pick(self, origin: np.ndarray, direction: np.ndarray) -> SurfacePick | None:
+        """Return where a ray, origin and direction (3,), first meets the surface; or None."""
         if self.is_empty:
             return None
-        met = meet_surface(self.at(index), np.asarray(origin, float), np.asarray(direction, float))
+        met = meet_surface(self.mesh, np.asarray(origin, float), np.asarray(direction, float))
         if met is None:
             return None
-        corners = self.vertices_at(index)[self.faces[met.face]]
+        corners = self.vertices[self.faces[met.face]]
         weights = trimesh.triangles.points_to_barycentric(corners[None], met.position[None])[0]
         return SurfacePick(met.face, weights)
 
-    def position(self, pick: SurfacePick, index: int | None = None) -> np.ndarray:
-        """Return where a place is, (3,) mm, in the state of a frame."""
-        corners = self.faces[pick.face]
-        place, states = pick.weights @ self._vertices[corners], self.run.states
-        if index is None or states is None or self._motion is None:
-            return np.asarray(place)
-        moved = np.tensordot(states.change(index), self._motion[:, corners], 1)
-        return np.asarray(place + pick.weights @ moved)
+    def position(self, pick: SurfacePick) -> np.ndarray:
+        """Return where a place is, (3,) mm."""
+        return np.asarray(pick.weights @ self.vertices[self.faces[pick.face]])
 
     def normal(self, pick: SurfacePick) -> np.ndarray:
         """Return the direction (3,) that a place faces, of length 1, or 0 for a triangle without area."""
-        first, second, third = self._vertices[self.faces[pick.face]]
+        first, second, third = self.vertices[self.faces[pick.face]]
         normal = np.cross(second - first, third - first)
         return np.asarray(normal / max(float(np.linalg.norm(normal)), 1e-12))
 

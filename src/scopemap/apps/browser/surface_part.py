@@ -36,7 +36,7 @@ _LIDS = (
 
 
 class SurfacePart:
-    """Controls of the surface; it is drawn when they change, and when the shown frame's tissue is in another state."""
+    """Controls of the surface, which is drawn when they change."""
 
     def __init__(self, view: ResultView) -> None:
         self._view, window, gui = view, view.window, view.window.gui
@@ -54,11 +54,8 @@ class SurfacePart:
         self._frusta = window.on(
             gui.add_checkbox("Camera at keyframes", initial_value=False), lambda value: self._draw_path()
         )
-        if view.surface.moves:
-            self._state = window.on(gui.add_checkbox("Moving tissue", initial_value=True), self._choose_state)
-            self._state.hint = "In the state of the frame; play the frames to see it move"
         window.on(gui.add_button("Look at the whole surface", color="gray"), view.look_at_all)
-        view.follow(frame=self._follow_frame, submap=self._follow_submap)
+        view.follow(submap=self._follow_submap)
         self._follow_submap()
 
     def _options(self) -> list[str]:
@@ -68,19 +65,11 @@ class SurfacePart:
     def _choose_submap(self, name: str) -> None:
         self._view.show_submap(self._names.index(name))
 
-    def _choose_state(self, value: bool) -> None:
-        self._view.in_state = value
-        self._draw()
-
     def _follow_submap(self) -> None:
         self._by.options = self._options()
         self._by.value = self._by.options[0]
         self._colour(self._by.value)
         self._draw_path()
-
-    def _follow_frame(self) -> None:
-        if self._view.state is not None:
-            self._draw()
 
     def _colour(self, name: str) -> None:
         if name == _COVERAGE:
@@ -117,7 +106,7 @@ class SurfacePart:
         if self._shown is not None:
             vertices, faces, colours = self._shown
         else:
-            vertices, faces, colours = surface.vertices_at(self._view.state), surface.faces, self._colours
+            vertices, faces, colours = surface.vertices, surface.faces, self._colours
             colours = in_relief(surface.facing, colours) if self._relief.value else colours
         content = unlit_glb(vertices, faces, colours)
         scene.add_glb(_SURFACE, content, cast_shadow=False, receive_shadow=False)

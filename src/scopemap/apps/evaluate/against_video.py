@@ -1,7 +1,6 @@
 """Measures a run's surface against its own video: frames kept out of fusion are compared with the mesh of the others.
 
 The run's frames are fused again with its settings, poses and depth, but for every n-th one; masks are made again.
-Tissue that moves is in the state of each frame.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from scopemap.engine.fusion.finish import finished
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.free_space import FreeSpace, views_among
 from scopemap.engine.fusion.new_views import NewViews
-from scopemap.engine.fusion.reference_state import in_surface_state
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion
 from scopemap.engine.geometry.rendering import Rendering, render_mesh, render_points
 from scopemap.engine.geometry.se3 import transform
@@ -101,7 +99,6 @@ class RunFrames:
         self._run, self._store = run, FrameStore(run)
         # Of those that are read here.
         self._fusion = fusion.model_copy(update={"every": fusion.every and 1})
-        self.states = folder.states
         self._segment_of = folder.segment_at
         self.indices: list[int] = []
         """Numbers of the frames: the tracked ones that are fused."""
@@ -132,8 +129,6 @@ class RunFrames:
         """Return the surface of the frames with these numbers."""
         fusion = SurfaceFusion(self._fusion, self._store, corrected=True)
         frames = NewViews(self._fusion.every).among(self.frames(fused))
-        if (states := self.states) is not None:
-            frames = (in_surface_state(frame, states) for frame in frames)
         surface = fusion.fuse(frames, self._store.median_depth_mm(fused))
         return finished(surface.mesh, surface.settings)
 
@@ -156,8 +151,7 @@ class RunFrames:
         views: list[tuple[float, Frame, Rendering]] = []
         for frame in self.frames():
             mesh = surfaces.get(self._segment_of(frame.index), trimesh.Trimesh())
-            then = mesh if self.states is None else self.states.moved(mesh, frame.index)
-            view, depth_mm = render_mesh(then, frame.camera, _pose(frame)), _usable_depth(frame)
+            view, depth_mm = render_mesh(mesh, frame.camera, _pose(frame)), _usable_depth(frame)
             if self._fusion.colours == "albedo":
                 view = lit_like(view, frame.camera, frame.rgb, depth_mm)
             agreement = compare_rendering(view, frame.rgb, depth_mm, perceptual)

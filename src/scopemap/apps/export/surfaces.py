@@ -61,8 +61,8 @@ def write_surfaces(run: Result, folder: Path, unit: Unit, axes: Axes) -> None:
 
     Raises `InputError` where the run has no surface, or one that fits all frames.
     """
-    if run.states is None and len(run.segments) < 2:
-        raise InputError(f"{run.path}: its tissue is taken to be at rest; export its one surface as ply")
+    if len(run.segments) < 2:
+        raise InputError(f"{run.path}: one surface fits all frames; export it as ply")
     folder.mkdir(parents=True, exist_ok=True)
     about = _about(run, unit, axes)
     for index in run.tracked.trajectory.indices.tolist():

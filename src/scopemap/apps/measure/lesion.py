@@ -214,7 +214,7 @@ def carried_masks(run: Result, frame: int, mask: np.ndarray) -> dict[int, np.nda
     near = [n for n in near if (pixels[n] < size).all()]
     masks = {frame: mask}
     for index in near[:: -(-len(near) // _MOST_FRAMES) or 1]:
-        seen = render_mesh(_at(run, surface, index), run.camera, poses[index])
+        seen = render_mesh(surface, run.camera, poses[index])
         depth_mm = run.depth.read(index)
         if depth_mm is None:
             continue
@@ -231,15 +231,11 @@ def _largest_part(mask: np.ndarray) -> np.ndarray:
     return np.asarray(parts == 1 + facts[1:, cv2.CC_STAT_AREA].argmax())
 
 
-def _at(run: Result, mesh: trimesh.Trimesh, index: int) -> trimesh.Trimesh:
-    return mesh if run.states is None else run.states.moved(mesh, index)
-
-
 def _marked(run: Result, frame: int, mask: np.ndarray, pose: np.ndarray) -> trimesh.Trimesh:
     """Return the surface, its vertices white where a frame sees them inside a mask, black elsewhere."""
     mesh = run.surface(run.segment_at(frame))
-    seen = render_mesh(_at(run, mesh, frame), run.camera, pose).depth_mm
-    points = transform(inverse(pose), np.asarray(_at(run, mesh, frame).vertices))
+    seen = render_mesh(mesh, run.camera, pose).depth_mm
+    points = transform(inverse(pose), np.asarray(mesh.vertices))
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = run.camera.project(points).astype(np.float32)
     u, v = np.nan_to_num(pixels, nan=-9).clip(-9, 1e4).T

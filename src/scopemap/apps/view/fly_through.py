@@ -50,11 +50,11 @@ class Painting:
 def write_fly_through(folder: Path, file: Path, source: Path | None = None, painting: Painting | None = None) -> None:
     """Write a film of a run's tracked frames at the video's rate: their pictures, and the surface along the path.
 
-    Tissue that moves is in the state of each frame. The surface is lit as the lamp lights it, and exposed as the
-    picture; where there is a painting, it shines through half. Below: the time, how far along the path the camera is,
-    in a lumen how far along the centreline, and what colours mean; a clock around the lumen; a scale bar where sizes
-    are known, for what is as far away as the picture's median depth. source : where the run's input is now; else it is
-    looked for. The end of the file's name chooses its kind: .mp4 (H.264), .mkv or .webm.
+    The surface is lit as the lamp lights it, and exposed as the picture; where there is a painting, it shines through
+    half. Below: the time, how far along the path the camera is, in a lumen how far along the centreline, and what
+    colours mean; a clock around the lumen; a scale bar where sizes are known, for what is as far away as the picture's
+    median depth. source : where the run's input is now; else it is looked for. The end of the file's name chooses its
+    kind: .mp4 (H.264), .mkv or .webm.
 
     Raises `InputError` where the folder holds no finished run or no surface, its input is gone, or the film cannot be
     written.
@@ -99,7 +99,7 @@ def _pictures(run: Result, source: Path | None, painting: Painting | None) -> It
             meshes[segment] = simplified(run.surface(segment), MOST_FACES)
         surface, known_mm = _surface(run, meshes[segment], frame, pose)
         if painted is not None:
-            colours = render_mesh(_at(run, painted, frame), frame.camera, pose)
+            colours = render_mesh(painted, frame.camera, pose)
             half = (surface.astype(np.uint16) + colours.rgb) // 2
             surface = np.where(np.isnan(colours.depth_mm)[..., None], surface, half.astype(np.uint8))
         share = way[frame.index] / max(along[-1], 1e-9)
@@ -113,15 +113,11 @@ def _pictures(run: Result, source: Path | None, painting: Painting | None) -> It
         yield _side_by_side(frame, surface, words, float(px_per_mm), clock, legend)
 
 
-def _at(run: Result, mesh: trimesh.Trimesh, frame: Frame) -> trimesh.Trimesh:
-    return mesh if run.states is None else run.states.moved(mesh, frame.index)
-
-
 def _surface(run: Result, mesh: trimesh.Trimesh, frame: Frame, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the surface (H, W, 3) uint8 from a pose, lit and exposed as a frame, and the frame's depth (H, W), mm."""
     depth_mm = run.depth.read(frame.index)
     known_mm = np.full(frame.valid.shape, np.nan) if depth_mm is None else np.where(frame.valid, depth_mm, np.nan)
-    view = render_mesh(_at(run, mesh, frame), frame.camera, pose)
+    view = render_mesh(mesh, frame.camera, pose)
     if run.config.fusion.colours == "albedo":
         view = lit_like(view, frame.camera, frame.rgb, known_mm)
     return np.where(np.isnan(view.depth_mm)[..., None], np.array(rgb_of(_EMPTY), np.uint8), view.rgb), known_mm

@@ -18,14 +18,13 @@ class MappingSettings(StageSettings):
         "full": {},
         "none": {"local_window": 0, "global_adjustment": False},
         "local": {"triangulate_depth": False, "min_loop_inliers": 0, "global_adjustment": False},
-        "realtime": {"triangulate_depth": False, "min_loop_inliers": 0, "moving_tissue": False},
-        "rigid": {"moving_tissue": False},
+        "realtime": {"triangulate_depth": False, "min_loop_inliers": 0},
     }
     method: str = Field(
         "full",
         description="none: poses as tracked, frame by frame; local: each keyframe adjusted as it comes, with those "
-        "before it; realtime: all adjusted at the end, too; full: with loop closure, depth of several views and moving "
-        "tissue. Where depth is predicted: measured depth tracks as well or better without",
+        "before it; realtime: all adjusted at the end, too; full: with loop closure and depth of several views. Where "
+        "depth is predicted: measured depth tracks as well or better without",
     )
 
     min_loop_inliers: NonNegativeInt = advanced(
@@ -78,11 +77,6 @@ class MappingSettings(StageSettings):
         True,
         "try other starts of the adjustment; false: the shape is taken for determined",
         "by hand: the bas-relief ambiguity",
-    )
-    moving_tissue: bool = advanced(
-        True,
-        "where a rigid scene leaves errors, try tissue that moves by one curve over time; false: poses stay",
-        "by hand",
     )
 
     @property

@@ -17,7 +17,6 @@ from scopemap.engine.fusion.albedo import lit_by_lamp
 from scopemap.engine.geometry.rendering import Rendering, render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.similarity import structural_similarity
-from scopemap.engine.mapping.tissue_states import TissueStates
 
 _NEAR = float(np.log(1.1))  # within 10 %
 _SAME_SURFACE = 0.02  # by hand: between a vertex and what is rendered at its pixel, of its depth: it is not hidden
@@ -116,24 +115,20 @@ def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
 
 
 class SurfaceView(NamedTuple):
-    """A frame with depth and pose, the vertices (V, 3) of a surface as they were then, world mm, and its rendering."""
+    """A frame with depth and pose, the vertices (V, 3) of a surface, world mm, and its rendering."""
 
     frame: Frame
     vertices: np.ndarray
     rendering: Rendering
 
 
-def surface_views(mesh: trimesh.Trimesh, frames: list[Frame], states: TissueStates | None = None) -> list[SurfaceView]:
-    """Return the views of a fusion's surface at some of its frames; [] without a surface or frames.
-
-    states : of tissue that moves, with which the surface is in that of each frame.
-    """
+def surface_views(mesh: trimesh.Trimesh, frames: list[Frame]) -> list[SurfaceView]:
+    """Return the views of a fusion's surface at some of its frames; [] without a surface or frames."""
     views = []
     for frame in frames if len(mesh.faces) else []:
         if frame.T_world_camera is not None and frame.depth_mm is not None:
-            then = mesh if states is None else states.moved(mesh, frame.index)
-            rendering = render_mesh(then, frame.camera, frame.T_world_camera)
-            views.append(SurfaceView(frame, np.asarray(then.vertices), rendering))
+            rendering = render_mesh(mesh, frame.camera, frame.T_world_camera)
+            views.append(SurfaceView(frame, np.asarray(mesh.vertices), rendering))
     return views
 
 

@@ -1,4 +1,4 @@
-"""Mesh files: PLY and GLB, with normals, colours and the confidence of each vertex; GLB with motion over time."""
+"""Mesh files: PLY and GLB, with normals, colours and the confidence of each vertex; GLB with surfaces in time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import trimesh
 from scopemap.engine.errors import reporting
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.srgb import LINEAR
-from scopemap.engine.mapping.tissue_states import TissueStates
 
 # glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
 T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
@@ -63,24 +62,6 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
         if not np.isfinite(mesh.vertices).all():
             raise ValueError("it is damaged: a vertex is nowhere")
     return mesh
-
-
-def save_mesh_over_time(mesh: trimesh.Trimesh, states: TissueStates, glb_file: Path, *, comment: str = "") -> None:
-    """Write a mesh as GLB whose tissue moves: a morph target for each curve, and an animation of their weights.
-
-    The animation has a key at each frame of `states`, at its time. Weights are 0 where a curve is lowest, and 1 where
-    it is highest: importers keep them within these. Otherwise as `save_mesh`. A mesh without faces gives no file.
-    """
-    if not len(mesh.faces):
-        return
-    low, high = states.curves.min(0), states.curves.max(0)
-    spread = np.where(high > low, high - low, 1.0)
-    motion = states.motion(np.asarray(mesh.vertices))
-    lowest = mesh.copy()
-    lowest.vertices = mesh.vertices + np.tensordot(low - states.reference, motion, 1)
-    targets = spread[:, None, None] * motion @ T_GLTF_WORLD[:3, :3].T
-    at_rest, weights = (states.reference - low) / spread, (states.curves - low) / spread
-    glb_file.write_bytes(_animated(_glb([lowest], comment), targets, at_rest, states.time_s, weights))
 
 
 def save_meshes_in_time(
@@ -142,22 +123,6 @@ class _OpenGlb:
         chunks = ((text + b" " * (-len(text) % 4), _JSON), (bytes(self._binary), _BIN))
         body = b"".join(struct.pack("<II", len(part), kind) + part for part, kind in chunks)
         return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
-
-
-def _animated(glb: bytes, targets: np.ndarray, at_rest: np.ndarray, time_s: np.ndarray, weights: np.ndarray) -> bytes:
-    """Return a GLB of one mesh with morph targets (L, V, 3), m, and their weights (F, L) over time.
-
-    glTF 2.0, sections 3.7.2.2, morph targets, and 3.11, animations.
-    """
-    found = _OpenGlb(glb)
-    (mesh,), (node,) = found.tree["meshes"], found.mesh_nodes
-    mesh["weights"] = at_rest.tolist()
-    for primitive in mesh["primitives"]:
-        primitive["targets"] = [{"POSITION": found.accessor(target, "VEC3")} for target in targets]
-    sampler = found.sampler(time_s - time_s[0], weights.ravel(), "SCALAR")
-    channel = {"sampler": 0, "target": {"node": node, "path": "weights"}}
-    found.tree["animations"] = [{"name": "tissue", "samplers": [sampler], "channels": [channel]}]
-    return found.content
 
 
 def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:

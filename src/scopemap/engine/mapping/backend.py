@@ -22,11 +22,10 @@ from scopemap.engine.mapping.bundle_adjustment import errors_px
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State
 from scopemap.engine.mapping.depth_correction import depth_grid
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
-from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TissueMotion, TrackedPose
+from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
 from scopemap.engine.mapping.lens_test import lens_test
 from scopemap.engine.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.engine.mapping.map_merging import Part, merge_maps, split_maps
-from scopemap.engine.mapping.nonrigid_adjustment import RIGID_CORE_PX, adjust_moving_tissue
 from scopemap.engine.mapping.pose_graph import (
     PathWithoutDrift,
     optimise_pose_graph,
@@ -54,7 +53,6 @@ class Backend:
     """
 
     _frames: Kept[list[int]]
-    _times_s: Kept[list[float]]
     _tracked: Kept[list[TrackedPose]]
     _steps: Kept[list[KeyframeStep]]
     _log_scales: Kept[list[float]]
@@ -74,7 +72,7 @@ class Backend:
         anchored: bool = False,
     ) -> None:
         self._settings, self._anchored = settings, anchored
-        self._frames, self._times_s, self._tracked, self._steps, self._log_scales = [], [], [], [], []
+        self._frames, self._tracked, self._steps, self._log_scales = [], [], [], []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
         self._depths_mm, self._loops = table("depth_grids", np.dtype(np.float32)), table("loops", LOOP)
         self._tracks = FeatureTracks(settings, flow, table)
@@ -113,7 +111,6 @@ class Backend:
             reference = self._frames[-1] if self._frames else keyframe.index
             tracked = TrackedPose(0, reference, keyframe.T_world_camera)
         self._frames.append(keyframe.index)
-        self._times_s.append(keyframe.time_s)
         self._tracked.append(tracked)
         self._steps.append(step or KeyframeStep())
         self._log_scales.append(math.log(keyframe.depth_scale))
@@ -155,8 +152,8 @@ class Backend:
         tracked: Mapping[int, TrackedPose] | None = None,
         among: Collection[int] | None = None,
     ) -> list[Segment]:
-        """Return the segments of a map and of the maps merged with it, after the last keyframe: one where one scene, at
-        rest or moved by one curve, explains all of it.
+        """Return the segments of a map and of the maps merged with it, after the last keyframe: one where one scene
+        explains all of it.
 
         tracked : poses as tracked by number of the frame; needed for several maps. among : numbers of the maps that may
         be merged; None: all. Where an adjustment is refused, keyframes stay as tracked, and only their steps are spread
@@ -215,7 +212,7 @@ class Backend:
         return without_drift(0.0)
 
     def _tested(self, found: AdjustedMaps, alone: AdjustedMaps, worlds: Mapping[int, Similarity]) -> FrameCorrection:
-        """Return the correction with the test of the lens, or with tissue that moves where no other lens explains that.
+        """Return the correction with the test of the lens; where one map was refused, only if it contradicts the lens.
 
         alone : the main map's own adjustment, which tells enough of the lens.
         """
@@ -224,10 +221,9 @@ class Backend:
         if lens.is_worse and tested is found and not found.correction.refused:
             worse = Notice("mapping-worse", {"error_px": lens.held_px, "tracked_px": lens.tracked_px, "merged": ""})
             return replace(self._keyframes_of(worlds).uncorrected(lens.held_px), refused=worse, lens=lens)
-        if len(worlds) > 1 or lens.contradicts:
-            return replace(found.correction, lens=lens)
-        correction = self._with_moving_tissue(found, worlds)
-        return correction if correction.refused or correction.tissue else replace(correction, lens=lens)
+        if len(worlds) == 1 and found.correction.refused and not lens.contradicts:
+            return found.correction
+        return replace(found.correction, lens=lens)
 
     def _merged_and_adjusted(
         self, main: int, allowed: Collection[int], alone: AdjustedMaps
@@ -322,21 +318,6 @@ class Backend:
             camera=self._camera,
             settings=self._settings,
         )
-
-    def _with_moving_tissue(self, alone: AdjustedMaps, worlds: Mapping[int, Similarity]) -> FrameCorrection:
-        """Return the correction with tissue that moves where left-out tracks confirm it, else the rigid one."""
-        by_depth = alone.correction.refused and alone.rigid.sigma_px < RIGID_CORE_PX
-        if self._camera is None or not self._settings.moving_tissue or by_depth:
-            return alone.correction
-        time_s = np.array(self._times_s)[self._chosen(worlds)]
-        solution = adjust_moving_tissue(alone.problem, alone.rigid, time_s)
-        if solution is None:
-            return alone.correction
-        found, deformation, left_out = solution
-        keyframes = self._keyframes_of(worlds)
-        fields = keyframes.depth_fields(alone.problem.points, found)
-        tissue = TissueMotion(deformation, left_out, deformation.rate_per_min(time_s))
-        return replace(keyframes.correction(found), depth_fields=fields, tissue=tissue)
 
     def _problem(self, worlds: Mapping[int, Similarity]) -> tuple[BundleProblem, np.ndarray]:
         """Return the bundle adjustment of maps' keyframes, from the pose graph, and its accepted loops (A, 2)."""

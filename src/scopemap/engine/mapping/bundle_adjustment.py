@@ -30,7 +30,6 @@ from scopemap.engine.geometry.se3 import hat, inverse, orthonormalised, se3_exp,
 from scopemap.engine.mapping.bundle_problem import (
     BundleProblem,
     Errors,
-    Moved,
     Observations,
     Points,
     Reprojection,
@@ -40,7 +39,7 @@ from scopemap.engine.mapping.bundle_problem import (
     reprojection_errors,
 )
 
-PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
+_PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 CAUCHY = 2.0  # by hand: residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # guard: squared residual, in variances, of a point behind the camera
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # by hand: factor of the inverse depth in one step
@@ -166,7 +165,7 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
 
     options = least_squares.Options(np.inf, max_iterations, min_step=0.0, min_decrease=min_decrease)
     search = least_squares.Problem(
-        lambda state: linearised(problem, state, seen_at(state)), partial(retract, problem), rescaled
+        lambda state: linearised(problem, state, seen_at(state)), partial(_retract, problem), rescaled
     )
     found = minimise(search, rescaled(start), options)
     state = found.state._replace(T_camera_world=orthonormalised(found.state.T_camera_world))
@@ -194,42 +193,42 @@ def linearised(problem: BundleProblem, state: State, seen: Errors | None = None)
     seen : the errors of the observations, where they are known.
     """
     count = len(state.T_camera_world)
-    seen, edges = seen or reprojection_errors(problem, state), odometry_edges(problem, state)
-    held = [6 + PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
-    held += [np.arange(6), np.arange(PER_KEYFRAME * problem.held)]
-    unknowns = PER_KEYFRAME * count + (problem.log_focal_sigma is not None)
+    seen, edges = seen or reprojection_errors(problem, state), _odometry_edges(problem, state)
+    held = [6 + _PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
+    held += [np.arange(6), np.arange(_PER_KEYFRAME * problem.held)]
+    unknowns = _PER_KEYFRAME * count + (problem.log_focal_sigma is not None)
     return ReducedModel(
         problem.first_seen,
         problem.parts,
-        cost(problem, state, seen, edges),
-        partial(derivatives, problem, state),
-        camera_priors(problem, state, edges),
-        *held_depths(problem, state),
+        _cost(problem, state, seen, edges),
+        partial(_derivatives, problem, state),
+        _camera_priors(problem, state, edges),
+        *_held_depths(problem, state),
         free=np.setdiff1d(np.arange(unknowns), np.concatenate(held)),
         unknowns=unknowns,
     )
 
 
-def held_depths(problem: BundleProblem, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _held_depths(problem: BundleProblem, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return how far ln depth of the points (P,) is from the estimate, its weight, and the unknown of its scale."""
     points = problem.points
     off = state.log_depth - points.log_depth - state.log_scale[points.host]
-    return off, cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2, PER_KEYFRAME * points.host + 6
+    return off, cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2, _PER_KEYFRAME * points.host + 6
 
 
-def derivatives(problem: BundleProblem, state: State, points: slice, moved: Moved | None = None) -> Linear:
+def _derivatives(problem: BundleProblem, state: State, points: slice) -> Linear:
     """Return the derivatives of the observations of some points by the keyframes and ln f."""
-    seen = reproject(problem, state, points, moved)
+    seen = reproject(problem, state, points)
     by_camera, by_host, by_depth, by_focal = jacobians(problem, state, points, seen)
     number, observer, _ = (part[problem.seen(points)] for part in problem.observations.columns)
-    first = PER_KEYFRAME * np.column_stack([observer, problem.points.host[number]])
-    of_focal = PER_KEYFRAME * len(state.T_camera_world) + np.tile(np.arange(by_focal.shape[2]), (len(number), 1))
+    first = _PER_KEYFRAME * np.column_stack([observer, problem.points.host[number]])
+    of_focal = _PER_KEYFRAME * len(state.T_camera_world) + np.tile(np.arange(by_focal.shape[2]), (len(number), 1))
     columns = np.hstack([first[:, :1] + np.arange(6), first[:, 1:] + np.arange(6), of_focal])
     by = np.concatenate([by_camera, by_host, by_focal], -1)
     return Linear(columns, by, by_depth, seen.error, weights(state, seen) / problem.correlated)
 
 
-def cost(problem: BundleProblem, state: State, seen: Errors, edges: OdometryEdges) -> float:
+def _cost(problem: BundleProblem, state: State, seen: Errors, edges: _OdometryEdges) -> float:
     """Return what is minimised, at a state."""
     points, priors = problem.points, problem.priors
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
@@ -243,7 +242,7 @@ def cost(problem: BundleProblem, state: State, seen: Errors, edges: OdometryEdge
     return float(cost)
 
 
-class OdometryEdges(NamedTuple):
+class _OdometryEdges(NamedTuple):
     """Deviations of C pairs of keyframes from the tracked motion between them.
 
     pairs : (C, 2). error : (C, 6) twists. information : (6,) of each.
@@ -254,54 +253,54 @@ class OdometryEdges(NamedTuple):
     information: np.ndarray
 
 
-def odometry_edges(problem: BundleProblem, state: State) -> OdometryEdges:
+def _odometry_edges(problem: BundleProblem, state: State) -> _OdometryEdges:
     """Deviations from the tracked motion between neighbours."""
     priors, tracked, T = problem.priors, problem.T_camera_world, state.T_camera_world
     information = np.repeat([priors.rotation_rad, priors.translation_share * problem.unit_mm], 3) ** -2.0
     pairs = problem.neighbours.reshape(-1, 2)
     i, j = pairs.T
-    return OdometryEdges(pairs, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
+    return _OdometryEdges(pairs, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
 
 
-def camera_priors(problem: BundleProblem, state: State, edges: OdometryEdges) -> list[Prior]:
+def _camera_priors(problem: BundleProblem, state: State, edges: _OdometryEdges) -> list[Prior]:
     """Return the normal equations of the priors of keyframes, and of ln f."""
     T, unit, (i, j) = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), edges.pairs.T
-    own = PER_KEYFRAME * np.repeat(edges.pairs, 6, axis=1) + np.tile(np.arange(6), 2)
+    own = _PER_KEYFRAME * np.repeat(edges.pairs, 6, axis=1) + np.tile(np.arange(6), 2)
     by_i = -_adjoint(T[j] @ inverse(T[i]))
     J = np.concatenate([by_i, np.broadcast_to(np.eye(6), by_i.shape)], -1) * np.tile(unit, 2)
     weighted = J.swapaxes(1, 2) * edges.information
     priors = list(map(Prior, own, weighted @ J, (weighted @ edges.error[..., None])[..., 0]))
     if problem.priors.scale > 0:
-        information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + PER_KEYFRAME * np.arange(len(T))
+        information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + _PER_KEYFRAME * np.arange(len(T))
         priors.append(Prior(own, np.diag(information), information * state.log_scale))
     if problem.log_focal_sigma is not None:
-        information, own = np.array([problem.log_focal_sigma**-2.0]), np.array([PER_KEYFRAME * len(T)])
+        information, own = np.array([problem.log_focal_sigma**-2.0]), np.array([_PER_KEYFRAME * len(T)])
         change = np.array([state.log_focal - problem.tracked.log_focal])
         priors.append(Prior(own, np.diag(information), information * change))
     return priors
 
 
-def with_points(problem: BundleProblem, state: State, moved: Moved | None = None) -> State:
-    """Return the state with the points where all observations place them, keyframes and motion of tissue held."""
+def with_points(problem: BundleProblem, state: State) -> State:
+    """Return the state with the points where all observations place them, keyframes held."""
     for _ in range(_POINT_STEPS):
-        h, g = _by_points(problem, state, moved)
-        off, held, _ = held_depths(problem, state)
+        h, g = _by_points(problem, state)
+        off, held, _ = _held_depths(problem, state)
         step = -(g + held * off) / (h + held)
         state = state._replace(log_depth=state.log_depth - np.log(np.clip(1 - step, *_INVERSE_DEPTH_STEP)))
     return state
 
 
-def log_depth_sigma(problem: BundleProblem, state: State, moved: Moved | None = None) -> np.ndarray:
+def log_depth_sigma(problem: BundleProblem, state: State) -> np.ndarray:
     """Return the standard deviation of ln depth (P,) by the observations alone; infinite without any."""
     with np.errstate(divide="ignore"):
-        return 1 / np.sqrt(_by_points(problem, state, moved)[0])
+        return 1 / np.sqrt(_by_points(problem, state)[0])
 
 
-def _by_points(problem: BundleProblem, state: State, moved: Moved | None) -> np.ndarray:
+def _by_points(problem: BundleProblem, state: State) -> np.ndarray:
     """Return the second and the first derivatives (2, P) of the observations by ln depth of the points."""
     found, number = np.zeros((2, len(problem.points.host))), problem.observations.point
     for points in problem.parts:
-        seen = reproject(problem, state, points, moved)
+        seen = reproject(problem, state, points)
         by_depth, weight = jacobians(problem, state, points, seen)[2], weights(state, seen)
         own, count = number[problem.seen(points)] - points.start, points.stop - points.start
         for row, by in zip(found, (by_depth, seen.error), strict=True):
@@ -317,10 +316,10 @@ def _adjoint(T: np.ndarray) -> np.ndarray:
     return adjoint
 
 
-def retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
+def _retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
     """Return the state after a step; points move along their rays in inverse depth, which parallax is linear in."""
-    count = PER_KEYFRAME * len(state.T_camera_world)
-    own = step[:count].reshape(-1, PER_KEYFRAME)
+    count = _PER_KEYFRAME * len(state.T_camera_world)
+    own = step[:count].reshape(-1, _PER_KEYFRAME)
     twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
     T = se3_exp(twists) @ state.T_camera_world
     log_focal = state.log_focal + (0.0 if problem.log_focal_sigma is None else float(step[count]))

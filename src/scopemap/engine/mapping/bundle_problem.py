@@ -7,7 +7,6 @@ keyframe t observes it at project(T_t T_h^-1 exp(u_p) ray_p).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -54,10 +53,6 @@ class Observations:
     def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """All three."""
         return self.point, self.keyframe, self.pixel
-
-
-Moved = Callable[[slice], np.ndarray]
-"""Returns by how much (n, 3) mm the points of some observations have moved in the world since their hosts saw them."""
 
 
 class Priors(NamedTuple):
@@ -171,30 +166,26 @@ class Reprojection(NamedTuple):
     pair: np.ndarray
 
 
-def reprojection_errors(problem: BundleProblem, state: State, moved: Moved | None = None) -> Errors:
-    """Return the errors of all observations; moved : as `reproject` takes it."""
+def reprojection_errors(problem: BundleProblem, state: State) -> Errors:
+    """Return the errors of all observations."""
     error, ahead = np.zeros((len(problem.observations.point), 2)), np.zeros(len(problem.observations.point), bool)
     for points in problem.parts:
         some = problem.seen(points)
-        error[some], ahead[some] = reproject(problem, state, points, moved)[:2]
+        error[some], ahead[some] = reproject(problem, state, points)[:2]
     return Errors(error, ahead)
 
 
-def reproject(problem: BundleProblem, state: State, points: slice, moved: Moved | None = None) -> Reprojection:
-    """Return where some points of a state are projected, against where they were observed.
-
-    moved : None where tissue is rigid.
-    """
+def reproject(problem: BundleProblem, state: State, points: slice) -> Reprojection:
+    """Return where some points of a state are projected, against where they were observed."""
     some, T, focal = problem.seen(points), state.T_camera_world, math.exp(state.log_focal)
-    number, observer, pixel = (part[some] for part in problem.observations.columns)
+    number, pixel = problem.observations.point[some], problem.observations.pixel[some]
     rays = np.column_stack([problem.points.pixel[points] / focal, np.ones(points.stop - points.start)])
     in_host, point = np.exp(state.log_depth[points])[:, None] * rays, number - points.start
     pairs, which = problem.pairs[0], problem.pairs[1][some]
     least = int(which.min(initial=len(pairs)))  # pairs are sorted by host, too
     pairs, pair = pairs[least : which.max(initial=0) + 1], which - least
     between = T[pairs % len(T)] @ inverse(T)[pairs // len(T)]
-    shift = np.zeros((0, 3)) if moved is None else np.einsum("nij,nj->ni", T[observer, :3, :3], moved(some))
-    error, ahead, seen, projected = _projected(between, pair, in_host, point, pixel, shift, focal)
+    error, ahead, seen, projected = _projected(between, pair, in_host, point, pixel, focal)
     return Reprojection(error, ahead, seen, projected, in_host, point, between, pair)
 
 
@@ -211,8 +202,8 @@ def jacobians(
 
 
 @kernel
-def _projected(between, pair, in_host, point, observed, shift, focal):  # type: ignore[no-untyped-def]
-    """Return error, ahead, seen and pixel of a `Reprojection`; observed : (n, 2); shift : of `seen`, (0, 3): none."""
+def _projected(between, pair, in_host, point, observed, focal):  # type: ignore[no-untyped-def]
+    """Return error, ahead, seen and pixel of a `Reprojection`; observed : (n, 2)."""
     count = len(point)
     error, pixel, seen = np.zeros((count, 2)), np.empty((count, 2)), np.empty((count, 3))
     ahead = np.zeros(count, np.bool_)
@@ -222,8 +213,6 @@ def _projected(between, pair, in_host, point, observed, shift, focal):  # type: 
             place = between[q, i, 3]
             for j in range(3):
                 place += between[q, i, j] * in_host[p, j]
-            if len(shift):
-                place += shift[n, i]
             seen[n, i] = place
             square += place * place
         ahead[n] = seen[n, 2] > _LEAST_Z * np.sqrt(square)

@@ -10,10 +10,8 @@ import numpy as np
 
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, mean_near, rotation_angle_rad
-from scopemap.engine.mapping.deformation_graph import Deformation
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField
 from scopemap.engine.mapping.lens_test import LensTest
-from scopemap.engine.mapping.nonrigid_adjustment import LeftOutTracks
 from scopemap.engine.mapping.other_starts import ShapeTest
 from scopemap.engine.notices import Notice
 
@@ -44,17 +42,6 @@ class KeyframeStep(NamedTuple):
     log_scale: float = 0.0
 
 
-class TissueMotion(NamedTuple):
-    """Motion of the tissue over the keyframes, in the adjusted world, and what confirms it.
-
-    rate_per_min : how often it repeats itself; NaN where it does not.
-    """
-
-    deformation: Deformation
-    left_out: LeftOutTracks
-    rate_per_min: float
-
-
 @dataclass(frozen=True)
 class FrameCorrection:
     """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
@@ -67,9 +54,8 @@ class FrameCorrection:
     loop_frames : the two frames of each. depth_fields : (K,) further factors of each pixel's depth; (): none.
     S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
     number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens : what
-    left-out tracks tell of it. tissue : how it moves; None: it is taken to be at rest. shape : what other
-    starts of the adjustment tell of it. S_world_adjusted : Sim(3) from the adjusted world to that of the submap, which
-    joins a segment to the one before.
+    left-out tracks tell of it. shape : what other starts of the adjustment tell of it. S_world_adjusted : Sim(3) from
+    the adjusted world to that of the submap, which joins a segment to the one before.
     """
 
     index: np.ndarray
@@ -86,14 +72,13 @@ class FrameCorrection:
     tracked: Mapping[int, TrackedPose] = field(default_factory=dict)
     depth_mm: float = 1.0
     lens: LensTest = field(default_factory=LensTest)
-    tissue: TissueMotion | None = None
     shape: ShapeTest = field(default_factory=ShapeTest)
     S_world_adjusted: Similarity = field(default_factory=Similarity.identity)
 
     @property
     def notices(self) -> list[Notice]:
         """What was adjusted and how well it fits, or why nothing was; what determines the shape; another lens."""
-        said = self.tissue is not None or (self.refused and self.refused.code == "mapping-not-determined")
+        said = self.refused and self.refused.code == "mapping-not-determined"
         tested = [] if said else self.shape.notices
         return [self.notice, *tested, *self.lens.notices]
 
@@ -106,16 +91,9 @@ class FrameCorrection:
             merged = len(self.S_common_map)
             by_loops = f", {merged} maps merged by {self.loops} loop closures" if merged > 1 else ""
             return replace(self.refused, values={**self.refused.values, "merged": by_loops})
-        if self.tissue is not None:
-            motion, left_out, rate = self.tissue
-            moved = np.linalg.norm(np.ptp(motion.displacement, axis=0), axis=1).max() / self.depth_mm
-            facts = {"keyframes": len(self.index), "nodes": len(motion.nodes), "moved": float(moved)}
-            facts |= {"rigid_px": left_out.rigid_px, "px": left_out.px}
-            periodic = f", {rate:.0f} times a minute" if np.isfinite(rate) else ""
-            return Notice("mapping-tissue-moves", facts | {"periodic": periodic})
         rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
         changes = [np.abs(depth_field.values).mean() for depth_field in self.depth_fields]
-        facts = {"keyframes": len(self.index), "loops": self.loops}
+        facts: dict[str, float] = {"keyframes": len(self.index), "loops": self.loops}
         facts["maps"] = max(len(self.S_common_map), 1)
         facts |= {"rotation_deg": float(rotation_deg), "sigma_px": float(self.sigma_px)}
         return Notice("mapping-adjusted", facts | {"depth_change": float(np.expm1(np.median(changes or [0.0])))})
@@ -146,7 +124,6 @@ class FrameCorrection:
             T_world_world_before=None if before is None else T_new_world @ before @ inverse(T_new_world),
             S_common_map={number: moved.after(S) for number, S in self.S_common_map.items()},
             S_world_adjusted=moved.after(self.S_world_adjusted).after(moved.inverse()),
-            tissue=self.tissue and self.tissue._replace(deformation=self.tissue.deformation.in_world(T_new_world)),
         )
 
     def pose(self, index: int, T_world_camera: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.mapping.bundle_adjustment import with_points
 from scopemap.engine.mapping.bundle_problem import (
     BundleProblem,
-    Moved,
     Observations,
     Points,
     State,
@@ -78,14 +77,11 @@ def _hosted(problem: BundleProblem, first: int, end: int) -> np.ndarray:
     return (problem.points.host >= first) & (problem.points.host < end)
 
 
-def placed(part: BundleProblem, keyframes: State, moved: Moved | None = None) -> State:
-    """Return the state of points that their own observations place in the keyframes of a solution.
-
-    moved : as `reproject` takes it.
-    """
+def placed(part: BundleProblem, keyframes: State) -> State:
+    """Return the state of points that their own observations place in the keyframes of a solution."""
     state = keyframes._replace(log_depth=part.points.log_depth + keyframes.log_scale[part.points.host])
     for _ in range(_RESCALINGS):
-        seen = reprojection_errors(part, state, moved)
+        seen = reprojection_errors(part, state)
         sigma_px = robust_sigma_2d(np.linalg.norm(seen.error, axis=1), part.least_sigma_px)
-        state = with_points(part, state._replace(sigma_px=sigma_px), moved)
+        state = with_points(part, state._replace(sigma_px=sigma_px))
     return state

@@ -3,9 +3,7 @@
 Poses are far more accurate than predicted depth. A neighbour, warped into the keyframe by pose and depth, differs from
 it by a small flow; its part along the epipolar line measures the error of depth, its part across tests the poses and
 the rigidity of the tissue. Estimates of several neighbours are combined by M-estimation, and what they disagree by is
-the standard deviation: where they agree less than the predicted depth is uncertain, that depth stays. Where tissue is
-known to move, frames count the less the farther it moved between them and the keyframe: nothing tests a motion along
-the epipolar line.
+the standard deviation: where they agree less than the predicted depth is uncertain, that depth stays.
 """
 
 from __future__ import annotations
@@ -22,8 +20,7 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
-from scopemap.engine.geometry.se3 import inverse, transform
-from scopemap.engine.mapping.tissue_states import TissueStates
+from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.mapping.triangulation import (
     VIEW_SIGMA,
     Intrinsics,
@@ -68,14 +65,12 @@ class StereoView(NamedTuple):
     """A frame for triangulation.
 
     contrast : (H, W, 3) uint8, grey values with normalised local contrast, from `normalised_contrast`. depth_mm :
-    (H, W) float32, NaN = unknown or not usable. T_world_camera : (4, 4). moved_px : of a neighbour, how far the tissue
-    at each pixel of the triangulated frame had moved when it was seen, (H, W) float32, px.
+    (H, W) float32, NaN = unknown or not usable. T_world_camera : (4, 4).
     """
 
     contrast: np.ndarray
     depth_mm: np.ndarray
     T_world_camera: np.ndarray
-    moved_px: np.ndarray | np.float32 = np.float32(0)
 
 
 class TriangulatedDepth(NamedTuple):
@@ -177,9 +172,7 @@ class KeyframeDepths:
         keyframes: Sequence[int],
         camera: PinholeCamera,
         flow: FlowEstimator,
-        states: TissueStates | None = None,
     ) -> None:
-        self._states = states
         self._poses, self._order, self.keyframes = T_world_camera, sorted(T_world_camera), list(keyframes)
         self._stereo_view = lru_cache(_CACHED_VIEWS)(partial(self._read, view))
         self._camera, self._flow = camera, flow
@@ -223,27 +216,9 @@ class KeyframeDepths:
         place = bisect_left(self._order, keyframe)
         near = self._order[max(0, place - _SEARCHED_FRAMES) : place + 1 + _SEARCHED_FRAMES]
         chosen = choose_neighbours(keyframe, view.depth_mm, self._camera, {n: self._poses[n] for n in near})
-        found = triangulate_depth(view, self._neighbours(keyframe, view, chosen), self._camera, self._flow)
+        found = triangulate_depth(view, map(self._stereo_view, chosen), self._camera, self._flow)
         self.triangulated += found is not None
         return found
-
-    def _neighbours(self, keyframe: int, view: StereoView, chosen: Sequence[int]) -> list[StereoView]:
-        """Return the views of the frames that triangulate a keyframe's depth."""
-        views, states = [self._stereo_view(number) for number in chosen], self._states
-        known = np.isfinite(view.depth_mm)
-        if states is None or not known.any():
-            return views
-        some = (slice(_SAMPLED_EVERY // 2, None, _SAMPLED_EVERY),) * 2
-        filled_mm = np.where(known, view.depth_mm, np.float32(np.median(view.depth_mm[known])))[some]
-        points = transform(view.T_world_camera, (self._camera.rays[some] * filled_mm[..., None]).reshape(-1, 3))
-        motion_px = states.motion(points) * (self._camera.fx / filled_mm).reshape(-1, 1)
-
-        def moved_px(number: int) -> np.ndarray:
-            moved = np.tensordot(states.change(number) - states.change(keyframe), motion_px, 1)
-            lengths = np.linalg.norm(moved, axis=1).reshape(filled_mm.shape).astype(np.float32)
-            return cv2.resize(lengths, known.shape[::-1])
-
-        return [seen._replace(moved_px=moved_px(number)) for seen, number in zip(views, chosen, strict=True)]
 
 
 def _estimates(
@@ -262,7 +237,6 @@ def _estimates(
         log_factor, slope, across = epipolar_error(flow.estimate_small(view.contrast, warped), seen)
         # A neighbourhood that moves across the epipolar lines moves along them as well.
         variance_px = np.float32(_FLOW_SIGMA_PX**2) + across + _around(across)
-        variance_px += neighbour.moved_px**2
         information = slope / (variance_px + np.float32(VIEW_SIGMA**2) * slope)
         if (information := np.where(textured, information, np.float32(0))).any():
             found.append((log_factor, information))

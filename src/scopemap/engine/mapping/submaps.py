@@ -283,7 +283,7 @@ class FinalFrames:
     Attributes
     ----------
     T_world_camera : corrected poses (4, 4) by number. keyframes : numbers of those whose depth can be triangulated:
-    none where neither a rigid scene nor one with a rigid core explains the observations.
+    none where no rigid scene explains the observations.
     """
 
     def __init__(
@@ -291,11 +291,9 @@ class FinalFrames:
     ) -> None:
         """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
         self._stored, self._correction = read, correction
-        moves = correction is not None and correction.tissue is not None and not correction.tissue.deformation.has_core
-        rigid = correction is not None and not correction.refused and not moves
         correct = correction.pose if correction is not None else lambda _, pose: pose
         self.T_world_camera = {index: correct(index, pose) for index, pose in sorted(T_world_camera.items())}
-        adjusted = correction.index.tolist() if rigid and correction is not None else []
+        adjusted = correction.index.tolist() if correction is not None and not correction.refused else []
         self.keyframes = [index for index in adjusted if index in self.T_world_camera]
 
     def frames(

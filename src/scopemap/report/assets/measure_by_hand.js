@@ -17,12 +17,12 @@ async function measuredFrame(picture) {
     const units = 256 * bytes[at] + bytes[at + 1], own = units ? Math.fround(units * run.depth_unit_mm) : NaN;
     return [own, Math.fround((run.sigma_shares[bytes[at + 2]] ?? NaN) * own)];
   };
-  return { camera, map, row: picture.row, depthAt, pose: run.poseOf(picture.row), name: run.indices[picture.row] };
+  return { camera, map, depthAt, pose: run.poseOf(picture.row), name: run.indices[picture.row] };
 }
 
 // The pixels of points (world) in a picture's frame, or null where it does not see all of them.
 function pixelsIn(picture, points) {
-  const pose = run.poseOf(picture.row), c = run.camera, surface = surfaceOf(run.maps[run.places[picture.row]], picture.row), pixels = [];
+  const pose = run.poseOf(picture.row), c = run.camera, surface = surfaceOf(run.maps[run.places[picture.row]]), pixels = [];
   for (const point of points) {
     const [x, y, z] = inCamera(pose, point), pixel = rounded([(x / z) * c.fx + c.cx, (y / z) * c.fy + c.cy]);
     if (!(z > 0 && pixel.every((value, k) => value >= -0.5 && value < [c.width, c.height][k] - 0.5))) return null;
@@ -88,14 +88,14 @@ function pickInFrame(event) {
   const at = (client, start, size, pixels, all) => ((client - start - (size - pixels * zoom) / 2) / zoom) * (all / pixels) - 0.5;
   const pixel = rounded([at(event.clientX, box.left, box.width, canvas.width, c.width), at(event.clientY, box.top, box.height, canvas.height, c.height)]);
   if (!pixel.every((value, k) => value >= -0.5 && value < [c.width, c.height][k] - 0.5)) return;
-  const pose = run.poseOf(picture.row), found = meet(surfaceOf(run.maps[shown], picture.row), pose.t, rotated(pose.R, unprojected(c, pixel)));
+  const pose = run.poseOf(picture.row), found = meet(surfaceOf(run.maps[shown]), pose.t, rotated(pose.R, unprojected(c, pixel)));
   pick(found && { picture, pixel, at: found.at });
 }
 
 function pickOnSurface(event) {
   const scene = element("scene"), box = scene.getBoundingClientRect(), from = eye(run.places[row] === shown ? run.poseOf(row) : null);
   const ray = unprojected(lensOf(box.width, box.height, from.fieldOfView), [event.clientX - box.left - 0.5, event.clientY - box.top - 0.5]);
-  const found = meet(surfaceOf(run.maps[shown], row), from.t, rotated(from.R, ray), element("cut").checked);
+  const found = meet(surfaceOf(run.maps[shown]), from.t, rotated(from.R, ray), element("cut").checked);
   pick(found && { at: found.at });
 }
 

@@ -8,20 +8,12 @@ const norm = (a) => Math.sqrt(dot(a, a));
 const unprojected = (c, [x, y]) => [(x - c.cx) / c.fx, (y - c.cy) / c.fy, 1];
 const inCamera = ({ R, t }, p) => rotated(transposed(R), minus(p, t));
 
-// Positions (3 numbers a vertex) of a shape of a map; where tissue moves, in the state of a row's frame.
-function positionsAt(map, { positions, low, spread, motion }, at) {
-  const levels = new Uint16Array(bytesOf(positions)), p = Float64Array.from(levels, (level, i) => low[i % 3] + (level / 65535) * spread[i % 3]);
-  const motions = motion && new Float32Array(bytesOf(motion));
-  (map.changes?.[at] ?? []).forEach((change, curve) => p.forEach((_, i) => (p[i] += change * motions[curve * p.length + i])));
-  return p;
-}
-
-// Positions and faces of a map's measured surface, in the state of a row's frame.
-function surfaceOf(map, row) {
-  const shape = map.measured || map, state = map.changes ? row : 0;
-  if (map.surface?.state === state) return map.surface;
-  const p = positionsAt(map, shape, state);
-  return (map.surface = { state, p, faces: new Uint32Array(bytesOf(shape.faces)), at: (v) => [p[3 * v], p[3 * v + 1], p[3 * v + 2]] });
+// Positions (3 numbers a vertex) and faces of a map's measured surface.
+function surfaceOf(map) {
+  if (map.surface) return map.surface;
+  const { positions, low, spread, faces } = map.measured || map, levels = new Uint16Array(bytesOf(positions));
+  const p = Float64Array.from(levels, (level, i) => low[i % 3] + (level / 65535) * spread[i % 3]);
+  return (map.surface = { p, faces: new Uint32Array(bytesOf(faces)), at: (v) => [p[3 * v], p[3 * v + 1], p[3 * v + 2]] });
 }
 
 // The first point of a surface on a ray, {at, face}, or null; frontOnly: seen from behind it is looked through.
@@ -193,7 +185,7 @@ function checkReference([[a, b], [c, d]], errors) {
 
 // What was measured in a frame {camera, pose, map, name, depthAt}: [{what, value, low, high, unit}]; refusals are thrown.
 function measured(frame, pixels, reference = null, referenceMm = null) {
-  const { camera, pose, map } = frame, surface = surfaceOf(map, frame.row), errors = map.errors;
+  const { camera, pose, map } = frame, surface = surfaceOf(map), errors = map.errors;
   const picked = (places) => places.map((pixel) => {
     const inside = pixel[0] >= -0.5 && pixel[1] >= -0.5 && pixel[0] < camera.width - 0.5 && pixel[1] < camera.height - 0.5;
     const found = inside && meet(surface, pose.t, rotated(pose.R, unprojected(camera, pixel)));

@@ -85,7 +85,6 @@ function drawScene() {
   view.paint = Number(element("paint").value);
   view.cut = element("cut").checked;
   const near = Math.max(0.004 * radius, distance - 2 * radius);
-  run.maps[shown].row = row;
   view.draw(run.maps[shown], from, {
     near, far: distance + 3 * radius, fieldOfView: from.fieldOfView, lines: [...pathLines(), ...handLines()],
     frustum: [...(corners && !from.through ? frustumLines(pose, corners) : []), ...spotLines()], corners: from.through ? null : corners,
@@ -117,7 +116,6 @@ async function setRow(next) {
   panels.shown = near;
   const of = near ? near.row : row, pose = run.places[of] === shown ? run.poseOf(of) : null;
   put("video-note", near && near.row !== row ? `of frame ${run.indices[near.row]}` : "");
-  run.maps[shown].row = of;
   view?.setPicture(images ? images.video : null);
   const median = panels.draw(images, run.maps[shown], view && pose, { showMask: element("mask").checked, far: 8 * run.balls[shown].radius + 2 * run.depth_range[1] });
   markPictures();

@@ -132,7 +132,7 @@ class SurfaceView {
     new Uint8Array(bytesOf(mesh.moving)).forEach((value, i) => (scalars[3 * i + 2] = value));
     gl.bindVertexArray(vao);
     const arrays = [
-      ["normal", bytesOf(mesh.normals), 3, gl.BYTE],
+      ["position", bytesOf(mesh.positions), 3, gl.UNSIGNED_SHORT], ["normal", bytesOf(mesh.normals), 3, gl.BYTE],
       ["colour", bytesOf(mesh.colours), 3, gl.UNSIGNED_BYTE], ["scalars", scalars, 3, gl.UNSIGNED_BYTE],
     ];
     for (const [name, values, count, kind] of arrays) {
@@ -141,16 +141,11 @@ class SurfaceView {
       gl.enableVertexAttribArray(at[name]);
       gl.vertexAttribPointer(at[name], count, kind, true, 0, 0);
     }
-    const places = gl.createBuffer(), kind = mesh.motion ? gl.FLOAT : gl.UNSIGNED_SHORT;
-    gl.bindBuffer(gl.ARRAY_BUFFER, places);
-    if (!mesh.motion) gl.bufferData(gl.ARRAY_BUFFER, bytesOf(mesh.positions), gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(at.position);
-    gl.vertexAttribPointer(at.position, 3, kind, true, 0, 0);
     const faces = bytesOf(mesh.faces);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    const ready = { vao, places, row: NaN, count: faces.byteLength / 4, gain: this.#gainOf(new Uint8Array(bytesOf(mesh.colours))) };
+    const ready = { vao, count: faces.byteLength / 4, gain: this.#gainOf(new Uint8Array(bytesOf(mesh.colours))) };
     this.uploaded.set(mesh, ready);
     return ready;
   }
@@ -166,19 +161,9 @@ class SurfaceView {
     return sums.length ? Math.max(1, Math.min(3, 400 / at(sums, 0.5), 255 / at(most, 0.9))) : 1;
   }
 
-  // Move tissue into the state of the frame in `mesh.row`.
-  #move(mesh, ready) {
-    if (!mesh.motion || ready.row === mesh.row) return;
-    const gl = this.gl, p = positionsAt(mesh, mesh, mesh.row);
-    gl.bindBuffer(gl.ARRAY_BUFFER, ready.places);
-    gl.bufferData(gl.ARRAY_BUFFER, Float32Array.from(p, (value, i) => (value - mesh.low[i % 3]) / (mesh.high[i % 3] - mesh.low[i % 3])), gl.DYNAMIC_DRAW);
-    ready.row = mesh.row;
-  }
-
   // Draw a mesh from a pose through a lens into what is bound. purpose and the rest: see the shader.
   #drawMesh(mesh, pose, lens, near, far, { purpose = 0, paint = 0, cut = false, lamp = false, gain = null, depthRange = [1, 2] } = {}) {
     const gl = this.gl, { program, uniforms } = this.programs.mesh, ready = this.#uploadedMesh(mesh), { vao, count } = ready;
-    this.#move(mesh, ready);
     gl.useProgram(program);
     gl.uniform3fv(uniforms.low, mesh.low);
     gl.uniform3fv(uniforms.spread, mesh.high.map((value, k) => value - mesh.low[k]));
