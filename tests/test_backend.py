@@ -16,10 +16,11 @@ from scopemap.engine.flow.corners import detect_corners, sample_flow
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp, se3_log
-from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose, adjusted_maps, other_starts
+from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose, adjusted_maps, backend, other_starts
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
 from scopemap.engine.mapping.frame_correction import KeyframeStep
+from scopemap.engine.mapping.lens_test import LensTest
 from scopemap.engine.mapping.other_starts import ShapeTest
 
 POSES = [
@@ -47,6 +48,15 @@ def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
     assert translation_mm < 0.15 * before[1]
     assert correction.sigma_px < 0.3
     assert "adjustment of 5 keyframes" in correction.notice.text
+
+
+def test_poses_stay_as_tracked_where_left_out_tracks_prefer_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backend, "lens_test", lambda problem, solution: LensTest(held_px=1.04, tracked_px=0.74))
+    correction = plane_scene.adjusted(_frame(number) for number in range(4))
+    assert correction.refused is not None
+    assert correction.refused.code == "mapping-worse"
+    assert "than as tracked (0.74 px)" in correction.refused.text
+    np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
 
 
 def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
@@ -87,10 +97,10 @@ def test_an_error_with_a_keyframe_is_raised_at_a_later_call(monkeypatch: pytest.
         raise RuntimeError("flow broke")
 
     monkeypatch.setattr(FeatureTracks, "add", broken)
-    backend = Backend(MappingSettings(), DisFlow())
-    backend.add(_frame(0))
+    mapper = Backend(MappingSettings(), DisFlow())
+    mapper.add(_frame(0))
     with pytest.raises(RuntimeError, match="flow broke"):
-        backend.adjust()
+        mapper.adjust()
 
 
 def _tracked(keyframe: int, x_mm: float, segment: int = 0) -> TrackedPose:
@@ -126,10 +136,10 @@ def test_the_motion_from_a_keyframe_is_scaled_as_its_depth_is() -> None:
 
 def test_the_step_of_a_keyframe_that_was_moved_as_it_came_is_spread_over_the_frames_that_lead_to_it() -> None:
     """Frames drift by 0.5 mm until the next keyframe, every tenth, which comes back to its place."""
-    backend = Backend(MappingSettings(), DisFlow())
+    mapper = Backend(MappingSettings(), DisFlow())
     drift, tracked = se3_exp(np.array([0, 0, 0, 0.5, 0, 0])), {}
     for number, true in enumerate(POSES):
-        backend.add(
+        mapper.add(
             _frame(number),
             tracked.setdefault(10 * number, TrackedPose(0, max(10 * number - 10, 0), true)),
             step=KeyframeStep(drift, np.log(1.25)) if number else None,
@@ -138,7 +148,7 @@ def test_the_step_of_a_keyframe_that_was_moved_as_it_came_is_spread_over_the_fra
             middle = POSES[number - 1] @ se3_exp(0.5 * se3_log(inverse(POSES[number - 1]) @ true))
             half = se3_exp(np.array([0, 0, 0, 0.25, 0, 0]))
             tracked[10 * number - 5] = TrackedPose(0, 10 * number - 10, middle @ half)
-    correction = plane_scene.only(backend.adjust(0, tracked))
+    correction = plane_scene.only(mapper.adjust(0, tracked))
     for number in range(1, len(POSES)):
         before, own, after = (correction.pose(i, tracked[i].T_world_camera) for i in np.arange(-10, 1, 5) + 10 * number)
         between = 0.5 * (before + after)[:3, 3]

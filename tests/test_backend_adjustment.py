@@ -11,7 +11,7 @@ from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.engine.mapping.bundle_adjustment import adjust, adjust_in_windows
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.engine.mapping.lens_test import lens_test
+from scopemap.engine.mapping.lens_test import LensTest, lens_test
 
 LOOSE = Priors(rotation_rad=10, translation_share=10)
 
@@ -56,6 +56,14 @@ def test_a_shifted_centre_alone_contradicts_no_lens() -> None:
     points, observations = replace(points, pixel=points.pixel + off_px), replace(observations, pixel=seen)
     problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, FOCAL_PX)
     assert not lens_test(problem, adjust(problem).state).contradicts
+
+
+@pytest.mark.parametrize(("held_px", "is_worse"), [(0.99 * 0.74, False), (1.04, True), (0.78, False)])
+def test_an_adjustment_is_worse_where_left_out_tracks_prefer_the_poses_as_tracked(
+    held_px: float, is_worse: bool
+) -> None:
+    assert LensTest(held_px=held_px, tracked_px=0.74).is_worse == is_worse
+    assert not LensTest(held_px=held_px).is_worse  # not tested
 
 
 def test_a_scene_that_is_not_rigid_contradicts_no_lens() -> None:
