@@ -149,12 +149,12 @@ class AdjustedMaps(NamedTuple):
     main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph,
     infinite where the depths of keyframes agree less there than as tracked. between_px : the largest between another
     map and all others. support : keyframes on either side of the accepted loops of the least supported map. problem,
-    rigid : what was solved, and the solution, refused or not.
+    solution : what was solved, and where that ended, refused or not.
     """
 
     correction: FrameCorrection
     problem: BundleProblem
-    rigid: State
+    solution: State
     main_px: float
     largest_px: float
     between_px: float

@@ -217,7 +217,7 @@ class Backend:
         alone : the main map's own adjustment, which tells enough of the lens.
         """
         tested = found if alone.correction.refused else alone
-        lens = lens_test(tested.problem, tested.rigid)
+        lens = lens_test(tested.problem, tested.solution)
         if lens.is_worse and tested is found and not found.correction.refused:
             worse = Notice("mapping-worse", {"error_px": lens.held_px, "tracked_px": lens.tracked_px, "merged": ""})
             return replace(self._keyframes_of(worlds).uncorrected(lens.held_px), refused=worse, lens=lens)
