@@ -9,7 +9,7 @@ import pytest
 from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.engine.mapping.bundle_adjustment import adjust, adjust_in_windows
+from scopemap.engine.mapping.bundle_adjustment import adjust, adjust_in_windows, linearised
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
 from scopemap.engine.mapping.lens_test import LensTest, lens_test
 
@@ -158,3 +158,14 @@ def test_depth_uncertainty_follows_from_the_baseline() -> None:
     # A pixel moves by fx baseline / depth, and the floor of a pixel's deviation is 0.1.
     np.testing.assert_allclose(found.log_depth_sigma[:49], 0.1 * depth_mm[:49] / (FOCAL_PX * baseline_mm), rtol=0.02)
     assert np.isinf(found.log_depth_sigma[49])
+
+
+def test_a_step_leaves_the_model_as_it_is() -> None:
+    rng = np.random.default_rng(0)
+    T, points, observations = world(rng)
+    problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, FOCAL_PX)
+    model = linearised(problem, problem.begin)
+    matrix = model.matrix.copy()
+    step = model.gauss_newton_step()
+    np.testing.assert_array_equal(model.matrix, matrix)
+    np.testing.assert_array_equal(model.gauss_newton_step(), step)

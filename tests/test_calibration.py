@@ -241,6 +241,15 @@ def test_calibrations_that_cannot_be_are_refused(text: str, message: str, tmp_pa
     assert "\n" not in str(caught.value)
 
 
+def test_a_lens_that_the_format_does_not_know_is_refused(tmp_path: Path) -> None:
+    class Unknown:
+        width, height, central = 640, 480, PINHOLE
+
+    with pytest.raises(CalibrationError, match="Unknown is no lens that the format knows"):
+        write_calibration(Unknown(), tmp_path / "c.yaml")
+    assert not (tmp_path / "c.yaml").exists()
+
+
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"nowhere\.yaml: there is no such file"):
         read_calibration(tmp_path / "nowhere.yaml", (640, 480))

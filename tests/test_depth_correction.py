@@ -14,7 +14,7 @@ from scopemap.engine.config import MappingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.mapping import MAX_LOG_FACTOR, FrameCorrection
 from scopemap.engine.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthCorrectionField, fit_depth_correction
-from scopemap.engine.mapping.submaps import corrected_frame
+from scopemap.engine.mapping.submaps import FinalFrames
 
 HEIGHT, WIDTH = 120, 160
 
@@ -89,7 +89,7 @@ def test_a_frame_between_two_keyframes_interpolates_both_fields() -> None:
         np.testing.assert_allclose(correction.depth_factors(index, depth_mm), np.exp([[log, np.nan]]), rtol=1e-5)
     camera, rgb, valid = plane_scene.CAMERA.resized(2, 1), np.zeros((1, 2, 3), np.uint8), np.ones((1, 2), bool)
     frame = Frame(15, 0.0, rgb, camera, valid, depth_mm, np.eye(4), depth_sigma_mm=0.1 * depth_mm)
-    done = corrected_frame(frame, correction)
+    (done,) = FinalFrames(correction, {15: np.eye(4)}, lambda _: frame).frames(None)
     np.testing.assert_allclose(done.depth_sigma_mm / done.depth_mm, [[0.1, np.nan]], rtol=1e-5)
     assert correction.notice.values["depth_change"] == pytest.approx(0.2214, abs=1e-4)
 

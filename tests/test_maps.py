@@ -26,7 +26,7 @@ from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.engine.mapping import Backend, Mapper, TrackedPose
 from scopemap.engine.mapping.pose_graph import PoseGraph, optimise_pose_graph
-from scopemap.engine.mapping.submaps import corrected_frame
+from scopemap.engine.mapping.submaps import FinalFrames
 from scopemap.engine.tracking.relocalisation import Relocaliser
 from scopemap.engine.tracking.track import Track
 from scopemap.evaluation.poses import match, pose_report
@@ -183,8 +183,8 @@ def test_maps_of_the_same_place_are_merged() -> None:
     correction = plane_scene.only(backend.adjust(0, tracked))
     assert sorted(correction.S_common_map) == [0, 1]
     assert correction.notice.values["maps"] == 2
-    for frame, at_mm in zip(frames, places, strict=True):
-        moved = corrected_frame(frame, correction)
+    final = FinalFrames(correction, {frame.index: frame.T_world_camera for frame in frames}, lambda n: frames[n // 10])
+    for moved, at_mm in zip(final.frames(None), places, strict=True):
         np.testing.assert_allclose(moved.T_world_camera, plane_scene.pose(at_mm=at_mm), atol=0.1)
         np.testing.assert_allclose(moved.depth_mm, plane_scene.see(plane_scene.pose(at_mm=at_mm)).depth_mm, rtol=0.05)
 
@@ -220,6 +220,17 @@ def test_the_pose_graph_merges_no_maps_whose_depths_then_disagree(zoom: float, m
         assert correction is not None
         assert correction.refused
         assert sorted(correction.S_common_map) == ([0] if zoom else [0, 1])
+
+
+def test_poses_are_read_anew_where_as_many_were_forgotten_as_added() -> None:
+    mapper = Mapper(MappingSettings(method="none"), DisFlow())
+    for number in range(4):
+        mapper.observe(Track(number, "ok", "", np.eye(4), 0))
+    assert mapper.submaps()[0][0].frames == {0, 1, 2, 3}
+    mapper.forget([0, 1])
+    for number in (4, 5):
+        mapper.observe(Track(number, "ok", "", np.eye(4), 2))
+    assert mapper.submaps()[0][0].frames == {2, 3, 4, 5}
 
 
 @pytest.mark.parametrize(("far", "found", "split"), [(True, False, True), (True, True, False), (False, False, False)])

@@ -15,6 +15,7 @@ from scopemap.input.opening import open_sequence
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.input.video import VideoFile
 from scopemap.result.reference import reference_trajectory
+from scopemap_bench.datasets import scared
 from scopemap_bench.datasets.scared import ScaredKeyframe
 
 Writer = Callable[[Path], Path]
@@ -43,7 +44,7 @@ def test_it_is_the_truth_of_the_selected_frames(
     for owner, name in (
         (VideoFile, "frames"),
         (ScaredKeyframe, "_depth_mm"),
-        (images, "decoded_image"),
+        (scared, "decoded"),
         (images, "read_decoded"),
     ):
         monkeypatch.setattr(owner, name, refuse)

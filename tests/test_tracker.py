@@ -12,8 +12,8 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.tracking.pyramid import build_pyramid
-from scopemap.engine.tracking.rtdl import align
-from scopemap.engine.tracking.tracker import Tracker
+from scopemap.engine.tracking.rtdl import Alignment, Motion, align
+from scopemap.engine.tracking.tracker import KeyframeChoice, Tracker
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
 
@@ -137,6 +137,18 @@ def test_a_fading_keyframe_is_replaced_before_its_turn(share: float, wanted: boo
     known = replace(frames[2], T_world_camera=track.T_world_camera)
     assert tracker.insert_keyframe(known, measured=True)
     assert not tracker.needs_keyframe()
+
+
+def test_a_keyframe_is_due_after_a_frame_that_features_alone_have_found() -> None:
+    frames, _ = _sequence()
+    choice = KeyframeChoice(SETTINGS)
+    choice.see(frames[1])
+    well = Alignment(Motion(np.eye(4), np.array([1.0, 0.0])), 0.1, 1.0, 1.0, 1.0, 1.0, 1)
+    choice.accept(well, flow_failed=True)
+    assert choice.is_due()
+    assert not choice.is_due(well), "how well a frame fits is not changed by how the one before was found"
+    choice.accept(well)
+    assert not choice.is_due()
 
 
 def test_a_keyframe_without_depth_is_refused() -> None:

@@ -19,7 +19,7 @@ from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.align import AlignMode
 from scopemap.engine.masking.masker import Masker
 from scopemap.evaluation.poses import MatchedTrajectories, frames_until_loss, longest_run, match, pose_report
-from scopemap.evaluation.turn import NOT_DETERMINED
+from scopemap.evaluation.turn import NOT_DETERMINED, Turn
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
 from scopemap.input.trajectory.trajectory import Trajectory
@@ -41,6 +41,7 @@ from scopemap_bench.true_depth import TrueDepths
 
 _CONSISTENCY_PX = 1.0
 _MAX_VIEWS = 40
+_LIMIT_MM = 0.5  # a turn that moves surfaces by less leaves them as they are
 
 
 def score(
@@ -118,10 +119,18 @@ def surface_figures_of(
     if true_surface.T_view is not None:
         camera = (open_sequence(truth) if isinstance(truth, Path) else truth).camera
     figures = measure_surface(moved, true_surface, camera=camera, icp=icp)
-    if matched.turn.determines_surface(np.asarray(moved.vertices), figures["accuracy_mean_mm"]):
+    if _determines_surface(matched.turn, np.asarray(moved.vertices), figures["accuracy_mean_mm"]):
         return figures | {"turn": ""}
     kept = {name: value for name, value in figures.items() if "icp" in name or name == "observed_share"}
     return dict.fromkeys(figures, math.nan) | kept | {"turn": NOT_DETERMINED}
+
+
+def _determines_surface(turn: Turn, points_mm: np.ndarray, error_mm: float) -> bool:
+    """Return whether a distance that points (N, 3), mm, were found to have after the alignment is the method's."""
+    if not len(points_mm):
+        return True
+    arm_mm = np.sqrt(np.mean(np.sum((points_mm - turn.centre_mm) ** 2, axis=1)))
+    return turn.determines(float(turn.off_rad * arm_mm), max(_LIMIT_MM, error_mm / 2))
 
 
 def _seen_surface(sequence: Sequence) -> TrueSurface | None:

@@ -15,9 +15,8 @@ from scopemap.engine.geometry.se3 import rotation_angle_rad
 NOT_DETERMINED = "not determined"
 """The word for figures that may be the alignment's own error."""
 
-# A turn that changes rotations by less, or surfaces by less, leaves them as they are.
+# A turn that changes rotations by less leaves them as they are.
 _LIMIT_RAD = float(np.radians(0.5))
-_LIMIT_MM = 0.5
 # Of 500 drawn odometries along tubes and lines whose relative poses err, by noise and by a bias, the turn was within
 # two of its standard deviations in 97 %, within three in more than 99 %.
 _BOUND = 3.0
@@ -49,16 +48,9 @@ class Turn:
 
     def determines_rotation(self, error_rad: float) -> bool:
         """Return whether a rotation error that was measured after the alignment is the method's."""
-        return self._determines(self.off_rad, max(_LIMIT_RAD, error_rad / 2))
+        return self.determines(self.off_rad, max(_LIMIT_RAD, error_rad / 2))
 
-    def determines_surface(self, points_mm: np.ndarray, error_mm: float) -> bool:
-        """Return whether a distance that points (N, 3), mm, were found to have after the alignment is the method's."""
-        if not len(points_mm):
-            return True
-        arm_mm = np.sqrt(np.mean(np.sum((points_mm - self.centre_mm) ** 2, axis=1)))
-        return self._determines(float(self.off_rad * arm_mm), max(_LIMIT_MM, error_mm / 2))
-
-    def _determines(self, share: float, harmless: float) -> bool:
+    def determines(self, share: float, harmless: float) -> bool:
         """Return whether the turn's `share` of an error is harmless, or none: more than positions can be off by."""
         return share <= harmless or self.off_rad > _BOUND * self.sigma_rad
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.input.camera_files.reading import stated_calibration
-from scopemap.input.decoding import by_number, decoded, frame_number, read_decoded, stated_size
+from scopemap.input.decoding import frame_number, read_decoded, stated_size
 from scopemap.input.sampling import MOST_REPEATS, SampledPair, pair_of
 from scopemap.input.source import OWN_CALIBRATION, Source, SourceFrame
 
@@ -37,23 +37,20 @@ def image_files(folder: Path) -> list[Path]:
     """Return the colour images in `folder` in numeric order; not depth, not masks, none of a run's folder."""
     if all((folder / name).is_file() for name in ("trajectory.tum", "provenance.json")):
         return []
-    files = sorted(_images_in(folder), key=numeric_order)
+    files = sorted(images_in(folder), key=numeric_order)
     return [file for file in files if not _COMPANION.search(file.stem)]
 
 
-def numbered_images(folder: Path) -> dict[int, Path]:
-    """Return the images in `folder` with a number in their names, depth and masks too, as `by_number`."""
-    return by_number(file for file in _images_in(folder) if frame_number(file) is not None)
+def images_in(folder: Path) -> list[Path]:
+    """Return all images in `folder`, depth and masks too, but for hidden files; [] where there is no folder."""
+    files = folder.iterdir() if folder.is_dir() else ()
+    return [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
 
 
 def read_image(file: Path) -> np.ndarray | None:
     """Return the image as (h, w, 3) uint8 RGB, whatever its depth and channels; None where it cannot be read."""
-    return _rgb(read_decoded(file, cv2.IMREAD_COLOR))
-
-
-def decoded_image(content: bytes) -> np.ndarray | None:
-    """Return the image in a file's `content` as (h, w, 3) uint8 RGB; None where it holds none."""
-    return _rgb(decoded(content, cv2.IMREAD_COLOR))
+    image = read_decoded(file, cv2.IMREAD_COLOR)
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 class ImageFolder(Source):
@@ -152,15 +149,6 @@ class ImageFolder(Source):
             yield
         except (CalibrationError, InputError) as fault:
             self.camera_fault = fault
-
-
-def _images_in(folder: Path) -> list[Path]:
-    files = folder.iterdir() if folder.is_dir() else ()
-    return [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
-
-
-def _rgb(image: np.ndarray | None) -> np.ndarray | None:
-    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _numbers(files: list[Path]) -> list[int]:

@@ -84,7 +84,7 @@ class Verdict:
 
 
 def verdict(run: Result) -> Verdict:
-    """Return the verdict on a run, from its frames and its provenance."""
+    """Return the verdict on a run, from its frames, surfaces, submaps, segments and provenance."""
     found = [*_of_end(run), *_of_notices(run), *_of_adjustment(run), _of_frames(run), *_of_maps(run)]
     found += [*_of_surface(run.provenance.get("surface") or {}, len(run.mesh.faces)), *_of_segments(run)]
     found += _of_camera(run)

@@ -14,9 +14,8 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import CalibrationError, InputError, reporting
 from scopemap.engine.notices import Notice
-from scopemap.input.images import numbered_images
 from scopemap.input.trajectory.poses import rigid
-from scopemap_bench.datasets.layouts import LayoutFolder, Place
+from scopemap_bench.datasets.layouts import LayoutFolder, Place, numbered_images
 
 _POSES = ("poses_bounds.npy", "pose_bounds.npy")
 _MASKS = "gt_masks"

@@ -19,8 +19,7 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError, check_bytes, reporting
 from scopemap.input.decoding import read_decoded
-from scopemap.input.trajectory.poses import poses_by_row
-from scopemap_bench.datasets.layouts import Place, UnityFolder
+from scopemap_bench.datasets.layouts import Place, UnityFolder, poses_by_row
 
 UNITY_CAMERA = PinholeCamera(156.0418, 155.7529, 178.5604, 181.8043, 320, 320)
 """UnityCam's `cam.txt` as others quote it, for copies without it."""

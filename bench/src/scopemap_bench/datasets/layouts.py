@@ -15,9 +15,9 @@ import numpy as np
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import TruthQuality
 from scopemap.input.camera_files.reading import stated_calibration
-from scopemap.input.decoding import by_number
-from scopemap.input.images import ImageFolder, image_files, numbered_images
-from scopemap.input.trajectory.poses import poses_by_row
+from scopemap.input.decoding import by_number, frame_number
+from scopemap.input.images import ImageFolder, image_files, images_in
+from scopemap.input.trajectory.poses import from_quaternions
 from scopemap.input.trajectory.text import fields_of, text_lines
 
 _HEADER = ["tx", "ty", "tz", "rx", "ry", "rz", "rw", "time(s)"]
@@ -158,3 +158,18 @@ class UnityFolder(LayoutFolder):
         else:
             self._warn(f"{file}: the times do not increase and were left out")
         return len(rows)
+
+
+def numbered_images(folder: Path) -> dict[int, Path]:
+    """Return the images in `folder` with a number in their names, depth and masks too, as `by_number`."""
+    return by_number(file for file in images_in(folder) if frame_number(file) is not None)
+
+
+def poses_by_row(rows: np.ndarray, mm_per_unit: float, where: list[str]) -> dict[int, np.ndarray]:
+    """Return the pose (4, 4), translation in mm, of each row (N, 7) `tx ty tz qx qy qz qw`, by number of the row.
+
+    A row that holds NaN or infinity has no pose. Raises `InputError`, with its `where`, for other quaternions.
+    """
+    known = np.flatnonzero(np.isfinite(rows).all(axis=1))
+    T = from_quaternions(rows[known, 3:], rows[known, :3] * mm_per_unit, [where[row] for row in known])
+    return dict(zip(known.tolist(), T, strict=True))

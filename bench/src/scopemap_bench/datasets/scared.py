@@ -17,13 +17,14 @@ from dataclasses import replace
 from math import gcd
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from scopemap.engine.errors import CalibrationError, InputError, reporting
 from scopemap.engine.frame import TruthQuality
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.decoding import decoded, frame_number
-from scopemap.input.images import ImageFolder, decoded_image, image_files, use_first_calibration
+from scopemap.input.images import ImageFolder, image_files, use_first_calibration
 from scopemap.input.source import OWN_CALIBRATION, Source, SourceFrame
 from scopemap.input.video import VideoFile
 from scopemap_bench.trajectories.numbered import NumberedFiles, find_numbered
@@ -203,7 +204,8 @@ class _ArchivedImages(ImageFolder):
 
     def _image(self, file: Path) -> np.ndarray | None:
         content = self._archive.read(frame_number(file) or 0)
-        return None if content is None else decoded_image(content)
+        image = None if content is None else decoded(content, cv2.IMREAD_COLOR)
+        return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _keyframe(path: Path) -> Path:

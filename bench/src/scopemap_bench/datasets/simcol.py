@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.engine.errors import InputError
-from scopemap.input.trajectory.poses import poses_by_row
 from scopemap.input.trajectory.text import read_numbers
-from scopemap_bench.datasets.layouts import LayoutFolder, Place, mirrored
+from scopemap_bench.datasets.layouts import LayoutFolder, Place, mirrored, poses_by_row
 
 DEPTH_RANGE_MM = 200.0
 _MM_PER_CM = 10.0

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from scopemap.engine.errors import InputError
 from scopemap.input.camera_files.reading import stated_calibration
-from scopemap.input.trajectory.poses import are_frame_numbers, poses_by_row
+from scopemap.input.trajectory.poses import are_frame_numbers
 from scopemap.input.trajectory.text import read_numbers
+from scopemap_bench.datasets.layouts import poses_by_row
 from scopemap_bench.datasets.posed_video import PosedVideo, videos_in
 
 _CALIBRATION = "StereoCalibration.ini"

@@ -1,1 +1,1 @@
-"""Cameras: pinhole and lens models, rectification, and camera file formats."""
+"""Cameras: pinhole and lens models, and rectification."""

@@ -1,1 +1,1 @@
-"""Depth of one image: estimators behind one protocol (`create.py`), metric anchor, consistency over time (MAPIS)."""
+"""Depth of one image: estimators behind one protocol (`estimate.py`), metric anchor, consistency over time (MAPIS)."""

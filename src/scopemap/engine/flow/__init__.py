@@ -1,1 +1,1 @@
-"""Optical flow of two images: estimators behind one protocol (`create.py`), forward-backward consistency, corners."""
+"""Optical flow: estimators behind one protocol (`estimator.py`), forward-backward consistency, corners."""

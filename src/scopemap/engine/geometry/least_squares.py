@@ -261,7 +261,7 @@ class ReducedModel:
 
     @property
     def matrix(self) -> np.ndarray:
-        """Lower half of the second derivative (F, F) by the free unknowns, the points eliminated; a step spoils it."""
+        """Lower half of the second derivative (F, F) by the free unknowns, the points eliminated."""
         return self._normal.matrix
 
     @cached_property
@@ -287,8 +287,8 @@ class ReducedModel:
     def gauss_newton_step(self) -> np.ndarray:
         """Return the step to the minimum."""
         normal = self._normal
-        # LAPACK reads by columns: the lower half is the upper one there, and nothing is copied.
-        factor = cho_factor(normal.matrix.T, overwrite_a=True, check_finite=False)
+        # LAPACK reads by columns: the lower half is the upper one there.
+        factor = cho_factor(normal.matrix.T, check_finite=False)
         solved = cho_solve(factor, normal.by_points - normal.gradient, check_finite=False)
         step = self._step(solved, np.zeros(len(normal.g)))
         shift = normal.g - self.held * step[self.scale]

@@ -107,7 +107,7 @@ class Mapper:
         # What follows changes after the last frame.
         self._changed: dict[int, TrackedPose] = {}
         self._extended: set[int] = set()
-        self._read: dict[int, TrackedPose] = {}
+        self._read: dict[int, TrackedPose] | None = None  # what the rows hold; None: not read since they changed
 
     def observe(self, track: Track) -> None:
         """Note where a frame was tracked, or that it was lost."""
@@ -117,6 +117,7 @@ class Mapper:
         part = self._pose(track)
         self._last = track.index, part
         self._rows.append(np.array([(track.index, *part)], _TRACKED))
+        self._read = None
         if track.relocalised and (found_in := self._poses().get(track.keyframe)) is not None:
             self._relocalised.add(((part.map, part.segment), (found_in.map, found_in.segment)))
 
@@ -169,7 +170,7 @@ class Mapper:
     def forget(self, indices: Collection[int]) -> None:
         """Forget where these frames were tracked: they are in no submap."""
         self._rows.keep(~np.isin(self._rows.read()["index"], list(indices)))
-        self._read = {}
+        self._read = None
 
     def add_keyframe(
         self,
@@ -255,7 +256,7 @@ class Mapper:
 
     def _poses(self) -> dict[int, TrackedPose]:
         """Return the poses of all tracked frames by their numbers; after the last frame they are read once."""
-        if len(self._read) != len(self._rows):
+        if self._read is None:
             found = self._rows.read()
             numbers = (found[name].tolist() for name in ("index", "map", "keyframe", "segment"))
             self._read = {
@@ -266,15 +267,6 @@ class Mapper:
 
     def _pose(self, track: Track) -> TrackedPose:
         return TrackedPose(track.map, track.keyframe, track.T_world_camera, self._lost_frames)
-
-
-def corrected_frame(frame: Frame, correction: FrameCorrection | None) -> Frame:
-    """Return a tracked frame with its pose, its depth and the standard deviation of that corrected."""
-    if correction is None:
-        return frame
-    if frame.T_world_camera is None or frame.depth_mm is None:
-        raise ValueError("a frame to be corrected needs a pose and a depth")
-    return replace(_with_depth(frame, correction), T_world_camera=correction.pose(frame.index, frame.T_world_camera))
 
 
 class FinalFrames:

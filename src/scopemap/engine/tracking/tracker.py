@@ -57,6 +57,7 @@ class KeyframeChoice:
     _best_quality: Kept[float] = 0.0
     _first_agreement: Kept[float | None] = None
     _last: Kept[Alignment | None] = None
+    _flow_failed: Kept[bool] = False
     _depth_mm: Kept[float] = 1.0
 
     def __init__(self, settings: TrackingSettings) -> None:
@@ -67,9 +68,12 @@ class KeyframeChoice:
         self.frames_since += 1
         self._quality, self._best_quality = frame.quality, max(frame.quality, self._best_quality)
 
-    def accept(self, alignment: Alignment) -> None:
-        """Take the alignment of a tracked frame with the current keyframe."""
-        self._last = alignment
+    def accept(self, alignment: Alignment, *, flow_failed: bool = False) -> None:
+        """Take the alignment of a tracked frame with the current keyframe.
+
+        flow_failed : whether only features found the frame; the next keyframe is then due.
+        """
+        self._last, self._flow_failed = alignment, flow_failed
         if self._first_agreement is None:
             self._first_agreement = alignment.agreement
 
@@ -83,6 +87,8 @@ class KeyframeChoice:
 
     def is_due(self, alignment: Alignment | None = None) -> bool:
         """Return whether a frame with this alignment should become a keyframe; None: the one that was accepted last."""
+        if alignment is None and self._flow_failed:
+            return True
         alignment = alignment or self._last
         settings = self._settings
         patience = settings.keyframe_patience if self._quality < _CLEAR * self._best_quality else 0
@@ -309,8 +315,7 @@ class Tracker(FrameTracker):
             self._relocaliser.add(keyframe)
             self._choice.frames_since = 1
         self._use_keyframe(keyframe)
-        # Tracking by flow alone has failed: a keyframe is due.
-        return self._accept(frame, replace(alignment, coverage=0.0), relocalised=relocalised)
+        return self._accept(frame, alignment, flow_failed=True, relocalised=relocalised)
 
     def _use_keyframe(self, keyframe: Keyframe) -> None:
         self._keyframe, self._last = keyframe, None
@@ -322,7 +327,9 @@ class Tracker(FrameTracker):
         assert self._keyframe is not None
         return self._aligner.rejection(self._keyframe, alignment)
 
-    def _accept(self, frame: Frame, alignment: Alignment, *, relocalised: bool = False) -> Track:
+    def _accept(
+        self, frame: Frame, alignment: Alignment, *, flow_failed: bool = False, relocalised: bool = False
+    ) -> Track:
         """Return the track of a frame with the pose of its alignment with the current keyframe."""
         keyframe = self._keyframe
         assert keyframe is not None
@@ -334,7 +341,7 @@ class Tracker(FrameTracker):
         self._after_close_up, self._sharp_frames_lost = False, 0
         self._motion.follow(T_world_camera)
         self._relocaliser.count(keyframe.map)
-        self._choice.accept(alignment)
+        self._choice.accept(alignment, flow_failed=flow_failed)
         track = Track(frame.index, "ok", "relocalised" if relocalised else "", T_world_camera, keyframe.frame.index)
         return replace(_fitted(track, keyframe, alignment), depth_ratio=ratio, relocalised=relocalised)
 

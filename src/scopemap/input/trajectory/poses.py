@@ -46,16 +46,6 @@ def from_quaternions(xyzw: np.ndarray, positions: np.ndarray, where: list[str]) 
     return T
 
 
-def poses_by_row(rows: np.ndarray, mm_per_unit: float, where: list[str]) -> dict[int, np.ndarray]:
-    """Return the pose (4, 4), translation in mm, of each row (N, 7) `tx ty tz qx qy qz qw`, by number of the row.
-
-    A row that holds NaN or infinity has no pose. Raises `InputError`, with its `where`, for other quaternions.
-    """
-    known = np.flatnonzero(np.isfinite(rows).all(axis=1))
-    T = from_quaternions(rows[known, 3:], rows[known, :3] * mm_per_unit, [where[row] for row in known])
-    return dict(zip(known.tolist(), T, strict=True))
-
-
 def are_frame_numbers(stamps: np.ndarray) -> bool:
     """Return whether stamps (N,) are all whole, and small enough to count frames."""
     return bool(np.all((stamps == np.round(stamps)) & (np.abs(stamps) < _MOST_FRAMES)))
