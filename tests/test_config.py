@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import scopemap.engine.config
 from docs.settings_page import settings_page
-from scopemap.engine.config import PRESETS, Config, TrackingSettings, setting_names
+from scopemap.engine.config import PRESETS, Config, MappingSettings, TrackingSettings, setting_names
 from scopemap.engine.config.settings import StageSettings
 from scopemap.engine.errors import SettingsError
 
@@ -50,6 +50,18 @@ def test_precedence_is_defaults_preset_file_single_settings(tmp_path: Path) -> N
     loaded = Config.load("paper", file)
     assert (loaded.tracking.keyframe_every, loaded.smoothing.method, loaded.preset) == (7, "none", "paper")
     assert Config.load("paper", file, {"tracking.keyframe_every": "3"}).tracking.keyframe_every == 3
+
+
+def test_nothing_is_adjusted_of_a_camera_at_rest(tmp_path: Path) -> None:
+    for other in ({}, {"mapping.method": "full"}, {"mapping.local_window": 7}, {"preset": "realtime"}):
+        config = Config.load(settings=other | {"tracking.camera_at_rest": "true"})
+        assert config.mapping == MappingSettings(method="none")
+        assert not config.mapping.adjusts
+        assert Config.load(file=_write(tmp_path, config.toml())) == config
+    assert Config.load(settings={"tracking.camera_at_rest": False}).mapping == MappingSettings()
+    assert Config(tracking=TrackingSettings(camera_at_rest=True)).mapping.method == "none"
+    with pytest.raises(SettingsError, match="keyframe_every"):
+        Config.load(settings={"tracking.camera_at_rest": True, "tracking.keyframe_every": 0})
 
 
 def test_the_preset_is_the_command_lines_before_the_files(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from scopemap.engine.tracking.at_rest import CameraAtRest
 from scopemap.engine.tracking.corner_pose import nonrigidity
 from scopemap.engine.tracking.track import MOVING_SIGMAS
 from scopemap.input.decoding import read_decoded
-from scopemap.runner.estimators import create_estimators
+from scopemap.runner.estimators import create_estimators, largest_depth_mm
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 
@@ -143,6 +143,16 @@ def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushe
         truth_mm = read_decoded(pushed / f"{index:04d}_depth.tiff")[row, column] * np.float64(100 / 65535)
         assert len(vertices) > 5000
         assert np.median(np.abs(vertices[:, 2] - truth_mm)) < 0.05
+
+
+def test_depth_of_a_camera_at_rest_leaves_no_room_for_an_adjustment(pushed: Path) -> None:
+    def largest_mm(settings: dict[str, object]) -> float:
+        config = Config.load(settings=settings)
+        return largest_depth_mm(config, create_estimators(config, open_sequence(pushed)))
+
+    at_rest_mm = largest_mm({"tracking.camera_at_rest": True})
+    assert at_rest_mm == largest_mm({"mapping.method": "none"})
+    assert at_rest_mm < largest_mm({})
 
 
 @pytest.mark.parametrize("at_rest", [True, False])

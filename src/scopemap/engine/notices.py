@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from string import Formatter
 from typing import Any, Literal
 
-Level = Literal["info", "note", "doubtful"]
-"""info: an assumption or a choice. note: a shortcoming. doubtful: one that makes the result doubtful."""
+Level = Literal["good", "info", "note", "doubtful", "bad"]
+"""Of a notice, or of a reason of the verdict. info: an assumption or a choice. note: a shortcoming. doubtful: one that
+makes the result doubtful. Of the verdict alone: good, and bad, not usable."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ A frame is tracked by the keyframe's corners, or by RTDL. The preset `paper` ref
 
 from __future__ import annotations
 
-from scopemap.engine.config import Config, MappingSettings
+from scopemap.engine.config import Config
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.faults import notices_of_faults
 from scopemap.engine.frame import Frame
@@ -48,15 +48,13 @@ class Pipeline:
         if tracker is None and estimators.tracker is not None:
             tracker = estimators.tracker()
         tracker = tracker or Tracker(config.tracking, estimators.corner_flow, estimators.features)
-        # Of a camera at rest there is nothing to adjust.
-        mapping = MappingSettings(method="none") if config.tracking.camera_at_rest else config.mapping
-        features, anchored = estimators.features, config.depth.is_anchored
+        mapping, features, anchored = config.mapping, estimators.features, config.depth.is_anchored
         mapper = Mapper(mapping, estimators.keyframe_flow, store.table, features, anchored)
         local = mapping.local_window and estimators.keyframe_flow.name != "none"
         # In the tracker's thread, so with its flow: that between keyframes is the back end's.
         adjustment = LocalAdjustment(mapping, estimators.corner_flow) if local else None
         self.odometry = Odometry(config, tracker, mapper, adjustment)
-        self.fusion = SurfaceFusion(config.fusion, store, corrected=config.mapping.at_end)
+        self.fusion = SurfaceFusion(config.fusion, store, corrected=mapping.at_end)
 
     @property
     def stages(self) -> dict[str, Preprocessing | Matching | Odometry]:

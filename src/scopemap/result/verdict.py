@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from scopemap.engine.notices import KINDS, Notice, notices_of
+from scopemap.engine.notices import KINDS, Level, Notice, notices_of
 from scopemap.result.frame_table import ELSEWHERE, NOT_USED, FrameTable
 from scopemap.result.input_part import part_of_input
 from scopemap.result.losses import losses, main_cause
@@ -16,7 +16,6 @@ from scopemap.result.result import Result
 from scopemap.result.submap_summaries import doubt_words, submaps_in_time
 from scopemap.result.surface_segments import GOOD_DISAGREEMENT, SurfaceSegment, segment_of_facts
 
-Level = Literal["good", "doubtful", "bad", "note", "info"]
 WORDS: dict[Level, str] = {"good": "good", "doubtful": "doubtful", "bad": "not usable"}
 
 LEAST_FRAMES = 10

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from scopemap.apps.browser.next_steps import NextRun, next_runs, source_of
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import escaped
+from scopemap.engine.notices import Level
 from scopemap.result.summary import summary_facts
-from scopemap.result.verdict import Level, Reason, verdict
+from scopemap.result.verdict import Reason, verdict
 
 _NAMES: dict[Level, str] = {"bad": "Not usable", "doubtful": "Caution", "note": "Note"}
 _GOOD = "The surface agrees with its own video. Its true shape was not measured."

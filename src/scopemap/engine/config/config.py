@@ -19,7 +19,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from scopemap.engine.config.depth import DepthSettings, MapisSettings, NetworkSettings
 from scopemap.engine.config.input import InputSettings, MaskSettings
@@ -56,8 +56,15 @@ class Config(Settings):
     networks: NetworkSettings = NetworkSettings()
     tracking: TrackingSettings = TrackingSettings()
     smoothing: SmoothingSettings = SmoothingSettings()
-    mapping: MappingSettings = MappingSettings()
+    mapping: MappingSettings = Field(MappingSettings(), validate_default=True)
     fusion: FusionSettings = FusionSettings()
+
+    @field_validator("mapping")
+    @classmethod
+    def _of_camera(cls, mapping: MappingSettings, before: ValidationInfo) -> MappingSettings:
+        """Return what is adjusted: of a camera at rest there is nothing to adjust."""
+        tracking = before.data.get("tracking")  # missing where it is wrong itself
+        return MappingSettings(method="none") if tracking and tracking.camera_at_rest else mapping
 
     @classmethod
     def load(

@@ -41,7 +41,9 @@ class TrackingSettings(StageSettings):
     }
     method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, realtime, paper, ...")
     camera_at_rest: bool = Field(
-        False, description="the camera does not move: poses stay the first one, every frame has a surface (surfaces/)"
+        False,
+        description="the camera does not move: poses stay the first one, every frame has a surface (surfaces/); "
+        "mapping.method is none then",
     )
     keyframe_every: int = Field(
         10, ge=1, description="every n-th frame becomes a keyframe, once the camera has moved (the paper: 2)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass
@@ -51,6 +52,7 @@ _SURROUNDINGS = 1 / 12  # by hand
 _EVERY_PX = 4  # by hand, for time
 # Share of the picture up to which a highlight is that small.
 _LARGEST_MASKED = 0.02  # by hand
+_ANY_DEPTH_MM = 60.0  # guard: of a volume whose parameters are not known yet
 # No endoscope resolves less; memory would be spent on noise.
 _MIN_VOXEL_MM = 0.01  # by hand
 
@@ -230,7 +232,8 @@ class SurfaceFusion:
         None: no limit."""
         self.coarser_beyond: int | None = None
         """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
-        self._volumes = {}
+        # Those of a run that is resumed are made here, and then get the parameters that they had.
+        self._volumes = defaultdict(lambda: TsdfVolume(settings, choose_parameters(settings, _ANY_DEPTH_MM)))
         self._views = NewViews(settings.every)
 
     @property

@@ -25,7 +25,7 @@ MAD_TO_SIGMA = 1.4826
 RAYLEIGH_TO_SIGMA = 1 / 1.1774
 """Standard deviation, per axis, over the median length of a normal vector in the plane."""
 
-State = TypeVar("State")
+_State = TypeVar("_State")
 
 
 def robust_sigma(residuals: np.ndarray, least: float = 0.0) -> float:
@@ -87,16 +87,16 @@ class DenseModel(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Problem(Generic[State]):
+class Problem(Generic[_State]):
     """What is minimised, on whatever group its states are.
 
     `linearise` gives the model around a state; `retract` moves a state by a step (n,). `accept`, if given, changes a
     state that was stepped to, such as the scale of its robust kernel, after which the cost is another one.
     """
 
-    linearise: Callable[[State], Model]
-    retract: Callable[[State, np.ndarray], State]
-    accept: Callable[[State], State] | None = None
+    linearise: Callable[[_State], Model]
+    retract: Callable[[_State, np.ndarray], _State]
+    accept: Callable[[_State], _State] | None = None
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,10 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Solution(Generic[State]):
+class Solution(Generic[_State]):
     """Where the search ended: `converged` means a step or a relative decrease below the tolerance."""
 
-    state: State
+    state: _State
     cost: float
     iterations: int
     converged: bool
@@ -137,7 +137,7 @@ def dogleg_step(model: Model, newton: np.ndarray, radius: float) -> np.ndarray:
     return cauchy_point + onwards * ((-b + np.sqrt(b * b - a * c)) / a)
 
 
-def minimise(problem: Problem[State], start: State, options: Options) -> Solution[State]:
+def minimise(problem: Problem[_State], start: _State, options: Options) -> Solution[_State]:
     """Search from `start`; the cost of the solution is never above the cost of `start` (except for Gauss-Newton)."""
     state, radius = start, options.radius
     model, newton = problem.linearise(state), None
