@@ -32,6 +32,11 @@ def act(task: tuple[str, Path]) -> tuple[int, str]:
     return os.getpid(), os.environ.get("NUMBA_NUM_THREADS", "")
 
 
+def threads_of_openblas(_: object) -> str:
+    """Return how many threads OpenBLAS was told to use."""
+    return os.environ.get("OPENBLAS_NUM_THREADS", "")
+
+
 def soon(what: Callable[[], bool]) -> bool:
     """Whether something comes true within a minute."""
     until = time.monotonic() + 60

@@ -19,6 +19,8 @@ import os
 os.access = lambda *_: False
 import scopemap
 from numba.core import caching
+from numba.core.dispatcher import Dispatcher
+assert Dispatcher.enable_caching.__module__ == "numba.core.dispatcher"
 for kind in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
     kind.from_function = classmethod(lambda *_: None)
 import numpy as np

@@ -25,8 +25,10 @@ from typing import TYPE_CHECKING, Any
 # seen to take seventeen times as long for a flow while something else ran. Read when the network library is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # The stages have threads of their own. OpenBLAS's would compete with them (a run took 1.3 times the time), and
-# sum in another order: results would depend on their number. Read when numpy is loaded.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# sum in another order: results would depend on their number. It is read when numpy is loaded and holds for the whole
+# process, so it is set here, for `reconstruct` to return what `scopemap run` does, and not where it is too late.
+if "numpy" not in sys.modules:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Nothing may leave the machine: these libraries send telemetry unless that is set before they are imported.
 _off = os.environ.get("ORT_DISABLE_TELEMETRY", "").lower() in ("1", "true", "yes", "on")
 if "onnxruntime" in sys.modules and not _off:
@@ -63,7 +65,7 @@ def _private_folder() -> str:
 def _choose_kernel_cache() -> None:
     """Name a folder for compiled kernels where numba's own cannot be written: it would refuse to start.
 
-    Without any, nothing is cached, and each process compiles its kernels.
+    Without any it is named "", `kernels.py` caches nothing, and each process compiles its kernels.
     """
     caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     named = os.environ.get("NUMBA_CACHE_DIR")
@@ -74,16 +76,14 @@ def _choose_kernel_cache() -> None:
     if named:
         usual.append(Path(named))
     if os.name != "posix" or any(_may_write(folder) for folder in usual):
+        if named == "":  # numba takes it for unset, `kernels.py` for no folder
+            del os.environ["NUMBA_CACHE_DIR"]
         return
     try:
         chosen = _private_folder()
     except OSError:  # there is no folder for temporary files either
         chosen = ""
     os.environ["NUMBA_CACHE_DIR"] = chosen
-    if not chosen:
-        from numba.core.dispatcher import Dispatcher
-
-        Dispatcher.enable_caching = lambda self: None  # type: ignore[method-assign]
 
 
 _choose_kernel_cache()

@@ -124,7 +124,8 @@ class _Worker:
         self.task: Any = None
         self._before = NEW
         self.process = _PROCESSES.Process(target=_serve, args=(theirs, call, threads), daemon=True)
-        with _environment({name: str(threads) for name in THREADS}):
+        # A script that the process imports first may load numpy before scopemap.
+        with _environment({name: str(threads) for name in THREADS} | {"OPENBLAS_NUM_THREADS": "1"}):
             self.process.start()
         theirs.close()
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -78,8 +78,6 @@ FrameWriter = Callable[[Frame], None]
 """Writes something of a frame whose depth is final."""
 _Item = TypeVar("_Item")
 _END = object()
-_COMPILING = TimingListener()
-register("numba:compile", _COMPILING)
 
 
 class RunStates(Protocol):
@@ -339,8 +337,17 @@ class Clock:
 
 
 def compiling_s() -> float:
-    """Return how long this process has compiled kernels that no cache held, s."""
-    return float(_COMPILING.duration) if _COMPILING.done else 0.0
+    """Return how long this process has compiled kernels that no cache held, s, since the first call."""
+    compiling = _compiling()
+    return float(compiling.duration) if compiling.done else 0.0
+
+
+@cache
+def _compiling() -> TimingListener:
+    """Return what hears of all compiling from now on."""
+    listener = TimingListener()
+    register("numba:compile", listener)
+    return listener
 
 
 def in_thread(items: Iterable[_Item], thread: str, count: int = 2) -> Generator[_Item, None, None]:

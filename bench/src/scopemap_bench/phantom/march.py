@@ -18,6 +18,7 @@ from numba import njit, prange
 from scipy import ndimage
 
 from scopemap.engine.cameras.camera import CameraModel
+from scopemap.engine.geometry.kernels import IS_CACHED
 from scopemap_bench.phantom.motion import Displacement
 from scopemap_bench.phantom.slit import gap_at, shift_at
 
@@ -31,20 +32,20 @@ Grids = tuple[np.ndarray, np.ndarray, np.ndarray, float, float]
 Moved = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=IS_CACHED, nogil=True, inline="always")
 def _weights(f: float) -> tuple[float, float, float, float]:
     g = 1.0 - f
     low, high = (4.0 - 3.0 * f * f * (1.0 + g)) / 6.0, (4.0 - 3.0 * g * g * (1.0 + f)) / 6.0
     return g * g * g / 6.0, low, high, f * f * f / 6.0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=IS_CACHED, nogil=True, inline="always")
 def _slopes(f: float) -> tuple[float, float, float, float]:
     g = 1.0 - f
     return -0.5 * g * g, 1.5 * f * f - 2.0 * f, 0.5 + f - 1.5 * f * f, 0.5 * f * f
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def spline(c: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Return value and gradient (per voxel) at grid coordinates; the caller has checked `inside`."""
     i, j, k = int(x), int(y), int(z)
@@ -63,14 +64,14 @@ def spline(c: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, f
     return value, gx, gy, gz
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=IS_CACHED, nogil=True, inline="always")
 def inside(c: np.ndarray, x: float, y: float, z: float) -> bool:
     """Tell whether the spline is defined at grid coordinates (a NaN is not inside)."""
     m, n, p = c.shape
     return _MARGIN <= x < m - _MARGIN - 1 and _MARGIN <= y < n - _MARGIN - 1 and _MARGIN <= z < p - _MARGIN - 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def evaluate(c: np.ndarray, grid: np.ndarray, out: np.ndarray) -> None:
     """Write value and gradient at grid coordinates (N, 3) into out (N, 4); points outside are left as they are."""
     for n in range(grid.shape[0]):
@@ -123,7 +124,7 @@ class Volume:
         return out[:, 0], out[:, 1:] / self.voxel_mm
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=IS_CACHED, nogil=True, inline="always")
 def _corner(ix: int, iy: int, iz: int, seed: int, x: float, y: float, z: float) -> float:
     key = (ix * 73856093) ^ (iy * 19349663) ^ (iz * 83492791) ^ (seed * 2654435761)
     key = ((key ^ (key >> 13)) * 1274126177) & 0xFFFFFFFF
@@ -134,12 +135,12 @@ def _corner(ix: int, iy: int, iz: int, seed: int, x: float, y: float, z: float) 
     return (u if h & 1 == 0 else -u) + (v if h & 2 == 0 else -v)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=IS_CACHED, nogil=True, inline="always")
 def _fade(a: float) -> float:
     return a * a * a * (a * (6.0 * a - 15.0) + 10.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def _noise(x: float, y: float, z: float, seed: int) -> float:
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     ix, iy, iz = int(fx), int(fy), int(fz)
@@ -153,7 +154,7 @@ def _noise(x: float, y: float, z: float, seed: int) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=IS_CACHED, nogil=True, parallel=True)
 def _fill(points: np.ndarray, period: float, seed: int, out: np.ndarray) -> None:
     for i in prange(points.shape[0]):
         x, y, z = points[i, 0] / period, points[i, 1] / period, points[i, 2] / period
@@ -182,7 +183,7 @@ class SurfaceBuffers:
     rest_mm: np.ndarray
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def _rest_point(moved: Moved, origin: np.ndarray, d: np.ndarray, t: float, here: np.ndarray) -> None:
     """Write p - u(p) of the point p at distance t (voxels) of a ray into here[7:10], its rest point into here[1:4]."""
     px, py, pz = origin[0] + t * d[0], origin[1] + t * d[1], origin[2] + t * d[2]
@@ -201,7 +202,7 @@ def _rest_point(moved: Moved, origin: np.ndarray, d: np.ndarray, t: float, here:
         here[1], here[2], here[3] = here[1] - c[3] * s, here[2] - c[4] * s, here[3] - c[5] * s
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def _part(c: np.ndarray, here: np.ndarray) -> None:
     """Turn value and gradient at the rest point, in here[0] and [4:7], into those at here[7:10] with a slit."""
     x, gap, deep, gap_y, gap_z, deep_y = gap_at(c, here[7], here[8], here[9])
@@ -225,7 +226,7 @@ def _part(c: np.ndarray, here: np.ndarray) -> None:
         here[4 + axis] += along_x * c[3 + axis] + along_y * c[6 + axis] + along_z * c[9 + axis]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def _shape(c: np.ndarray, moved: Moved, origin: np.ndarray, d: np.ndarray, t: float, here: np.ndarray) -> float:
     """Write value, rest point and gradient in space into here[0], [1:4], [4:7]; return the slope along the ray."""
     _rest_point(moved, origin, d, t, here)
@@ -248,7 +249,7 @@ def _shape(c: np.ndarray, moved: Moved, origin: np.ndarray, d: np.ndarray, t: fl
     return here[4] * d[0] + here[5] * d[1] + here[6] * d[2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def _refine(
     c: np.ndarray, moved: Moved, origin: np.ndarray, d: np.ndarray, near: float, far: float, here: np.ndarray
 ) -> float:
@@ -267,7 +268,7 @@ def _refine(
     return t
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def _march(grids: Grids, moved: Moved, origin: np.ndarray, d: np.ndarray, here: np.ndarray) -> float:
     """Distance (voxels) to the first surface, NaN if none; `here` is left as `_shape` fills it at the hit."""
     c, skip, steepest, slope_unit, stretch = grids
@@ -299,7 +300,7 @@ def _march(grids: Grids, moved: Moved, origin: np.ndarray, d: np.ndarray, here: 
     return np.nan
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=IS_CACHED, nogil=True, parallel=True)
 def _march_image(grids: Grids, moved: Moved, T_grid_camera: np.ndarray, rays: np.ndarray, out: np.ndarray) -> None:
     """Fill out (H, W, 7): distance in voxels, rest point in grid coordinates, gradient in grid axes."""
     R, origin = np.ascontiguousarray(T_grid_camera[:3, :3]), np.ascontiguousarray(T_grid_camera[:3, 3])

@@ -13,6 +13,7 @@ from scipy import ndimage
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial.distance import cdist
 
+from scopemap.engine.geometry.kernels import IS_CACHED
 from scopemap_bench.phantom.march import Volume, noise_at
 
 _WALL_MM = 95.0
@@ -263,7 +264,7 @@ def _box(points: np.ndarray, margin_mm: float) -> tuple[np.ndarray, tuple[int, i
     return low, (nx, ny, nz), voxel
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=IS_CACHED, nogil=True, parallel=True)
 def _balls(balls: np.ndarray, sharpness: float, outside: float, value: np.ndarray, station: np.ndarray) -> None:
     """Smooth union of balls (x, y, z, radius, station): log-sum-exp of radius minus distance, brick by brick.
 

@@ -13,6 +13,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from scopemap.engine.geometry.kernels import IS_CACHED
+
 _GAPE_MM = 2.2
 _FADE_MM = 8.0
 _REACH_MM = 5.0
@@ -61,7 +63,7 @@ def stretch(slits: np.ndarray) -> float:
     return float(steep)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def gap_at(s: np.ndarray, px: float, py: float, pz: float) -> tuple[float, float, float, float, float, float]:
     """Return x, g and the depth of the cut at a point, and their slopes: g along y and z, the depth along y."""
     dx, dy, dz = px - s[0], py - s[1], pz - s[2]
@@ -83,13 +85,13 @@ def gap_at(s: np.ndarray, px: float, py: float, pz: float) -> tuple[float, float
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def shift_at(s: np.ndarray, x: float, g: float) -> float:
     """Return v at x where the slit gapes by g."""
     return x if abs(x) <= g else np.sign(x) * g * np.exp((g - abs(x)) / s[13])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=IS_CACHED, nogil=True)
 def opened(s: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Return where rest points (N, 3) are after the cut."""
     moved = rest.copy()

@@ -7,13 +7,18 @@ is compiled again when its own file has changed, not when this one has.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from numba import njit
 
-kernel: Callable[..., Any] = partial(njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+IS_CACHED = os.environ.get("NUMBA_CACHE_DIR") != ""
+"""Whether there is a folder for compiled kernels; `scopemap/__init__.py` looks for one. Without any numba
+would refuse to start."""
+
+kernel: Callable[..., Any] = partial(njit, cache=IS_CACHED, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 """Decorator of a kernel: division by 0 gives an infinity or NaN, as in numpy."""
 
 inner_kernel: Callable[..., Any] = partial(kernel, no_cpython_wrapper=True)
