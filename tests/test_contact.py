@@ -190,4 +190,4 @@ def test_rotations_are_in_the_folder_and_come_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.status, result.trajectory.status)
     np.testing.assert_allclose(found.T_world_camera, result.trajectory.T_world_camera, atol=2e-6)
     assert found.tracked.tolist() == [True] * 3 + [False] * 3 + [True, False]
-    assert result.frames.place.tolist() == [0, 0, 0, ROTATED, ROTATED, LOST, 0, LOST]
+    assert result.frames.submap.tolist() == [0, 0, 0, ROTATED, ROTATED, LOST, 0, LOST]

@@ -112,7 +112,7 @@ def test_frames_names_may_be_anything_that_files_names_are(tmp_path: Path, name:
     result.save(tmp_path)
     frames = Result(tmp_path).frames
     assert frames["name"].tolist() == [kept_name] * FRAMES
-    assert (frames.place == 0).sum() == IN_RESULT
+    assert (frames.submap == 0).sum() == IN_RESULT
 
 
 def test_a_long_run_stays_small(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from scopemap.engine.geometry.align import align_trajectories
 from scopemap.engine.notices import notices_of
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
-from scopemap.report.shown_maps import MapOnPage, shown_maps, shown_place
+from scopemap.report.shown_maps import MapOnPage, shown_map_numbers, shown_maps
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
 from scopemap.report.video_parts import video_parts
 from scopemap.result.frame_table import NOT_USED
@@ -109,11 +109,11 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
 
 def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:
     """Return the columns of all frames; a pose is (3, 4), row by row, NaN where there is none."""
-    frames, place = run.frames, run.frames.place
+    frames, in_map = run.frames, run.frames.submap
     poses = np.full((len(frames), 3, 4), np.nan)
     for number, submap in enumerate(run.submaps):
         pose_of = _pose_of(submap)
-        for row in np.flatnonzero(place == number):
+        for row in np.flatnonzero(in_map == number):
             poses[row] = pose_of[int(frames["index"][row])][:3]
     curves = {name: frames[column] for name, column in _CURVES.items()}
     # A lost frame has no scale of its own.
@@ -121,7 +121,7 @@ def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:
     measures = [run.measures.get(index, (np.nan, np.nan)) for index in frames["index"].tolist()]
     curves["sharpness"], curves["ms"] = np.array(measures).reshape(-1, 2).T
     # The different reasons why frames are not in a map, and for each frame the number of its own, or -1.
-    reasons = np.where(place < 0, frames["reason"], "")
+    reasons = np.where(in_map < 0, frames["reason"], "")
     different = sorted({reason for reason in reasons if reason})
     number_of = {reason: number for number, reason in enumerate(different)} | {"": -1}
     causes = sorted(set(frames["cause"].tolist()))
@@ -131,7 +131,7 @@ def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:
         "cause": base64_of(np.searchsorted(causes, frames["cause"]), "i1"),
         "index": base64_of(frames["index"], "i4"),
         "time_s": base64_of(frames["time_s"], "f4"),
-        "place": base64_of(shown_place(run, maps), "i2"),
+        "place": base64_of(shown_map_numbers(run, maps), "i2"),
         "pose": base64_of(poses, "f8"),
         "curves": {name: base64_of(values, "f4") for name, values in curves.items()},
         "reasons": different,
@@ -214,7 +214,7 @@ def _pose_of(submap: Result) -> dict[int, np.ndarray]:
 
 
 def _pictures(run: Result) -> list[_Picture]:
-    rows = np.flatnonzero(run.frames.place != NOT_USED)
+    rows = np.flatnonzero(run.frames.submap != NOT_USED)
     used, found = dict(zip(run.frames["index"][rows].tolist(), rows.tolist(), strict=True)), []
     for index in run.pictured:
         picture, mask = run.picture_file(index), run.mask_file(index)
@@ -258,16 +258,16 @@ def _maps(
     found, submaps = [], submaps_in_time(run.frames)
     turn, worst = {one.number: k for k, one in enumerate(submaps)}, most_doubtful(submaps)
     inliers = {one.number: one.inliers + ", most doubtful" * (one is worst) for one in submaps}
-    place, indices = shown_place(run, maps), run.frames["index"].tolist()
+    in_map, indices = shown_map_numbers(run, maps), run.frames["index"].tolist()
     for number, (one, mesh) in enumerate(zip(maps, meshes, strict=False)):
         pose_of = _pose_of(one.result)
-        looking = [p for p in pictures if place[p.row] == number and p.depth_mm is not None]
+        looking = [p for p in pictures if in_map[p.row] == number and p.depth_mm is not None]
         looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
         seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
         data = mesh_data(mesh, seen, run.camera) | {"errors": measure_errors(one.result)}
         if len(mesh.faces) > (most := MOST_FACES if number == 0 else FACES_OF_OTHERS):
             data["measured"] = shape_data(simplified(mesh, most))
-        facts = {"frames": int((place == number).sum()), "all_faces": len(one.mesh.faces)}
+        facts = {"frames": int((in_map == number).sum()), "all_faces": len(one.mesh.faces)}
         found.append(data | facts | {"turn": turn.get(number, number), "inliers": inliers.get(number, "")})
     return found
 

@@ -59,11 +59,11 @@ def shown_maps(run: Result) -> list[MapOnPage]:
     return found
 
 
-def shown_place(run: Result, maps: list[MapOnPage]) -> np.ndarray:
-    """Return the number of each frame's map (N,), as `FrameTable.place` for frames in none."""
-    place = run.frames.place.copy()
-    inside = place == 0
+def shown_map_numbers(run: Result, maps: list[MapOnPage]) -> np.ndarray:
+    """Return the number of each frame's map (N,), as `FrameTable.submap` for frames in none."""
+    submap = run.frames.submap.copy()
+    inside = submap == 0
     for number, one in enumerate(maps):
         if one.result is run and number:
-            place[inside & (run.frames["segment"] == one.segment)] = number
-    return place
+            submap[inside & (run.frames["segment"] == one.segment)] = number
+    return submap

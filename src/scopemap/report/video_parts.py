@@ -39,15 +39,17 @@ class VideoPart:
 
 def video_parts(run: Result) -> list[VideoPart]:
     """Return the parts of a run in the order of the video."""
-    spans = _spans(run.frames.place, run.frames["time_s"])
+    spans = _spans(run.frames.submap, run.frames["time_s"])
     part_of = np.full(len(run.frames), -1)
     for number, (_, first, last) in enumerate(spans):
         part_of[first : last + 1] = number
     submap_of = [*(submap for submap, _, _ in spans), NOT_USED]  # of no part
     row_of = {index: row for row, index in enumerate(run.frames["index"].tolist())}
     # A span of another submap may lie between two frames of one.
-    place = run.frames.place
-    part_of_frame = {index: int(part_of[row]) for index, row in row_of.items() if place[row] == submap_of[part_of[row]]}
+    in_map = run.frames.submap
+    part_of_frame = {
+        index: int(part_of[row]) for index, row in row_of.items() if in_map[row] == submap_of[part_of[row]]
+    }
     loops: Counter[tuple[int, int]] = Counter()
     found: dict[tuple[int, int], float] = {}
     for submap in run.submaps:
@@ -63,14 +65,14 @@ def video_parts(run: Result) -> list[VideoPart]:
     ]
 
 
-def _spans(place: np.ndarray, time_s: np.ndarray) -> list[tuple[int, int, int]]:
+def _spans(submap: np.ndarray, time_s: np.ndarray) -> list[tuple[int, int, int]]:
     """Return submap, first and last row of each part."""
     spans: list[tuple[int, int, int]] = []
-    for row in np.flatnonzero(place >= 0).tolist():
-        number = int(place[row])
+    for row in np.flatnonzero(submap >= 0).tolist():
+        number = int(submap[row])
         if spans and spans[-1][0] == number:
             _, first, last = spans[-1]
-            lost = (place[last + 1 : row] != NOT_USED).any()
+            lost = (submap[last + 1 : row] != NOT_USED).any()
             if not lost or time_s[row] - time_s[last] < _LEAST_GAP_S:
                 spans[-1] = number, first, row
                 continue

@@ -104,15 +104,15 @@ class FrameTable:
             found[name] = "" if ROW[name].kind in "OU" else -1 if ROW[name].kind == "i" else np.nan
         found["relocalised"] = False
         table = cls(found)
-        for place, row in enumerate(given):
-            table.put(place, row)
+        for number, row in enumerate(given):
+            table.put(number, row)
         return table
 
-    def put(self, place: int, row: Mapping[str, Any]) -> None:
-        """Change columns of the row at a place; what is None, or no column, is left out."""
+    def put(self, number: int, row: Mapping[str, Any]) -> None:
+        """Change columns of the row with this number; what is None, or no column, is left out."""
         for name, value in row.items():
             if value is not None and name in (ROW.names or ()):
-                self.rows[name][place] = value
+                self.rows[name][number] = value
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -142,7 +142,7 @@ class FrameTable:
         return np.isin(self["status"], ("lost", ROTATION_ONLY))
 
     @property
-    def place(self) -> np.ndarray:
+    def submap(self) -> np.ndarray:
         """(N,) int64, the number of the frame's submap, the table's own 0, or `LOST`, `ROTATED`, ..."""
         status = self["status"]
         outside = np.select([status == name for name in ("lost", ROTATION_ONLY, SKIPPED)], [LOST, ROTATED, NOT_USED], 0)
@@ -174,14 +174,16 @@ class FrameTable:
         rows = list(zip(*columns, strict=True))
         # A file's name may hold bytes that are no UTF-8.
         with file.open("w", newline="", encoding="utf-8", errors="replace") as table:
-            csv.writer(table).writerows([COLUMNS, *(rows[place] for place in np.argsort(self["index"], kind="stable"))])
+            csv.writer(table).writerows(
+                [COLUMNS, *(rows[number] for number in np.argsort(self["index"], kind="stable"))]
+            )
 
     def cells(self, column: str) -> list[str]:
         """Return a column as frames.csv has it."""
         if column == "orientation":
             rotated = self["status"] == ROTATION_ONLY
             T = self["T_world_camera"]
-            return [_quaternion(T[place, :3, :3]) if rotated[place] else "" for place in range(len(self))]
+            return [_quaternion(T[row, :3, :3]) if rotated[row] else "" for row in range(len(self))]
         values, form = self[column].tolist(), _FORMATS[column]
         if form == "d":
             return ["" if value == -1 else str(value) for value in values]
@@ -208,10 +210,10 @@ class FrameTable:
         used = table["index"][table["status"] != SKIPPED]
         if np.any(np.diff(used) <= 0) or not set(table["status"].tolist()) <= {*STATUSES, SKIPPED}:
             raise InputError(f"cannot read {file}: index must ascend and status be one of {', '.join(STATUSES)}")
-        for place in np.flatnonzero(table["status"] == ROTATION_ONLY):
-            with reporting(f"cannot read {file}: the orientation of frame {table['index'][place]} is no quaternion"):
-                quaternion = [float(number) for number in texts[place]["orientation"].split()]
-                table.rows["T_world_camera"][place, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
+        for row in np.flatnonzero(table["status"] == ROTATION_ONLY):
+            with reporting(f"cannot read {file}: the orientation of frame {table['index'][row]} is no quaternion"):
+                quaternion = [float(number) for number in texts[row]["orientation"].split()]
+                table.rows["T_world_camera"][row, :3, :3] = Rotation.from_quat(quaternion).as_matrix()
         return table
 
 

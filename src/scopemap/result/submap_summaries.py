@@ -37,9 +37,9 @@ class SubmapSummary:
 
 def submaps_in_time(frames: FrameTable) -> list[SubmapSummary]:
     """Return the maps of a run in the order of their first frames."""
-    shares, place, found = frames["inlier_share"], frames.place, []
-    for number in np.unique(place[place >= 0]).tolist():
-        inside = place == number
+    shares, submap, found = frames["inlier_share"], frames.submap, []
+    for number in np.unique(submap[submap >= 0]).tolist():
+        inside = submap == number
         indices, known = frames["index"][inside], shares[inside & np.isfinite(shares)]
         share = float(np.median(known)) if len(known) else float("nan")
         found.append(SubmapSummary(number, len(indices), int(indices.min()), int(indices.max()), share))

@@ -122,7 +122,7 @@ def state_verdict(result: Result) -> None:
 
 def frames_in_result(frames: FrameTable) -> tuple[int, int]:
     """Return how many frames are in the result, and of how many that were used."""
-    return int(np.sum(frames.place == 0)), int(np.sum(frames.place != NOT_USED))
+    return int(np.sum(frames.submap == 0)), int(np.sum(frames.submap != NOT_USED))
 
 
 def level_of_submap(submap: Result) -> Level:
@@ -222,12 +222,12 @@ def _of_frames(run: Result) -> Reason:
     if inside < LEAST_FRAMES:
         few = f"Only {inside} of {used}{chosen} frames are in the result: too few for a shape.{which}"
         return Reason("frames-too-few", "bad", few)
-    place = run.frames.place[run.frames.place != NOT_USED]
-    found = np.isin(place, [0, *_long_submaps(run)])
+    submap = run.frames.submap[run.frames.submap != NOT_USED]
+    found = np.isin(submap, [0, *_long_submaps(run)])
     apart = int(found.sum()) - inside
     bad = [segment.segment for segment in run.segments if segment.level == "bad"]
     if len(bad) < len(run.segments):  # that no surface can be used is another reason
-        found &= ~((place == 0) & np.isin(run.frames["segment"][run.frames.place != NOT_USED], bad))
+        found &= ~((submap == 0) & np.isin(run.frames["segment"][run.frames.submap != NOT_USED], bad))
     share = found.mean()
     lost_in_a_row = longest_segment(~found)
     longest = f"; the longest gap is {lost_in_a_row} frames" if lost_in_a_row else ""
@@ -244,9 +244,9 @@ def _of_frames(run: Result) -> Reason:
 
 def _long_submaps(run: Result) -> list[int]:
     """Return the numbers of the submaps that stand for their part of the video."""
-    place, times_s = run.frames.place, run.frames["time_s"]
+    submap, times_s = run.frames.submap, run.frames["time_s"]
     period_s = np.median(np.diff(times_s)) if len(times_s) > 1 else np.nan
-    long = (n for n in range(1, len(run.submaps)) if (place == n).sum() * period_s >= LEAST_SEGMENT_S)
+    long = (n for n in range(1, len(run.submaps)) if (submap == n).sum() * period_s >= LEAST_SEGMENT_S)
     return [number for number in long if level_of_submap(run.submaps[number]) != "bad"]
 
 
@@ -259,7 +259,7 @@ def _submaps_in_words(run: Result) -> str:
 
 def _of_maps(run: Result) -> list[Reason]:
     frames, found = run.frames, []
-    other = int(np.sum((frames.place > 0) | (frames.place == ELSEWHERE)))
+    other = int(np.sum((frames.submap > 0) | (frames.submap == ELSEWHERE)))
     lost, rotated = frames.counts["lost"], frames.counts["rotation_only"]
     if other:
         judged = _submaps_in_words(run)

@@ -48,7 +48,7 @@ def _depth_at(run: Result, depth_mm: np.ndarray | None, x: float, y: float) -> f
 
 def drift(run: Result) -> float:
     """Return the largest distance between two positions of a camera at rest, as a share of the median depth."""
-    inside = run.frames.place == 0
+    inside = run.frames.submap == 0
     positions_mm = run.frames["T_world_camera"][inside][:, :3, 3]
     depth_mm = run.depth.read(int(run.frames["index"][inside][0]))
     assert depth_mm is not None  # every frame of a result has depth

@@ -138,12 +138,12 @@ def rows_where(condition: np.ndarray) -> Iterator[tuple[int, int]]:
 
 def print_kinds(plan: list[Shown], frames: FrameTable, skipped: np.ndarray) -> None:
     """Print what became of the frames, by what they show."""
-    kinds, place = np.array([shown.kind for shown in plan])[frames["index"]], frames.place
+    kinds, submap = np.array([shown.kind for shown in plan])[frames["index"]], frames.submap
     measuring.print_head("shows", "frames", "in a submap", "lost after a search", "lost unseen", "left out: at rest")
     for kind in dict.fromkeys(kinds.tolist()):
         of, left_out = kinds == kind, frames["status"] == "skipped"
         lost = frames.lost & ~skipped
-        counts = [int((of & some).sum()) for some in (place >= 0, lost, skipped, left_out)]
+        counts = [int((of & some).sum()) for some in (submap >= 0, lost, skipped, left_out)]
         measuring.print_row(kind, int(of.sum()), *counts)
 
 
@@ -173,7 +173,7 @@ def print_submaps(plan: list[Shown], run: Result, poses: list[np.ndarray]) -> No
 def print_cost(plan: list[Shown], run: Result, skipped: np.ndarray, peak_mb: float) -> None:
     """Print segments found, speed, memory, and time per frame in the quarters."""
     frames, clear = run.frames, np.array([shown.kind == CLEAR for shown in plan])
-    tracked = frames.place >= 0
+    tracked = frames.submap >= 0
     segments = [tracked[first : last + 1].mean() for first, last in rows_where(clear[frames["index"]])]
     ms = np.array([run.measures.get(index, (np.nan, np.nan))[1] for index in frames["index"].tolist()])
     steady = np.zeros(len(frames), bool)

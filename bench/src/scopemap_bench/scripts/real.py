@@ -77,7 +77,7 @@ def clips(data: Path) -> list[RealClip]:
 
 def depth_pairs(run: Result, truth: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield estimated and true depth (H, W), mm, of the result's frames that have both."""
-    inside = set(run.frames["index"][run.frames.place == 0].tolist())
+    inside = set(run.frames["index"][run.frames.submap == 0].tolist())
     for frame, true in open_sequence(truth):
         if frame.index in inside and true is not None and true.depth_mm is not None:
             depth_mm = run.depth.read(frame.index)

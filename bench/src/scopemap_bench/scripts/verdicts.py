@@ -81,7 +81,7 @@ def surface_error(run: Path, truth: Path, scale: float | None) -> float:
     assert file is not None
     lens = read_calibration(file, (true_lens.width, true_lens.height)).camera
     pixels = sequence.camera.project(true_lens.unproject(lens.project(camera.rays))).astype(np.float32)
-    inside = set(folder.frames["index"][folder.frames.place == 0].tolist())
+    inside = set(folder.frames["index"][folder.frames.submap == 0].tolist())
     for frame, true in sequence:
         depth_mm = folder.depth.read(frame.index) if frame.index in inside else None
         if depth_mm is None or true is None or true.depth_mm is None:

@@ -225,17 +225,17 @@ class FramePart:
 def frame_words(view: ResultView) -> str:
     """Return number, time and status of the frame that is shown, and why it is lost, as Markdown."""
     frames, row = view.whole.frames, view.row
-    place, time_s = int(frames.place[row]), float(frames["time_s"][row])
+    submap, time_s = int(frames.submap[row]), float(frames["time_s"][row])
     words = f"Frame {view.index}, {time_s:.2f} s: "
-    if place >= 0:
-        here = "" if place == view.number else f" in submap {place + 1}, not the one that is shown"
+    if submap >= 0:
+        here = "" if submap == view.number else f" in submap {submap + 1}, not the one that is shown"
         return f"{words}tracked{here}"
     status = {
         LOST: "**lost**",
         ROTATED: "**lost**, only its rotation is known",
         ELSEWHERE: "in a submap that is too small",
     }
-    words += status.get(place, "not used")
+    words += status.get(submap, "not used")
     reason, cause = str(frames["reason"][row]), LossCause(str(frames["cause"][row]))
     advice = ADVICE.get(cause, "")
     return words + (f": {escaped(reason)}." if reason else ".") + (f" {advice}" if advice else "")

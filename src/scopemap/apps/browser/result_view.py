@@ -38,7 +38,7 @@ class ResultView:
 
     def __init__(self, window: BrowserWindow, whole: Result, workspace: Workspace | None) -> None:
         self.window, self.whole, self.workspace = window, whole, workspace
-        self.rows = np.flatnonzero(whole.frames.place != NOT_USED).tolist()
+        self.rows = np.flatnonzero(whole.frames.submap != NOT_USED).tolist()
         self.row = self.rows[0] if self.rows else 0
         self.number, self.surface = 0, ShownSurface(whole)
         self._surfaces: dict[tuple[int, int | None], ShownSurface] = {(0, None): self.surface}
@@ -136,7 +136,7 @@ class ResultView:
         """Show the surface of another submap, and its first frame."""
         self.number = number
         self._show_surface()
-        inside = np.flatnonzero(self.whole.frames.place == number)
+        inside = np.flatnonzero(self.whole.frames.submap == number)
         self.show_row(int(inside[0]) if len(inside) else self.row)
         self.look_at_all()
 

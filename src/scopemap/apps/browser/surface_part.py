@@ -148,5 +148,5 @@ def strip_words(view: ResultView) -> str:
 
 
 def _submap_words(view: ResultView, number: int) -> str:
-    count, submap = int((view.whole.frames.place == number).sum()), view.whole.submaps[number]
+    count, submap = int((view.whole.frames.submap == number).sum()), view.whole.submaps[number]
     return f"{number + 1}: {count} frames, {WORDS[level_of_submap(submap)]}"

@@ -158,8 +158,8 @@ def _pose(run: Result, frame: int) -> np.ndarray:
     row = np.flatnonzero(run.tracked.trajectory.indices == frame)
     if len(row):
         return np.asarray(run.tracked.trajectory.T_world_camera[row[0]])
-    place = run.frames.place[run.frames["index"] == frame]
-    where = f"it is in maps/{place[0]}, a folder of its own" if len(place) and place[0] > 0 else "it has no pose"
+    submap = run.frames.submap[run.frames["index"] == frame]
+    where = f"it is in maps/{submap[0]}, a folder of its own" if len(submap) and submap[0] > 0 else "it has no pose"
     raise InputError(f"frame {frame} is not in the result {run.path}: {where}")
 
 
