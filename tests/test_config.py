@@ -62,10 +62,10 @@ def test_the_preset_is_the_command_lines_before_the_files(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_runs_file_repeats_the_run_without_naming_its_preset(preset: str, tmp_path: Path) -> None:
-    changed = {"tracking.solver": "gauss-newton", "mapping.keyframe_gaps": [1, 4]}
+    changed = {"tracking.solver": "gauss-newton", "input.redact": [[1, 4, 5, 6]]}
     config = Config.load(preset, settings=changed)  # type: ignore[arg-type]
     assert Config.load(file=_write(tmp_path, config.toml())) == config
-    assert (config.tracking.solver, config.mapping.keyframe_gaps) == ("gauss-newton", (1, 4))
+    assert (config.tracking.solver, config.input.redact) == ("gauss-newton", ((1, 4, 5, 6),))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -151,8 +151,8 @@ def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_
         ("tracking.huber", 0, "greater than 0"),
         ("tracking.finest_level", 4, "less than or equal to 3"),
         ("tracking.solver", "lbfgs", "'dogleg', 'gauss-newton'"),
-        ("mapping.keyframe_gaps", [], "at least 1 item"),
-        ("mapping.keyframe_gaps", [1, 0], "greater than 0"),
+        ("input.redact", [[1, 2, 3]], "Field required"),
+        ("input.redact", [[1, 2, 3, 0]], "greater than or equal to 1"),
         ("smoothing.alpha", 0.9, r"alpha \+ beta \+ gamma must be 1, their sum is 1\.3"),
         ("tracking.keyframe_every", 0, "greater than or equal to 1"),
         ("tracking.keyframe_every", "wide", "valid integer"),
