@@ -116,9 +116,9 @@ def test_each_method_is_named_by_a_preset_or_a_document() -> None:
 
 def test_of_joined_methods_the_later_one_wins() -> None:
     both = Config.load("paper", settings={"tracking.method": "paper+realtime+least-squares"}).tracking
-    assert (both.max_iterations, both.start, both.huber) == (15, "identity", 1e6)
+    assert (both.fast, both.start, both.huber) == (True, "identity", 1e6)
     stricter = Config.load(settings={"tracking.method": "no-pose-checks+paper"}).tracking
-    assert (stricter.min_texture, stricter.max_step) == (0.0, 1e6)
+    assert (stricter.picture_checks, stricter.pose_checks) == (False, False)
 
 
 def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_another(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_
     assert Config.load(settings=single).tracking == TrackingSettings(method="paper", huber=2.0)
     assert Config.load("paper", settings={"tracking.huber": 2}).tracking.start == "identity"
     file = _write(tmp_path, Config.load(settings=single | {"tracking.keyframe_every": 4}).toml())
-    assert Config.load(file=file, settings={"tracking.max_step": 1}).tracking.huber == 2.0
+    assert Config.load(file=file, settings={"tracking.levels": 4}).tracking.huber == 2.0
     other = Config.load(file=file, settings={"tracking.method": "realtime"}).tracking
     assert other == TrackingSettings(method="realtime", keyframe_every=4)
     assert Config.load(file=file, settings={"mapping.method": "none"}).tracking.huber == 2.0

@@ -38,8 +38,6 @@ REFUSED = {
 """Ends that no run of this clip can have, and what is said then."""
 ALONE = {
     "tracking.camera_at_rest=True",
-    "tracking.min_correlation=1",
-    "tracking.min_inlier_share=1",
     "mapping.global_adjustment=False",
 }
 """Ends with which a run does not reach what other settings change."""
