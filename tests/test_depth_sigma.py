@@ -151,7 +151,7 @@ def _wall(sigma_mm: np.ndarray | None = None, depth_mm: np.ndarray | None = None
 
 
 def _field(*frames: Frame, **changes: Any) -> Any:
-    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, min_weight=0.2, **changes))
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, **changes))
     for frame in frames:
         volume.integrate(frame)
     return volume._blocks.dense(np.array([-1, 0, 6]), 2)

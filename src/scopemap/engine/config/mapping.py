@@ -75,7 +75,7 @@ class FusionSettings(StageSettings):
     METHODS: ClassVar[Methods] = {
         "scopemap": {},
         "no-free-space": {"free_space": False},
-        "unweighted": {"weighted": False, "min_incidence": 0.0, "truncation_share": 0.0, "min_weight": 0.0},
+        "unweighted": {"weighted": False},
         "all-components": {"min_component_share": 0.0},
     }
     method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, no-free-space, ...")
@@ -107,18 +107,10 @@ class FusionSettings(StageSettings):
 
     weighted: bool = advanced(
         True,
-        "weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface less; "
-        "false: 1",
+        "weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface less; leave "
+        "out grazing pixels and voxels of little weight; truncate farther where depth is larger; false: none of these",
         "Curless and Levoy 1996, and by hand",
     )
-    min_incidence: Share = advanced(0.1, "cosine of incidence below which a pixel is not fused", "by hand")
-    depth_sigma_share: PositiveFloat = advanced(
-        0.2, "relative error that all depth has; more uncertain pixels weigh less; large: off", "by hand"
-    )
-    truncation_share: Share = advanced(
-        0.08, "truncation over the pixel's depth, where that is larger than truncation_mm", "by hand"
-    )
-    min_weight: NonNegativeFloat = advanced(0.1, "voxels with less weight give no surface", "by hand")
     min_component_share: Share = advanced(
         0.02, "components with less than this share of the faces are removed", "by hand"
     )
