@@ -31,7 +31,6 @@ OPEN = {
 """Ends with which a run does not get through yet."""
 REFUSED = {
     "run.memory_mb=1": "are the least",
-    "mask.dark_level=255": "no frame of .* could be used",
     "tracking.min_valid_share=1": "no frame of .* could be used",
     "depth.anchor=near-far": "needs a range",
 }
