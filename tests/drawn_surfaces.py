@@ -18,7 +18,7 @@ GREY = (120, 110, 100)
 
 def lenient(**changes: Any) -> FusionSettings:
     """Settings of fusion with which one frame makes a surface."""
-    return FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, **{"min_weight": 0.2} | changes)
+    return FusionSettings(voxel_mm=1.0, truncation_mm=5.0, max_depth_mm=150.0, **changes)
 
 
 LENIENT = lenient()

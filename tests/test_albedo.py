@@ -33,7 +33,7 @@ def _shot(x_mm: float = 0.0, exposure: float = 1.0, albedo: np.ndarray = PINK, s
 
 
 def _fused(frames: list[Frame], colours: str = "albedo") -> trimesh.Trimesh:
-    settings = FusionSettings(voxel_mm=1.0, truncation_mm=4.0, max_depth_mm=200.0, colours=colours, min_weight=0.01)
+    settings = FusionSettings(voxel_mm=1.0, truncation_mm=4.0, max_depth_mm=200.0, colours=colours)
     volume = TsdfVolume(settings)
     for frame in frames:
         volume.integrate(frame)

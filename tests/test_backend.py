@@ -60,9 +60,8 @@ def test_poses_stay_as_tracked_where_left_out_tracks_prefer_them(monkeypatch: py
 
 
 def test_a_keyframe_with_too_small_a_depth_gets_a_factor() -> None:
-    settings = MappingSettings(depth_sigma_share=0.05, scale_sigma=0.3)
     frames = [_frame(number, factor=0.8 if number == 2 else 1.0) for number in range(6)]
-    correction = plane_scene.adjusted(frames, settings)
+    correction = plane_scene.adjusted(frames)
     factors = np.array([correction.depth_factor(10 * number) for number in range(6)])
     assert factors[2] / np.delete(factors, 2).mean() == pytest.approx(1.25, rel=0.03)
     assert correction.depth_factor(15) == pytest.approx(np.sqrt(factors[1] * factors[2]))

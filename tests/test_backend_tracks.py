@@ -11,7 +11,6 @@ import pytest
 from drawn_bundle import FOCAL_PX, LINE, tracked, world
 from plane_scene import CAMERA
 
-from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.corners import normalised_brightness, refined_corners
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.flow.estimator import FlowEstimator, NoFlow
@@ -33,7 +32,7 @@ class _Biased(DisFlow):
 def _errors_px(flow: FlowEstimator, gap: int, step_mm: float, nearer_mm: float = 0.0) -> np.ndarray:
     """Errors (n,) of the observations at a gap between keyframes that slide along the plane, and come nearer."""
     poses = [plane_scene.pose(at_mm=(step_mm * n, 0.0, nearer_mm * n)) for n in range(gap + 1)]
-    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(gap,)), flow)
+    tracks = FeatureTracks(flow, gaps=(gap,))
     for number, pose in enumerate(poses):
         tracks.add(plane_scene.frame(pose, number))
     points, observations = tracks.collected()
@@ -72,7 +71,7 @@ def test_distant_keyframes_are_matched_along_those_between(monkeypatch: pytest.M
 
 
 def test_a_map_that_the_camera_leaves_goes_on_when_it_comes_back() -> None:
-    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2, 3)), DisFlow())
+    tracks = FeatureTracks(DisFlow(), gaps=(1, 2, 3))
     poses = [plane_scene.pose(at_mm=(2.0 * n, 0.0, 0.0)) for n in range(4)]
     for number, (pose, map_number) in enumerate(zip(poses, (0, 0, 1, 0), strict=True)):
         tracks.add(plane_scene.frame(pose, number), map_number)
@@ -99,7 +98,7 @@ def test_keyframes_that_are_far_apart_are_matched_from_depth_and_poses_as_tracke
 def test_farther_keyframes_are_tried_only_where_nearer_ones_have_corners_in_common(
     step_mm: float | None, tried: int
 ) -> None:
-    tracks, rng, pairs = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2, 3)), DisFlow()), np.random.default_rng(0), 0
+    tracks, rng, pairs = FeatureTracks(DisFlow(), gaps=(1, 2, 3)), np.random.default_rng(0), 0
     for number in range(4):
         frame = plane_scene.frame(plane_scene.pose(at_mm=((step_mm or 0.0) * number, 0.0, 0.0)), number)
         if step_mm is None:  # each another picture
@@ -135,7 +134,7 @@ def test_observations_that_share_their_errors_count_as_one() -> None:
 
 
 def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
-    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2)), DisFlow())
+    tracks = FeatureTracks(DisFlow(), gaps=(1, 2))
     for number in range(4):
         tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)), number))
     points, observations = tracks.collected()
@@ -150,7 +149,7 @@ def test_of_a_long_video_every_nth_point_is_adjusted() -> None:
 
 def test_across_a_cut_flow_is_searched_from_where_poses_have_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def observations() -> int:
-        tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1,)), DisFlow())
+        tracks = FeatureTracks(DisFlow(), gaps=(1,))
         for number, at_mm in enumerate((0.0, 20.0)):
             tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(at_mm, 0.0, 0.0)), number))
         return len(tracks.collected()[1].point)
@@ -161,7 +160,7 @@ def test_across_a_cut_flow_is_searched_from_where_poses_have_it(monkeypatch: pyt
 
 
 def test_observations_between_parts_alone_and_the_median_depth_of_some_keyframes() -> None:
-    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1, 2)), DisFlow())
+    tracks = FeatureTracks(DisFlow(), gaps=(1, 2))
     for number in range(4):
         tracks.add(plane_scene.frame(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)), number))
     points, observations = tracks.collected()
@@ -179,9 +178,8 @@ def test_observations_between_parts_alone_and_the_median_depth_of_some_keyframes
 def test_what_windows_have_matched_is_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:
     matched, both_ways = Mock(wraps=feature_tracks._matched), 2
     frames = [plane_scene.frame(plane_scene.pose(at_mm=(1.5 * n, 0.5 * n, 0.0)), n) for n in range(5)]
-    settings, no_flow = MappingSettings(keyframe_gaps=(1, 2, 3)), NoFlow()
-    alone, far = FeatureTracks(settings, DisFlow()), FeatureTracks(settings, no_flow)
-    near = FeatureTracks(settings, DisFlow(), gaps=(1, 2))
+    alone, far = FeatureTracks(DisFlow(), gaps=(1, 2, 3)), FeatureTracks(NoFlow(), gaps=(1, 2, 3))
+    near = FeatureTracks(DisFlow(), gaps=(1, 2))
     for frame in frames:
         alone.add(frame)
         known = near.add(frame)

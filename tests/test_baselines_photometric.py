@@ -73,8 +73,8 @@ def test_two_scales_and_grey_values_alone() -> None:
     for name in ("channels", "lamp_gamma", "gain_bias", "solver", "start"):
         assert getattr(SETTINGS, name) != getattr(ours, name)
     assert SETTINGS.depth_weight == SETTINGS.min_keyframe_agreement == SETTINGS.corner_depth_sigma == 0
-    assert (SETTINGS.min_correlation, SETTINGS.min_inlier_share) == (-1, 0)
-    assert SETTINGS.min_sharpness == SETTINGS.relocalisation_keyframes == SETTINGS.new_map_after == 0
+    assert SETTINGS.picture_checks is SETTINGS.pose_checks is False
+    assert SETTINGS.relocalisation_keyframes == SETTINGS.new_map_after == 0
 
 
 def test_a_black_frame_in_a_run_is_lost_and_tracking_goes_on(tmp_path: Path) -> None:

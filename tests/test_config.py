@@ -74,10 +74,10 @@ def test_the_preset_is_the_command_lines_before_the_files(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_runs_file_repeats_the_run_without_naming_its_preset(preset: str, tmp_path: Path) -> None:
-    changed = {"tracking.solver": "gauss-newton", "mapping.keyframe_gaps": [1, 4]}
+    changed = {"tracking.solver": "gauss-newton", "input.redact": [[1, 4, 5, 6]]}
     config = Config.load(preset, settings=changed)  # type: ignore[arg-type]
     assert Config.load(file=_write(tmp_path, config.toml())) == config
-    assert (config.tracking.solver, config.mapping.keyframe_gaps) == ("gauss-newton", (1, 4))
+    assert (config.tracking.solver, config.input.redact) == ("gauss-newton", ((1, 4, 5, 6),))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -128,9 +128,9 @@ def test_each_method_is_named_by_a_preset_or_a_document() -> None:
 
 def test_of_joined_methods_the_later_one_wins() -> None:
     both = Config.load("paper", settings={"tracking.method": "paper+realtime+least-squares"}).tracking
-    assert (both.max_iterations, both.start, both.huber) == (15, "identity", 1e6)
+    assert (both.fast, both.start, both.huber) == (True, "identity", 1e6)
     stricter = Config.load(settings={"tracking.method": "no-pose-checks+paper"}).tracking
-    assert (stricter.min_texture, stricter.max_step) == (0.0, 1e6)
+    assert (stricter.picture_checks, stricter.pose_checks) == (False, False)
 
 
 def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_another(tmp_path: Path) -> None:
@@ -138,7 +138,7 @@ def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_
     assert Config.load(settings=single).tracking == TrackingSettings(method="paper", huber=2.0)
     assert Config.load("paper", settings={"tracking.huber": 2}).tracking.start == "identity"
     file = _write(tmp_path, Config.load(settings=single | {"tracking.keyframe_every": 4}).toml())
-    assert Config.load(file=file, settings={"tracking.max_step": 1}).tracking.huber == 2.0
+    assert Config.load(file=file, settings={"tracking.levels": 4}).tracking.huber == 2.0
     other = Config.load(file=file, settings={"tracking.method": "realtime"}).tracking
     assert other == TrackingSettings(method="realtime", keyframe_every=4)
     assert Config.load(file=file, settings={"mapping.method": "none"}).tracking.huber == 2.0
@@ -163,8 +163,8 @@ def test_an_advanced_setting_counts_before_a_method_unless_a_later_source_names_
         ("tracking.huber", 0, "greater than 0"),
         ("tracking.finest_level", 4, "less than or equal to 3"),
         ("tracking.solver", "lbfgs", "'dogleg', 'gauss-newton'"),
-        ("mapping.keyframe_gaps", [], "at least 1 item"),
-        ("mapping.keyframe_gaps", [1, 0], "greater than 0"),
+        ("input.redact", [[1, 2, 3]], "Field required"),
+        ("input.redact", [[1, 2, 3, 0]], "greater than or equal to 1"),
         ("smoothing.alpha", 0.9, r"alpha \+ beta \+ gamma must be 1, their sum is 1\.3"),
         ("tracking.keyframe_every", 0, "greater than or equal to 1"),
         ("tracking.keyframe_every", "wide", "valid integer"),

@@ -115,9 +115,9 @@ def _refined(sigmas: tuple[Any, Any], motion: np.ndarray | None = None, **change
 
 
 def test_the_blend_is_weighed_by_inverse_variance() -> None:
-    refined = _refined((SHARE * DEPTH, SHARE_OTHER * OTHER), blend="linear", sigma_fading=0.2)[1]
+    refined = _refined((SHARE * DEPTH, SHARE_OTHER * OTHER), blend="linear")[1]
     trust = 1 - np.clip(DISTANCE, 0, 1)
-    variance = SHARE**2 + 0.2 * np.maximum(SHARE_OTHER**2 - SHARE**2, 0)
+    variance = SHARE**2 + 0.3 * np.maximum(SHARE_OTHER**2 - SHARE**2, 0)
     one, other = trust / variance, (1 - trust) / SHARE_OTHER**2
     np.testing.assert_allclose(refined.depth_mm, (one * DEPTH + other * OTHER) / (one + other), rtol=1e-5)
     weight = one / (one + other)
@@ -151,7 +151,7 @@ def _wall(sigma_mm: np.ndarray | None = None, depth_mm: np.ndarray | None = None
 
 
 def _field(*frames: Frame, **changes: Any) -> Any:
-    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, min_weight=0.2, **changes))
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, **changes))
     for frame in frames:
         volume.integrate(frame)
     return volume._blocks.dense(np.array([-1, 0, 6]), 2)

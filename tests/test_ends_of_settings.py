@@ -31,15 +31,12 @@ OPEN = {
 """Ends with which a run does not get through yet."""
 REFUSED = {
     "run.memory_mb=1": "are the least",
-    "mask.dark_level=255": "no frame of .* could be used",
     "tracking.min_valid_share=1": "no frame of .* could be used",
     "depth.anchor=near-far": "needs a range",
 }
 """Ends that no run of this clip can have, and what is said then."""
 ALONE = {
     "tracking.camera_at_rest=True",
-    "tracking.min_correlation=1",
-    "tracking.min_inlier_share=1",
     "mapping.global_adjustment=False",
 }
 """Ends with which a run does not reach what other settings change."""

@@ -116,7 +116,7 @@ def test_a_store_that_lost_bytes_is_refused(tmp_path: Path) -> None:
 def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
     corrected: bool, voxel_mm: float | None, shown: bool, at_end: bool
 ) -> None:
-    settings = FusionSettings(voxel_mm=voxel_mm, every=2, min_weight=0.0)
+    settings = FusionSettings(voxel_mm=voxel_mm, every=2)
     fusion = SurfaceFusion(settings, FrameStore(), corrected=corrected)
     fusion.shown = shown
     frames = [wall(60.0, n) for n in range(3)]
@@ -125,7 +125,7 @@ def test_frames_wait_where_they_are_corrected_or_voxels_follow_the_scene(
     assert (fusion.at_end, fusion.at_once) == (at_end, shown or not at_end)
     assert bool(len(fusion.surface(0).faces)) == fusion.at_once
     surface = fusion.fuse(fusion.store.frames(), fusion.store.median_depth_mm())
-    volume = TsdfVolume(FusionSettings(voxel_mm=1.0, min_weight=0.0))
+    volume = TsdfVolume(FusionSettings(voxel_mm=1.0))
     for frame in frames[::2]:
         volume.integrate(frame)
     assert len(surface.mesh.vertices) == pytest.approx(len(volume.extract_mesh().vertices), rel=0.05)

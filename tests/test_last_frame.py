@@ -15,7 +15,7 @@ from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.tracking.alike import AlikeFeatures
-from scopemap.engine.tracking.keyframe_alignment import is_obscured
+from scopemap.engine.tracking.keyframe_alignment import MIN_SHARPNESS, is_obscured
 from scopemap.engine.tracking.rtdl import Alignment, Motion
 from scopemap.engine.tracking.track import Track
 from scopemap.engine.tracking.tracker import Tracker
@@ -80,4 +80,4 @@ def test_flow_is_searched_from_the_guessed_motion() -> None:
 @pytest.mark.parametrize(("sharpness", "matches", "obscured"), [(0.5, 39, True), (0.5, 40, False), (0.2, 400, True)])
 def test_features_that_match_tell_a_bare_wall_from_smoke(sharpness: float, matches: int, obscured: bool) -> None:
     alignment = Alignment(Motion(np.eye(4), np.array([1.0, 0.0])), 1.0, 0.5, 0.3, 1.0, 0.9, 5, matches=matches)
-    assert is_obscured(sharpness, alignment, SETTINGS.min_sharpness) == obscured
+    assert is_obscured(sharpness, alignment, MIN_SHARPNESS) == obscured

@@ -128,7 +128,7 @@ def test_a_keyframe_that_sees_nothing_of_those_before_takes_over_the_correction(
 
 
 def test_tracks_that_forget_know_of_the_last_keyframes_what_all_know() -> None:
-    everything, some = FeatureTracks(LOCAL, DisFlow()), FeatureTracks(LOCAL, DisFlow())
+    everything, some = FeatureTracks(DisFlow()), FeatureTracks(DisFlow())
     for n, pose in enumerate(TRUE):
         for tracks in (everything, some):
             tracks.add(plane_scene.frame(pose, n))

@@ -110,7 +110,7 @@ def test_a_keyframe_leaves_little_in_memory(tmp_path: Path) -> None:
 
 def test_of_many_maps_the_last_ones_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.engine.mapping.feature_tracks._MOST_MAPS", 2)
-    tracks = FeatureTracks(MappingSettings(keyframe_gaps=(1,)), DisFlow())
+    tracks = FeatureTracks(DisFlow(), gaps=(1,))
     for number, map_number in enumerate((0, 1, 0, 2, 0, 1)):
         view = plane_scene.see(plane_scene.pose(at_mm=(2.0 * number, 0.0, 0.0)))
         frame = (view.rgb, CAMERA, plane_scene.EVERYWHERE, view.depth_mm, view.T_world_camera)

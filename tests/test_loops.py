@@ -21,7 +21,6 @@ OUT = [plane_scene.pose(at_mm=(4.0 * n, 0.7 * n, 0.0), turn_rad=(0.0, 0.0, 0.02 
 POSES = [*OUT, *OUT[-2::-1]]
 COUNT = len(POSES)
 LINE = np.column_stack([np.arange(COUNT - 1), np.arange(1, COUNT)])
-SETTINGS = MappingSettings(keyframe_gaps=(1, 2))
 
 
 def _frame(number: int, T_tracked: np.ndarray | None = None, factor: float = 1.0) -> Frame:
@@ -46,7 +45,7 @@ def _off(pose: np.ndarray, true: np.ndarray) -> tuple[float, float]:
 
 
 def test_a_revisited_place_is_found_with_its_relative_pose() -> None:
-    finder = LoopFinder(SETTINGS)
+    finder = LoopFinder(MappingSettings(), recent=2)
     loops = [loop for number in range(COUNT) for loop in finder.add(_frame(number, factor=1.0 + 0.02 * number))]
     assert any(loop.past + loop.new == COUNT - 1 for loop in loops)
     for loop in loops:
@@ -62,7 +61,7 @@ def test_a_revisited_place_is_found_with_its_relative_pose() -> None:
 @pytest.mark.parametrize("candidates", [0, 3])
 def test_all_keyframes_of_two_maps_are_compared_at_the_end(candidates: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.engine.mapping.loop_closure._CANDIDATES", candidates)
-    finder, map_of = LoopFinder(SETTINGS), [0] * len(OUT) + [1] * (COUNT - len(OUT))
+    finder, map_of = LoopFinder(MappingSettings(), recent=2), [0] * len(OUT) + [1] * (COUNT - len(OUT))
     first = [loop for number in range(COUNT) for loop in finder.add(_frame(number), map_of[number])]
     assert bool(first) == bool(candidates)
     loops = finder.between(map_of)
@@ -79,7 +78,7 @@ def test_all_keyframes_of_two_maps_are_compared_at_the_end(candidates: int, monk
 
 def test_memory_of_places_is_bounded_and_a_return_is_still_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.engine.mapping.loop_closure.MOST_SEARCHED", 6)
-    finder, kept, loops = LoopFinder(MappingSettings(keyframe_gaps=(1,))), [], []
+    finder, kept, loops = LoopFinder(MappingSettings(), recent=1), [], []
     for number, x_mm in enumerate([*np.linspace(-60.0, 60.0, 17), -60.0]):
         loops = finder.add(_sideways(number, x_mm))
         kept.append(len(finder._features))
@@ -92,7 +91,7 @@ def test_dirt_on_the_lens_closes_no_loop(map_number: int, height_px: int, monkey
     dirt = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(height_px, 80, 3)), (0, 0), 0.9)
 
     def loops() -> list[Loop]:
-        finder, found = LoopFinder(SETTINGS), []
+        finder, found = LoopFinder(MappingSettings(), recent=2), []
         for number in range(10):
             frame = _sideways(number, -60.0 + 2 * number if number < 5 else 45.0 + 2 * number)
             frame.rgb[60 : 60 + height_px, 80:160] = np.clip(100 + 30 * dirt / dirt.std(), 0, 255).astype(np.uint8)
@@ -174,7 +173,7 @@ def test_one_false_loop_is_an_outlier() -> None:
 @pytest.mark.parametrize("closing", [True, False])
 def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
     tracked = _drifting()
-    settings = SETTINGS if closing else MappingSettings(keyframe_gaps=(1, 2), min_loop_inliers=0)
+    settings = MappingSettings() if closing else MappingSettings(min_loop_inliers=0)
     correction = plane_scene.adjusted((_frame(number, T) for number, T in enumerate(tracked)), settings)
     _, before = _off(tracked[-1], POSES[-1])
     _, after = _off(correction.pose(10 * (COUNT - 1), tracked[-1]), POSES[-1])
@@ -186,7 +185,7 @@ def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
 
 
 def test_a_camera_at_rest_closes_few_loops_to_each_keyframe() -> None:
-    finder = LoopFinder(MappingSettings(keyframe_gaps=(1,)))
+    finder = LoopFinder(MappingSettings(), recent=1)
     loops = [loop for number in range(14) for loop in finder.add(replace(_frame(0), index=10 * number))]
     assert len(loops) > 10
     counts = np.bincount([loop.past for loop in loops])

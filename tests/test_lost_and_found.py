@@ -119,7 +119,7 @@ def test_a_camera_that_is_lost_for_long_is_looked_for_in_some_frames_and_still_f
     frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n % 9) for n in range(12)]
     back = [plane_scene.frame(T, 20 + n) for n, T in enumerate(NEAR[:4])]
-    tracks = _tracked([*frames, *there, *back], _settings(new_map_after=0, search_every=3))
+    tracks = _tracked([*frames, *there, *back], _settings(new_map_after=0, fast=True))
     searched = ["not searched" not in track.reason for track in tracks[8:20]]
     # The first five, and every third after these.
     assert searched == [True] * 6 + [True, False, False] * 2
@@ -141,7 +141,7 @@ def test_a_lost_frame_is_not_aligned_by_light_and_one_keyframe_finds_it(monkeypa
     count(relocalisation, "relative_pose_pnp")
     frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
     there = [_elsewhere(8 + n, n) for n in range(3)]
-    tracker = Tracker(_settings(min_keyframe_motion=0.0), DisFlow())
+    tracker = Tracker(_settings(keyframes_wait=False), DisFlow())
     tracks = _tracked([*frames, *there], tracker=tracker)
     assert [track.status for track in tracks] == ["initial"] + ["ok"] * 7 + ["lost"] * 3
     # Of the keyframes 0, 3 and 6.

@@ -92,17 +92,16 @@ def test_frame_scale_corrects_a_wrong_factor_exactly(kind: Any, factor: float) -
     np.testing.assert_allclose(refined.depth_mm, DEPTH, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("pull", "least", "most"), [(0.0, 6.0, 8.0), (0.1, 1.2, 2.0)])
-def test_a_chain_that_little_holds_does_not_run_away(pull: float, least: float, most: float) -> None:
+def test_a_chain_that_little_holds_does_not_run_away() -> None:
     """A motion that is wrong says at each frame that all went 2 mm away, in three tenths of the image."""
-    mapis = _mapis(frame_scale="robust", blend="none", scale_pull=pull)
+    mapis = _mapis(frame_scale="robust", blend="none")
     consistent = np.zeros(SHAPE, bool)
     consistent[:, : round(0.3 * SHAPE[1])] = True
     link = DenseCorrespondence(_link().to_previous, consistent, _link().distance)
     flat, away = np.full(SHAPE, 40.0, np.float32), se3(np.eye(3), np.array([0.0, 0.0, 2.0]))
     mapis.refine(flat, "depth", CAMERA, None, None)
     scales = [mapis.refine(flat, "depth", CAMERA, link, away).scale for _ in range(120)]
-    assert least < scales[-1] < most
+    assert 1.2 < scales[-1] < 2.0
 
 
 @pytest.mark.parametrize("round_view", [False, True])
@@ -129,7 +128,7 @@ def test_scale_with_the_motion_keeps_an_approach_and_without_cancels_it() -> Non
 
 
 def test_values_are_pulled_along_the_flow() -> None:
-    refined = _second(_mapis(constant_weight=1.0), _link(flow_x=3.0))
+    refined = _second(_mapis(blend="linear"), _link(flow_x=3.0))
     np.testing.assert_allclose(refined.depth_mm[:, :-3], DEPTH[:, 3:], rtol=1e-6)
     np.testing.assert_array_equal(refined.depth_mm[:, -3:], OTHER[:, -3:])
     assert refined.warped_share == pytest.approx(61 / 64)

@@ -118,7 +118,7 @@ def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> N
     for i in range(3):
         save(images / f"{i}.png", picture(i, (640, 480)))
     masks = write_masks(tmp_path / "masks", {f"{i}.png": left_half() for i in range(3)})
-    config = Config.load(settings={"mask.files": str(masks), "mask.files_grow_px": 0, "depth.backend": "shading"})
+    config = Config.load(settings={"mask.files": str(masks), "depth.backend": "shading"})
     sequence = open_sequence(images)
     estimators = create_estimators(config, sequence)
     assert estimators_provenance(estimators)["masks"].startswith("3 files")

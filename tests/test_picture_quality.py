@@ -104,11 +104,10 @@ def test_a_camera_at_rest_needs_no_other_keyframe() -> None:
 
 
 def test_every_nth_frame_is_a_keyframe_in_the_paper() -> None:
-    paper = {name: TrackingSettings.METHODS["paper"][name] for name in ("min_keyframe_motion", "keyframe_patience")}
-    assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5], step_mm=0.02, **paper) == [0, 3, 6]
+    assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5], step_mm=0.02, keyframes_wait=False) == [0, 3, 6]
 
 
-def keyframes(qualities: list[float], step_mm: float = 0.5, **settings: float) -> list[int]:
+def keyframes(qualities: list[float], step_mm: float = 0.5, **settings: bool) -> list[int]:
     """Return the frames that become keyframes, of every third, where the camera moves by `step_mm` a frame."""
     tracker, found = Tracker(TrackingSettings(keyframe_every=3, **settings)), list[int]()
     for n, quality in enumerate(qualities):

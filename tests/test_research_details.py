@@ -41,10 +41,9 @@ from drawn_image_sets import (
 from drawn_inputs import SIZE, frames_of, number_in, poses, save, write_c3vd
 
 from scopemap.engine.cameras.lenses import OpenCvCamera
-from scopemap.engine.config import MaskSettings
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.se3 import se3_exp
-from scopemap.input.mask_files import create_masks
+from scopemap.input.mask_files import MaskFiles
 from scopemap.input.opening import open_sequence
 from scopemap.input.trajectory.text import read_poses
 from scopemap.result.reference import reference_trajectory
@@ -154,8 +153,7 @@ def test_other_poses_are_in_the_axes_of_llff(tmp_path: Path) -> None:
 def test_instruments_are_masked_unless_the_masks_hold_holes_of_the_depth(tmp_path: Path) -> None:
     folder = write_endonerf(tmp_path / "a")
     sequence = open_sequence(folder)
-    settings = MaskSettings(files_grow_px=0)
-    covered = create_masks(settings, sequence.rectifier, sequence.source.masks).covered(9)
+    covered = MaskFiles(sequence.source.masks, sequence.rectifier).covered(9)
     np.testing.assert_array_equal(covered, np.broadcast_to(np.arange(64)[:, None] < 10, (64, 80)))
     shutil.rmtree(folder / "gt_masks")
     sequence = open_sequence(folder)
@@ -180,7 +178,7 @@ def test_real_scene_of_endonerf(real_data: Path) -> None:
     sequence = open_sequence(folder, size=(640, 512))
     assert (sequence.source.name, sequence.count, sequence.source.masks) == ("endonerf", 63, folder / "gt_masks")
     np.testing.assert_allclose(sequence.camera.matrix, [[569.468, 0, 319.5], [0, 569.468, 255.5], [0, 0, 1]], atol=1e-3)
-    masks = create_masks(MaskSettings(files_grow_px=0), sequence.rectifier, folder / "gt_masks")
+    masks = MaskFiles(folder / "gt_masks", sequence.rectifier)
     for frame, truth in sequence:
         stored = cv2.imread(str(folder / "depth" / f"frame-{frame.index:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(np.nan_to_num(truth.depth_mm), stored)

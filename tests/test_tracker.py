@@ -106,11 +106,12 @@ def test_lost_frames_are_kept_and_tracking_goes_on() -> None:
     assert turned_deg < 0.4
 
 
-def test_a_jump_is_believed_only_where_many_features_confirm_it() -> None:
+def test_a_jump_is_believed_only_where_many_features_confirm_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scopemap.engine.tracking.keyframe_alignment._MAX_STEP", 1e-4)
     frames, truth = _sequence()
     tracks = []
     for searched in (0, 10):
-        tracker = Tracker(TrackingSettings(**PLAIN, max_step=1e-4, relocalisation_keyframes=searched))
+        tracker = Tracker(TrackingSettings(**PLAIN, relocalisation_keyframes=searched))
         first = tracker.track(frames[0])
         tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
         tracks.append(tracker.track(frames[4]))

@@ -19,6 +19,7 @@ from scopemap.input.decoding import by_number, frame_number, read_decoded
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _LOSSY = (".jpg", ".jpeg")
 _HALF = 127
+_GROW_PX = 3  # by hand: by which masks are widened
 _NO_MASKS = "none"
 
 
@@ -33,7 +34,7 @@ def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None 
         raise SettingsError(f"mask.instruments=off contradicts mask.files={settings.files}: leave one of them out")
     if folder is None or settings.instruments == "off":
         return None
-    return MaskFiles(folder, rectifier, settings.files_grow_px)
+    return MaskFiles(folder, rectifier, _GROW_PX)
 
 
 class MaskFiles:

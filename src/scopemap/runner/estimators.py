@@ -18,6 +18,7 @@ from scopemap.engine.estimators import Estimators
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.flow.flows import create_flow
 from scopemap.engine.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
+from scopemap.engine.mapping.bundle_problem import TRACKED
 from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.engine.models import weights
 from scopemap.engine.models.device import choose_device
@@ -104,5 +105,5 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
         return estimators.depth.measured_max_mm
     mapping, log_factor = config.mapping, 0.0
     if mapping.adjusts:
-        log_factor = 3 * mapping.scale_sigma + (MAX_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
+        log_factor = 3 * TRACKED.scale + (MAX_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)
     return math.exp(log_factor) * max_depth_mm(config.depth)

@@ -11,6 +11,7 @@ from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.depth_mesh import depth_mesh
 from scopemap.engine.fusion.mesh_files import save_mesh
+from scopemap.engine.fusion.surface_fusion import steepest_cosine
 from scopemap.engine.notices import scale_words
 from scopemap.runner.provenance import scale_facts
 
@@ -29,7 +30,7 @@ class SurfaceWriter:
         if frame.T_world_camera is None:
             return
         step_px = depth_downscale(self._config.depth, max(frame.valid.shape))
-        mesh = depth_mesh(frame, step_px, max(self._config.fusion.min_incidence, 0.05))
+        mesh = depth_mesh(frame, step_px, steepest_cosine(self._config.fusion))
         with reporting(f"cannot write to {self._folder}"):
             self._folder.mkdir(parents=True, exist_ok=True)
             scale = scale_words(scale_facts(self._estimators))

@@ -16,7 +16,6 @@ from scopemap.report.frame_pictures import shrunk
 
 _SMALL_PX = 320
 _FLOW_PX = 160
-_MASK = MaskSettings()
 # A frame with a smaller lit share is blank: text on black shows no tissue.
 _LEAST_LIT = 0.05
 
@@ -69,7 +68,7 @@ class FrameInspector:
     """Measures the frames of a video in their order; keeps the last one that was no repeat."""
 
     def __init__(self) -> None:
-        self._field, self._masker = FieldOfView(), Masker(_MASK)
+        self._field, self._masker = FieldOfView(), Masker(MaskSettings())
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
         self._before: np.ndarray | None = None
@@ -77,7 +76,7 @@ class FrameInspector:
     def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> InspectedFrame:
         """Return the picture (H, W, 3) uint8 at a position, with the frame that a run makes of it, measured."""
         small = shrunk(rgb, _SMALL_PX)
-        lit = is_lit(small, _MASK.dark_level)
+        lit = is_lit(small)
         field, masked = self._field(lit, np.ones_like(lit)), self._masker(frame)
         inside = field if field.any() else np.ones_like(field)
         darkest, middle = darker_channels(small)

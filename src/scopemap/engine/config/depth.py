@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from scopemap.engine.config.settings import Methods, Settings, Share, StageSettings, advanced
+from scopemap.engine.config.settings import Methods, Settings, StageSettings, advanced
 
 
 class DepthSettings(StageSettings):
@@ -49,14 +49,6 @@ class DepthSettings(StageSettings):
         300.0, gt=0, description="predicted depth beyond this is unknown, unless near-far names a farther one, mm"
     )
 
-    reanchor_every: NonNegativeInt = advanced(
-        0, "fit the metric anchor every n-th frame, best a multiple of keyframe_every; 0: once", "the paper: once"
-    )
-    shading_exponent: Annotated[float, Field(gt=0, le=1)] = advanced(
-        0.6,
-        "depth from shading: distance = k * brightness^-exponent",
-        "chosen on the real frames of scopemap_bench.scripts.depth_without_download; an inverse square gives 0.5",
-    )
     fit_shift: bool = advanced(
         True, "fit scale and shift to the anchor; false: the pseudo-stereo baseline (the paper)", "by hand"
     )
@@ -107,15 +99,6 @@ class MapisSettings(StageSettings):
         "robust for predicted depth, none for measured",
         "by hand: a network's scale changes from frame to frame",
     )
-    scale_pull: Share = advanced(
-        0.1,
-        "share of ln of that scale removed per frame where no pixel has a warped depth; decreases with the square of "
-        "the warped share; 0: off",
-        "by hand",
-    )
-    sigma_fading: Share = advanced(
-        0.3, "growth of the warped depth's variance per frame, share of its gap to the frame's", "by hand"
-    )
     filter_sigma_px: NonNegativeFloat = advanced(
         2.0, "sigma_d of the bilateral filter; 0: off", "plausible, not searched; the paper gives none"
     )
@@ -133,15 +116,9 @@ class MapisSettings(StageSettings):
     )
     blend: Literal["auto", "none", "exponential", "linear", "constant", "paper-equation"] = advanced(
         "auto",
-        "weight of the warped depth, with the perceptual distance S; linear: 1 - S; exponential: exp(-S / tau); "
-        "paper-equation: S; auto: linear for predicted depth, none for measured",
+        "weight of the warped depth, with the perceptual distance S; linear: 1 - S; exponential: exp(-S / 0.15); "
+        "constant: 0.5; paper-equation: S; auto: linear for predicted depth, none for measured",
         "linear: the paper's section MAPIS-Depth, by its text; better than exponential wherever it was tried",
-    )
-    tau: PositiveFloat = advanced(
-        0.15, "exponential blend: distance at which the weight is 1/e", "plausible, not searched; the paper gives none"
-    )
-    constant_weight: Share = advanced(
-        0.5, "constant blend: weight of the warped depth", "by hand, for the ablation without LPIPS"
     )
     recursive: bool = advanced(True, "warp the refined previous depth; false: the raw one (the paper)", "by hand")
     compare_warped: bool = advanced(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, cast, get_args
 
-from pydantic import BeforeValidator, Field, NonNegativeInt
+from pydantic import BeforeValidator, Field
 
 from scopemap.engine.config.settings import Methods, Settings, StageSettings, advanced
 
@@ -129,7 +129,3 @@ class MaskSettings(StageSettings):
         True, "find burned-in text and logos, which stay while the rest moves", "by hand; the paper has none"
     )
     exposure: bool = advanced(True, "mask under-exposed and over-exposed pixels", "by hand; the paper has none")
-    dark_level: Annotated[int, Field(ge=0, le=255)] = advanced(
-        12, "grey level up to which a pixel counts as under-exposed", "by hand"
-    )
-    files_grow_px: NonNegativeInt = advanced(3, "by which masks from files are widened, px", "by hand")

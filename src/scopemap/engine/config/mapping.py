@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from scopemap.engine.config.settings import Methods, Share, StageSettings, advanced
-
-Gaps = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
 
 
 class MappingSettings(StageSettings):
@@ -38,35 +36,16 @@ class MappingSettings(StageSettings):
         "over; false: depth as predicted, corrected at the keyframes' corners",
         "by hand: adjusted poses are far more accurate than depth",
     )
-    keyframe_gaps: Gaps = advanced(
-        (1, 2, 3, 5, 8, 16, 32),
-        "a keyframe's corners are matched in those so many before it",
-        "by hand; 16 and 32, where flow lags less: chosen on phantoms of an abdominal wall",
-    )
     local_window: NonNegativeInt = advanced(
         5,
         "keyframes that each new one is adjusted with, itself among them, before frames are tracked against it; 0: off",
         "by hand",
     )
-    local_gaps: Gaps = advanced((1, 2), "there a keyframe's corners are matched in those so many before", "by hand")
     global_adjustment: bool = advanced(True, "adjust all keyframes after the last frame", "by hand; the paper has none")
-    correlated_observations: Annotated[float, Field(ge=1)] = advanced(
-        4.0, "so many observations count as one: errors of flow are alike at neighbouring corners", "by hand"
-    )
-    depth_sigma_share: PositiveFloat = advanced(
-        0.2, "standard deviation that every estimated depth has at least, over the depth", "by hand"
-    )
-    scale_sigma: PositiveFloat = advanced(0.1, "standard deviation of ln of a keyframe's depth scale", "by hand")
     depth_step_sigma: NonNegativeFloat = advanced(
         0.1,
         "standard deviation of ln depth between nodes of the depth correction field; 0: depth is only scaled",
         "by hand",
-    )
-    rotation_sigma_deg: PositiveFloat = advanced(
-        3.0, "standard deviation of the tracked rotation between keyframes", "by hand"
-    )
-    translation_sigma_share: PositiveFloat = advanced(
-        0.1, "standard deviation of the tracked translation between keyframes, over the median depth", "by hand"
     )
     max_sigma_px: PositiveFloat = advanced(
         0.8,
@@ -96,7 +75,7 @@ class FusionSettings(StageSettings):
     METHODS: ClassVar[Methods] = {
         "scopemap": {},
         "no-free-space": {"free_space": False},
-        "unweighted": {"weighted": False, "min_incidence": 0.0, "truncation_share": 0.0, "min_weight": 0.0},
+        "unweighted": {"weighted": False},
         "all-components": {"min_component_share": 0.0},
     }
     method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, no-free-space, ...")
@@ -128,18 +107,10 @@ class FusionSettings(StageSettings):
 
     weighted: bool = advanced(
         True,
-        "weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface less; "
-        "false: 1",
+        "weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface less; leave "
+        "out grazing pixels and voxels of little weight; truncate farther where depth is larger; false: none of these",
         "Curless and Levoy 1996, and by hand",
     )
-    min_incidence: Share = advanced(0.1, "cosine of incidence below which a pixel is not fused", "by hand")
-    depth_sigma_share: PositiveFloat = advanced(
-        0.2, "relative error that all depth has; more uncertain pixels weigh less; large: off", "by hand"
-    )
-    truncation_share: Share = advanced(
-        0.08, "truncation over the pixel's depth, where that is larger than truncation_mm", "by hand"
-    )
-    min_weight: NonNegativeFloat = advanced(0.1, "voxels with less weight give no surface", "by hand")
     min_component_share: Share = advanced(
         0.02, "components with less than this share of the faces are removed", "by hand"
     )

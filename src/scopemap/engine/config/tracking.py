@@ -19,25 +19,22 @@ class TrackingSettings(StageSettings):
     METHODS: ClassVar[Methods] = {
         "scopemap": {},
         "paper": {
-            "min_texture": 0.0,
-            "min_sharpness": 0.0,
+            "picture_checks": False,
             "relocalisation_keyframes": 0,
             "new_map_after": 0,
             "corner_depth_sigma": 0.0,
             "min_keyframe_agreement": 0.0,
-            "min_keyframe_motion": 0.0,
-            "keyframe_patience": 0,
+            "keyframes_wait": False,
             "finest_level": 0,
             "depth_weight": 0.0,
-            "min_correlation": -1.0,
             "start": "identity",
             "channels": "grey",
             "lamp_gamma": 0.0,
             "gain_bias": False,
         },
         "least-squares": {"huber": 1e6},
-        "no-pose-checks": {"min_valid_share": 0.001, "min_texture": 0.0, "min_inlier_share": 0.0, "max_step": 1e6},
-        "realtime": {"search_every": 3, "max_iterations": 15},
+        "no-pose-checks": {"min_valid_share": 0.001, "pose_checks": False},
+        "realtime": {"fast": True},
     }
     method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, realtime, paper, ...")
     camera_at_rest: bool = Field(
@@ -50,21 +47,18 @@ class TrackingSettings(StageSettings):
     )
 
     min_valid_share: Share = advanced(0.1, "a frame with a smaller usable overlap with its keyframe is lost", "by hand")
-    min_texture: NonNegativeFloat = advanced(
-        0.5,
-        "from the 11th frame in a row with less texture on, a frame is lost without being looked at further; 0: off",
-        "measured: noise has 0.32, a wall that is touched up to 0.45, tissue 0.65 and more",
+    picture_checks: bool = advanced(
+        True,
+        "a frame with little texture, an unsharp one, and one unlike its keyframe (correlation) is lost; false: not",
+        "by hand; the paper has none",
     )
-    min_sharpness: NonNegativeFloat = advanced(
-        0.6,
-        "a frame below this share of the recent frames' median sharpness is lost where it also fits its keyframe badly",
-        "by hand, for smoke and blur",
+    pose_checks: bool = advanced(
+        True,
+        "a frame that few pixels fit, or whose pose is a jump, is lost; false: not checked, and texture neither",
+        "by hand",
     )
     relocalisation_keyframes: NonNegativeInt = advanced(
         10, "recent keyframes in which a lost camera is relocalised; 0: off", "by hand"
-    )
-    search_every: PositiveInt = advanced(
-        1, "a camera that was lost for more than 5 frames is looked for in every n-th one", "by hand"
     )
     new_map_after: NonNegativeInt = advanced(
         5, "sharp frames lost in a row after which a new map begins; 0: never", "by hand"
@@ -78,33 +72,25 @@ class TrackingSettings(StageSettings):
         "for the keyframe's first frame; 0: off",
         "by hand; of 20 lost frames of the colonoscopy clip 1 remained",
     )
-    min_keyframe_motion: NonNegativeFloat = advanced(
-        0.01,
-        "a camera that has moved less since the keyframe, rad and translation over depth, needs no other one: its "
-        "views triangulate nothing, and their errors are alike; 0: off",
-        "chosen on cecum_t1_a (C3VD): 0.02 left keyframes out where the camera is slow",
+    keyframes_wait: bool = advanced(
+        True,
+        "a keyframe waits until the camera has moved, and up to three frames longer where the picture is not clear; "
+        "false: it does not wait",
+        "by hand; the paper has none",
     )
-    keyframe_patience: NonNegativeInt = advanced(
-        3, "frames that a keyframe waits longer where the picture is not clear", "by hand"
+    fast: bool = advanced(
+        False,
+        "after more than 5 lost frames only every third one is looked for, and a pyramid level has half the steps",
+        "by hand",
     )
     levels: PositiveInt = advanced(5, "levels of the image pyramid, factor 0.5", "the paper's section WEMA-RTDL")
     finest_level: Annotated[int, Field(ge=0, le=3)] = advanced(1, "0: full working size, 1: half", _CHOSEN)
-    max_iterations: PositiveInt = advanced(30, "steps per pyramid level", "by hand")
     huber: PositiveFloat = advanced(
         1.0, "threshold of Huber's loss (1964), in robust standard deviations (MAD)", _CHOSEN
     )
     depth_weight: NonNegativeFloat = advanced(
         1.0, "weight of the point-to-plane distance to the frame's measured depth; 0: off", "by hand"
     )
-    min_inlier_share: Share = advanced(
-        0.4, "a frame with a smaller share is lost", "measured: unrelated fine texture has 0.37"
-    )
-    min_correlation: Annotated[float, Field(ge=-1, le=1)] = advanced(
-        0.15,
-        "a frame that correlates less with its keyframe is lost; -1: off",
-        "measured: well tracked clips have 0.3 and more, tissue without structure 0.1 and less",
-    )
-    max_step: PositiveFloat = advanced(0.5, "largest motion between frames: rad, and mm over mean depth", "by hand")
     solver: Literal["dogleg", "gauss-newton"] = advanced(
         "dogleg", "minimiser of the photometric error", "the paper's section WEMA-RTDL, subsection Optimisation"
     )

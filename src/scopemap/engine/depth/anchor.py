@@ -57,7 +57,7 @@ class AnchoredDepth:
 
     `settings.anchor` chooses the target of the fit to the first frame with enough usable pixels: a range (`near-far`),
     `depth-pro`, the `shading` prior, an arbitrary `factor`, or (`auto`) the range if given, else the estimate's own
-    millimetres, else shading. `settings.reanchor_every` repeats the fit. Measured depth is not changed.
+    millimetres, else shading. It is fitted once. Measured depth is not changed.
     Raises `SettingsError` where `near-far` has no valid range.
 
     reference : metric estimator for anchors other than the range and the estimate itself. conversion : of the sequence;
@@ -71,17 +71,13 @@ class AnchoredDepth:
     scale_is_known: Kept[bool] = False
     is_measured: Kept[bool] = False
     is_stated: Kept[bool] = False
-    _frames_held: Kept[int] = 0
+    just_fitted: Kept[bool] = False
+    """Whether the last frame determined the conversion, so that its depth needs no scale from earlier frames."""
 
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
         _check_range(settings)
         self._settings = settings
         self.reference = reference
-
-    @property
-    def just_fitted(self) -> bool:
-        """Whether the last frame determined the conversion, so that its depth needs no scale from earlier frames."""
-        return self.conversion is not None and self._frames_held == 0
 
     def metric(self, estimate: DepthEstimate, frame: Frame) -> MetricDepth:
         """Return metric depth (H, W) float32, mm, NaN = unknown, with its standard deviation where it is estimated.
@@ -90,11 +86,11 @@ class AnchoredDepth:
         Predicted depth beyond `max_depth_mm` is NaN. All is NaN until a frame had enough usable pixels. Raises
         `InputError` if the estimate contradicts the anchor.
         """
-        self._frames_held += 1
-        first_mm, limit_note = self._anchor(estimate, frame) if self._is_due(estimate) else (None, "")
+        self.just_fitted = False
+        first_mm, limit_note = self._anchor(estimate, frame) if self.conversion is None else (None, "")
         if self.conversion is None:
             return MetricDepth(np.full(estimate.values.shape, np.nan, dtype=np.float32), None, limit_note)
-        if isinstance(self.reference, Releasable) and not self._settings.reanchor_every:
+        if isinstance(self.reference, Releasable):
             self.reference.release()  # a resumed run has it anew
         depth_mm = self.conversion.depth_mm(estimate.values) if first_mm is None else first_mm
         sigma_mm = self.conversion.sigma_mm(estimate.sigma) if first_mm is None else None
@@ -112,12 +108,6 @@ class AnchoredDepth:
             return share, ""
         limit = f"depth.max_depth_mm = {limit_mm:g}"
         return share, f"{share:.0%} of its depth is beyond {limit} (median {np.median(positive_mm):.0f} mm)"
-
-    def _is_due(self, estimate: DepthEstimate) -> bool:
-        if self.conversion is None:
-            return True
-        every = self._settings.reanchor_every
-        return every > 0 and self._frames_held >= every and self._source(estimate) == "reference"
 
     def _anchor(self, estimate: DepthEstimate, frame: Frame) -> tuple[np.ndarray | None, str]:
         """Fit the conversion if the frame allows it.
@@ -147,7 +137,7 @@ class AnchoredDepth:
             self.conversion = self._fitted(estimate.kind, estimate.values[known], reference.values[known], focal_px)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
             first_mm = None if self._settings.fit_shift else reference.values
-        self._frames_held = 0
+        self.just_fitted = True
         self.description = self._describe(source, estimate, frame) + details
         network = (
             self._settings.backend if source == "estimate" else self.reference.name if source == "reference" else ""

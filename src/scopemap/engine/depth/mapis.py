@@ -24,6 +24,12 @@ from scopemap.engine.kept import Kept
 
 # Share of the image that must be known in both depths for a scale to be fitted; across a cut 0.06 is so by chance.
 _MIN_OVERLAP = 0.2
+# Share of ln of a frame's scale that is removed where no pixel has a warped depth; it decreases with the square of the
+# warped share.
+_SCALE_PULL = 0.1  # by hand
+_SIGMA_FADING = 0.3  # by hand: growth of the warped depth's variance per frame, share of its gap to the frame's
+_TAU = 0.15  # plausible, not searched; the paper gives none: distance at which an exponential weight is 1/e
+_CONSTANT_WEIGHT = 0.5  # by hand, for the ablation without LPIPS
 
 
 @dataclass(frozen=True)
@@ -155,7 +161,7 @@ class Mapis:
 
     def _pulled_back(self, scale: float, matched_share: float) -> float:
         """Return the scale pulled back towards 1, the more the fewer pixels are matched to the previous frame."""
-        return float(scale ** (1 - self.settings.scale_pull * max(1 - matched_share, 0.0) ** 2))
+        return float(scale ** (1 - _SCALE_PULL * max(1 - matched_share, 0.0) ** 2))
 
     def _blend(self, kind: DepthKind) -> str:
         if self.settings.blend != "auto":
@@ -179,18 +185,18 @@ class Mapis:
             warped_mm = moved_depth(warped_mm, correspondence.to_previous, camera, T_current_previous)
         filtered_mm = bilateral_filtered(warped_mm, self.settings.filter_sigma_px, self.settings.filter_sigma_mm)
         warped_sigma = pull(self._propagated.relative_sigma, correspondence.to_previous)
-        return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, self.settings.sigma_fading))
+        return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, _SIGMA_FADING))
 
     def _weight(self, blend: str, distance: np.ndarray) -> np.ndarray:
         """Weight of the warped depth in equation 4, (H, W) float32 in 0..1, from the perceptual distance S."""
         match blend:
             case "exponential":
-                return np.exp(-distance / np.float32(self.settings.tau))
+                return np.exp(-distance / np.float32(_TAU))
             case "linear":
                 return 1 - np.clip(distance, 0, 1)
             case "paper-equation":
                 return np.clip(distance, 0, 1)
-        return np.full_like(distance, self.settings.constant_weight)
+        return np.full_like(distance, _CONSTANT_WEIGHT)
 
 
 def robust_scale(raw_mm: np.ndarray, warped_mm: np.ndarray, otherwise: float) -> float:

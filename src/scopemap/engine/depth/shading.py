@@ -12,14 +12,15 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.srgb import LINEAR
 from scopemap.engine.kept import Kept
 
-# By trial: on the real frames of `scopemap_bench.scripts.depth_without_download`.
+# Of what is by trial: on the real frames of `scopemap_bench.scripts.depth_without_download`.
+_EXPONENT = 0.6  # by trial: distance = k * brightness^-exponent; an inverse square gives 0.5
 # Red alone saturates on near tissue, green alone follows the blood, blue is mostly noise.
 _CHANNEL_WEIGHTS = np.array([0.5, 0.5, 0.0], dtype=np.float32)
 # Below this linear brightness (sRGB level 3 of 255) there is only noise: it bounds the distance.
 _DARKEST = 1e-3  # guard
 # Lamp emission and lens vignetting together fall with about the first power of the angle's cosine.
 _LAMP_COSINE_POWER = 1.0  # by trial
-_DARK_LEVEL = 12  # by trial: the default of `mask.dark_level`
+_DARK_LEVEL = 12  # by trial: as that of `masking/masker.py`
 _SATURATED_LEVEL = 250  # by trial: grey level of green that is clipped
 _HIGHLIGHT_RATIO = 2.0  # by trial: of a highlight's brightness over its wide surroundings'
 _HIGHLIGHT_WHITENESS = 0.6  # by trial: of a highlight's darkest channel over its brightest
@@ -53,7 +54,7 @@ class ShadingDepth:
         neighbours; everything, as long as no frame had usable pixels.
         """
         unit_z = 1 / np.linalg.norm(frame.camera.rays, axis=-1)
-        distance = relative_distance(frame, unit_z, self._settings.shading_exponent)
+        distance = _relative_distance(frame, unit_z)
         if self._scale_mm is None:
             seen = distance[frame.valid & np.isfinite(distance)]
             if seen.size >= _MIN_SHARE * distance.size:
@@ -66,11 +67,11 @@ class ShadingDepth:
         return {
             "depth": "near-field shading, embedded, no weights",
             "prior": f"median distance of the first frame {self._settings.shading_median_mm:g} mm",
-            "exponent": f"{self._settings.shading_exponent:g}",
+            "exponent": f"{_EXPONENT:g}",
         }
 
 
-def relative_distance(frame: Frame, unit_z: np.ndarray, exponent: float) -> np.ndarray:
+def _relative_distance(frame: Frame, unit_z: np.ndarray) -> np.ndarray:
     """Return the distance along the ray up to a factor, (H, W) float32, NaN = unknown; unit_z : (H, W) of unit rays."""
     width = frame.camera.width
     brightness = linear_brightness(frame.rgb) / unit_z**_LAMP_COSINE_POWER
@@ -79,7 +80,7 @@ def relative_distance(frame: Frame, unit_z: np.ndarray, exponent: float) -> np.n
     glare = _glare(frame.rgb, log_brightness, 2 * radius_px + 1)
     log_brightness = filled(log_brightness, frame.valid & ~glare, max(1, round(_REACH_SHARE * width)))
     known = np.isfinite(log_brightness) & (frame.rgb.max(-1) > _DARK_LEVEL)
-    return np.exp(-exponent * guided_filter(log_brightness, known, radius_px, _EDGE_LOG))
+    return np.exp(-_EXPONENT * guided_filter(log_brightness, known, radius_px, _EDGE_LOG))
 
 
 def linear_brightness(rgb: np.ndarray) -> np.ndarray:

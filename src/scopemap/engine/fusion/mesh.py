@@ -20,6 +20,7 @@ _SMALLEST_DISTANCE_VOXELS = 1e-3
 # A cell's diagonal is sqrt(3) voxels, and a distance changes by no more than the step: twice that is a depth edge, not
 # a surface. Without the limit, walls of the truncation's depth would grow behind every fold's silhouette.
 _LARGEST_SPREAD_VOXELS = 3.5
+_MIN_WEIGHT = 0.1  # by hand: voxels with less weight give no surface
 _UNSEEN_GREY = 128.0  # by hand: colour of what no frame saw
 # Weight of a vertex whose confidence is 1 - 1/e: a frontal look from near weighs 1.
 _CONFIDENT_WEIGHT = 1.5  # by hand
@@ -47,13 +48,15 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """Return the zero level of the field as a mesh in world mm, its normals towards free space, with vertex colours.
 
-    Only cells whose 8 corners all weigh at least `min_weight` give faces: unseen space stays a hole. Components with
-    less than `min_component_share` of the faces are dropped, the largest never. No surface: a mesh without vertices.
+    Only cells whose 8 corners all have some weight, at least `_MIN_WEIGHT` unless weights are off, give faces: unseen
+    space stays a hole. Components with less than `min_component_share` of the faces are dropped, the largest never. No
+    surface: a mesh without vertices.
     `vertex_attributes["confidence"]`: (V,) float32, 0..1, 1 - exp(-weight / 1.5). median_level : median grey level,
     0..255, that the colours are scaled to; None: they stay as they are.
     """
     corners = np.unique(unpack(blocks.keys()) // _CHUNK_BLOCKS, axis=0)
-    chunks = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, settings.min_weight) for corner in corners]
+    least = _MIN_WEIGHT if settings.weighted else 0.0
+    chunks = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, least) for corner in corners]
     mesh = _weld([chunk for chunk in chunks if chunk is not None])
     vertices, faces, values = _without_floaters(*mesh, settings.min_component_share)
     shown = np.round(displayed(values[:, :3], median_level)).astype(np.uint8)

@@ -35,8 +35,11 @@ from scopemap.engine.geometry.uncertainty import depth_trust
 from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 
-# Below this cosine a slanted wall cannot be distinguished from a depth edge, whatever the setting.
+# Below this cosine a slanted wall cannot be distinguished from a depth edge, with weights or without.
 _MIN_COSINE = 0.05  # by hand
+_MIN_INCIDENCE = 0.1  # by hand: cosine of incidence below which a pixel is not fused
+_TRUNCATION_SHARE = 0.08  # by hand: truncation over the pixel's depth, where that is larger than that in mm
+_DEPTH_SIGMA = 0.2  # by hand: relative error that all depth has; more uncertain pixels weigh less
 # Voxels of 1 mm suit tissue 60 mm away (Endo-Depth-and-Motion, RA-L 2021, truncation 5 mm); TSDF parameters that are
 # not set keep the proportions at other depths.
 _VOXELS_PER_MEDIAN_DEPTH = 60
@@ -90,6 +93,11 @@ def choose_parameters(settings: FusionSettings, median_depth_mm: float | None = 
     )
 
 
+def steepest_cosine(settings: FusionSettings) -> float:
+    """Return the cosine of incidence below which neighbouring pixels are taken for two surfaces."""
+    return _MIN_INCIDENCE if settings.weighted else _MIN_COSINE
+
+
 class TsdfVolume:
     """An unbounded truncated signed distance field; `ValueError` where the parameters do not set `voxel_mm`."""
 
@@ -125,19 +133,19 @@ class TsdfVolume:
         T_camera_world = inverse(T_world_camera)
         R, t = np.ascontiguousarray(T_camera_world[:3, :3]), T_camera_world[:3, 3].copy()
         pinhole = TsdfCamera(R, t, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-        steepest = max(settings.min_incidence, _MIN_COSINE)
-        step = math.sqrt(1 / steepest**2 - 1) / min(camera.fx, camera.fy)
+        step = math.sqrt(1 / steepest_cosine(settings) ** 2 - 1) / min(camera.fx, camera.fy)
         # A share of 1: voxels have the full weight up to the truncation.
-        ramp = {} if settings.weighted else {"full_weight_share": 1.0}
-        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, settings.truncation_share, **ramp)
+        shares = (_TRUNCATION_SHARE,) if settings.weighted else (0.0, 1.0)
+        grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, *shares)
         masked = np.zeros_like(frame.valid)
         if settings.weighted and frame.highlights is not None:
             masked = _small_regions(frame.highlights)
         with np.errstate(invalid="ignore"):
             usable = (frame.valid | masked) & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
+        least_incidence = _MIN_INCIDENCE if settings.weighted else 0.0
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
-        surface = measure_surface(inverse_depth, pinhole, step, settings.min_incidence, parameters.max_depth_mm)
-        trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, settings.depth_sigma_share)
+        surface = measure_surface(inverse_depth, pinhole, step, least_incidence, parameters.max_depth_mm)
+        trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, _DEPTH_SIGMA)
         weight = surface.weight * np.where(masked, np.float32(_MASKED_WEIGHT), np.minimum(trust, np.float32(1.0)))
         weight = weight * np.float32(frame.quality) if settings.weighted else (weight > 0).astype(np.float32)
         surface = surface._replace(weight=weight if frame.weight is None else weight * frame.weight)

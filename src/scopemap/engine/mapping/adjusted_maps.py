@@ -31,8 +31,8 @@ from scopemap.engine.mapping.depth_correction import (
     fit_depth_corrections,
     growth_of_disagreement,
 )
+from scopemap.engine.mapping.feature_tracks import NEAR_GAPS
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
-from scopemap.engine.mapping.loop_closure import MOST_RECENT
 from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.engine.notices import Notice
 
@@ -131,10 +131,8 @@ class MapKeyframes:
     ) -> Notice | None:
         """Return that the depths of keyframes agree less than as tracked; None: they agree about as well."""
         T_world_camera, after = self.adjusted_depths(found, fields)
-        # Farther apart two keyframes may have a few pixels in common, which prove nothing.
-        gaps = [gap for gap in self.settings.keyframe_gaps if gap <= MOST_RECENT]
         before = self.T_world_camera, self.tracked_depths
-        grown = growth_of_disagreement(self.camera, before, (T_world_camera, after), gaps)
+        grown = growth_of_disagreement(self.camera, before, (T_world_camera, after), NEAR_GAPS)
         if grown is None:
             return None
         return Notice("mapping-depth-disagrees", {"tracked": grown[0], "adjusted": grown[1], "merged": ""})

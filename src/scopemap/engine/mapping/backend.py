@@ -19,7 +19,7 @@ from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.adjusted_maps import AdjustedMaps, MapKeyframes, adjust_maps
 from scopemap.engine.mapping.bundle_adjustment import errors_px
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State
+from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundleProblem, Priors, State
 from scopemap.engine.mapping.depth_correction import depth_grid
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
@@ -75,7 +75,7 @@ class Backend:
         self._frames, self._tracked, self._steps, self._log_scales = [], [], [], []
         self._path = PathWithoutDrift(np.zeros(0), np.zeros((0, 4, 4)))
         self._depths_mm, self._loops = table("depth_grids", np.dtype(np.float32)), table("loops", LOOP)
-        self._tracks = FeatureTracks(settings, flow, table)
+        self._tracks = FeatureTracks(flow, table)
         self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
         self._all_weighed = False
         self.most_observations = MOST_OBSERVATIONS
@@ -322,7 +322,7 @@ class Backend:
     def _problem(self, worlds: Mapping[int, Similarity]) -> tuple[BundleProblem, np.ndarray]:
         """Return the bundle adjustment of maps' keyframes, from the pose graph, and its accepted loops (A, 2)."""
         assert self._camera is not None
-        settings, chosen = self._settings, self._chosen(worlds)
+        chosen = self._chosen(worlds)
         poses = [self._tracked[k] for k in chosen]
         T_map_camera, to_common = self._path.T_world_camera[chosen], [worlds[pose.map] for pose in poses]
         T_world_camera = np.stack([S.transform_poses(T) for S, T in zip(to_common, T_map_camera, strict=True)])
@@ -335,10 +335,8 @@ class Backend:
             graph = optimise_pose_graph(T_world_camera, pairs, loops, depth_mm)
         points, observations = self._tracks.collected(chosen, self.most_observations)
         points = replace(points, log_depth=points.log_depth + log_unit[points.host])
-        rotation_rad = math.radians(settings.rotation_sigma_deg)
-        priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
-        T, correlated = inverse(T_world_camera), settings.correlated_observations
-        problem = BundleProblem(T, points, observations, priors, pairs, self._camera.fx, correlated=correlated)
+        T = inverse(T_world_camera)
+        problem = BundleProblem(T, points, observations, TRACKED, pairs, self._camera.fx, correlated=CORRELATED)
         if graph is None:
             return problem, np.zeros((0, 2), int)
         log_depth = points.log_depth + graph.log_scale[points.host]

@@ -67,6 +67,12 @@ class Priors(NamedTuple):
     translation_share: float = 0.1
 
 
+TRACKED = Priors(scale=0.1, rotation_rad=math.radians(3.0), translation_share=0.1)  # by hand
+"""Of keyframes as tracked."""
+CORRELATED = 4.0  # by hand
+"""So many observations of feature tracks count as one: errors of flow are alike at neighbouring corners."""
+
+
 @dataclass(frozen=True)
 class BundleProblem:
     """What is adjusted.

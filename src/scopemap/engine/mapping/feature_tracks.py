@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.corners import (
     detect_corners,
     expected_flow,
@@ -37,6 +36,12 @@ from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.loop_closure import MOST_RECENT, Loop
 
+# By hand; 16 and 32, where flow lags less: chosen on phantoms of an abdominal wall.
+KEYFRAME_GAPS = (1, 2, 3, 5, 8, 16, 32)
+"""A keyframe's corners are matched in those so many before it."""
+NEAR_GAPS = tuple(gap for gap in KEYFRAME_GAPS if gap <= MOST_RECENT)
+"""Those of keyframes just before it: farther apart two may have a few pixels in common, which prove nothing."""
+_LEAST_DEPTH_SIGMA = 0.2  # by hand: standard deviation that every estimated depth has at least, over the depth
 _CELL_PX = 16  # by hand: one corner in each cell of that size
 # Maps whose last keyframes are kept: as many as a lost camera may be found again in.
 _MOST_MAPS = 20  # by hand
@@ -100,7 +105,7 @@ _MATCH = np.dtype([("point", np.int64), ("keyframe", np.int64), ("pixel", np.flo
 class FeatureTracks:
     """Takes keyframes one by one; each is matched both ways with earlier ones of its map.
 
-    gaps : how many keyframes before it these are; None: `keyframe_gaps` of the settings.
+    gaps : how many keyframes before it these are.
     """
 
     keyframe_count: Kept[int] = 0
@@ -111,13 +116,11 @@ class FeatureTracks:
 
     def __init__(
         self,
-        settings: MappingSettings,
         flow: FlowEstimator,
         table: RowTable = rows_in_memory,
-        gaps: Collection[int] | None = None,
+        gaps: Collection[int] = KEYFRAME_GAPS,
     ) -> None:
-        self.settings, self._flow = settings, flow
-        self._gaps = gaps or self.settings.keyframe_gaps
+        self._flow, self._gaps = flow, gaps
         self._recent = {}
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
 
@@ -278,7 +281,7 @@ class FeatureTracks:
         """Add points at pixels (n, 2), with relative deviation of depth `share` (n,); return the first's number."""
         first, rows = len(self._points), np.zeros(len(pixels), _POINT)
         rows["host"], rows["pixel"], rows["log_depth"] = keyframe, self._centred(pixels), log_depth
-        rows["sigma"] = np.hypot(share, self.settings.depth_sigma_share)
+        rows["sigma"] = np.hypot(share, _LEAST_DEPTH_SIGMA)
         self._points.append(rows)
         return first
 

@@ -20,13 +20,14 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_adjustment import HELD_SIGMA, RIGID_SIGMA_PX, BundleSolution, adjust
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors, State
+from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundleProblem, Observations, Points, State
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.engine.mapping.frame_correction import KeyframeStep
 from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
 from scopemap.engine.notices import Notice
 
+_GAPS = (1, 2)  # by hand: a keyframe's corners are matched in those so many before
 _FREE = 3  # by hand: last keyframes of the window that move
 _ITERATIONS = 10  # by hand: steps of a window's adjustment
 _LEAST_SEEN = 0.1  # by hand: of a keyframe's points that those before it must observe: else nothing corrects its depth
@@ -88,7 +89,7 @@ class LocalAdjustment:
 
     def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
         self._settings, self._flow = settings, flow
-        self._tracks = FeatureTracks(settings, flow, gaps=settings.local_gaps)
+        self._tracks = FeatureTracks(flow, gaps=_GAPS)
         self._window = deque(maxlen=settings.local_window)
         self._corrections, self._shapes = {}, {}
         self._adjusted, self._refused = Counter[int](), Counter[int]()
@@ -154,7 +155,7 @@ class LocalAdjustment:
 
     def _begin(self) -> None:
         """Begin a window without keyframes."""
-        self._tracks = FeatureTracks(self._settings, self._flow, gaps=self._settings.local_gaps)
+        self._tracks = FeatureTracks(self._flow, gaps=_GAPS)
         self._window.clear()
         self._is_determined = False
 
@@ -174,7 +175,7 @@ class LocalAdjustment:
 
     def _problem(self, points: Points, observations: Observations, focal_px: float) -> BundleProblem:
         """Return the adjustment of the window, from where its keyframes are; the first ones are held."""
-        settings, count = self._settings, len(self._window)
+        count = len(self._window)
         _, _, T_camera_world, log_scale, log_depth, found_sigma = map(list, zip(*self._window, strict=True))
         T = np.stack(T_camera_world)
         start = State(T, np.array(log_scale), np.concatenate(log_depth), math.log(focal_px))
@@ -182,11 +183,8 @@ class LocalAdjustment:
         known, sigma = points.host < held, np.clip(np.concatenate(found_sigma), HELD_SIGMA, points.sigma)
         estimated = np.where(known, start.log_depth - start.log_scale[points.host], points.log_depth)
         points = replace(points, log_depth=estimated, sigma=np.where(known, sigma, points.sigma))
-        rotation_rad = math.radians(settings.rotation_sigma_deg)
-        priors = Priors(settings.scale_sigma, rotation_rad, settings.translation_sigma_share)
-        facts = (points, observations, priors, np.arange(count - 1)[:, None] + [0, 1], focal_px)
-        correlated = settings.correlated_observations
-        return BundleProblem(T, *facts, start=start, correlated=correlated, held=held)
+        facts = (points, observations, TRACKED, np.arange(count - 1)[:, None] + [0, 1], focal_px)
+        return BundleProblem(T, *facts, start=start, correlated=CORRELATED, held=held)
 
     def _with_other_starts(
         self, points: Points, observations: Observations, found: BundleSolution, focal_px: float, map_number: int

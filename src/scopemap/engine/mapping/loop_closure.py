@@ -117,7 +117,8 @@ class LoopFinder:
 
     Candidates are the keyframes with the most similar features. A loop is accepted if PnP places the new keyframe with
     at least `settings.min_loop_inliers` inliers and both look alike there (`is_verified`). table : where is
-    kept what only this needs. detector : of features; None: SIFT.
+    kept what only this needs. detector : of features; None: SIFT. recent : keyframes just before the new one, to which
+    no loop is sought.
     """
 
     _features: Kept[dict[int, _KeptFeatures]]
@@ -134,11 +135,11 @@ class LoopFinder:
         settings: MappingSettings,
         table: RowTable = rows_in_memory,
         detector: FeatureDetector | None = None,
+        recent: int = MOST_RECENT,
     ) -> None:
         self._detector = detector or SiftFeatures()
         self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
-        self._min_inliers, gaps = settings.min_loop_inliers, settings.keyframe_gaps
-        self._max_gap = min(max(gaps), MOST_RECENT)
+        self._min_inliers, self._recent = settings.min_loop_inliers, recent
         self._rows, self._views = table("features", self._kind), table("views", VIEW)
         self._features, self._map_of = {}, {}
         self._loops_to = defaultdict(list)
@@ -224,7 +225,7 @@ class LoopFinder:
     def _candidates(self, new: Features, map_number: int) -> list[int]:
         """Numbers of the most similar keyframes, of this map (but for the last ones) and of others."""
         kept, strongest = list(self._features), new.descriptors[: self._strongest]
-        recent = [k for k, number in self._map_of.items() if number == map_number][-self._max_gap :]
+        recent = [k for k, number in self._map_of.items() if number == map_number][-self._recent :]
         own = [k for k in kept if self._map_of[k] == map_number and k not in recent]
         elsewhere = [k for k in kept if self._map_of[k] != map_number]
         candidates: list[int] = []

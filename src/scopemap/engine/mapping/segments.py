@@ -25,9 +25,9 @@ from scopemap.engine.mapping.adjusted_maps import MapKeyframes, adjust_maps
 from scopemap.engine.mapping.bundle_adjustment import RIGID_SIGMA_PX, adjust, errors_px
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, State
 from scopemap.engine.mapping.depth_correction import depth_log_ratios
+from scopemap.engine.mapping.feature_tracks import NEAR_GAPS
 from scopemap.engine.mapping.frame_correction import FrameCorrection
 from scopemap.engine.mapping.left_out import halves, placed, successive
-from scopemap.engine.mapping.loop_closure import MOST_RECENT
 from scopemap.engine.notices import Notice
 
 PIECE = 4
@@ -105,8 +105,7 @@ class IntervalJudge:
         error_px, tracked_px = (_error_px(left_out, state) for state in (found.state, left_out.tracked))
         own = self._keyframes.successive(first, last + 1)
         T, grids_mm = own.adjusted_depths(found, own.depth_fields(adjusted.points, found))
-        gaps = [gap for gap in own.settings.keyframe_gaps if gap <= MOST_RECENT]
-        pairs = [(k, k + gap) for gap in gaps for k in range(last + 1 - first - gap)]
+        pairs = [(k, k + gap) for gap in NEAR_GAPS for k in range(last + 1 - first - gap)]
         pairs += [(other, one) for one, other in pairs]
         after = [_disagreement(own.camera, T, grids_mm, *pair) for pair in pairs]
         tracked = [self._as_tracked(first + one, first + other) for one, other in pairs]

@@ -17,6 +17,7 @@ from scopemap.engine.notices import Notice
 # The local level that a highlight stands out from is taken over this share of the image's longer side.
 _NEIGHBOURHOOD_SHARE = 0.09  # by hand
 _DARKEST_HIGHLIGHT = 70  # by hand: grey level of a highlight's darkest channel, at least
+_DARK_LEVEL = 12  # by hand: grey level up to which a pixel counts as under-exposed
 # Level at which the second-brightest channel is saturated, and how far a highlight's darkest channel stands out.
 BRIGHT_LEVEL = 240  # by hand
 _HIGHLIGHT_RATIO = 1.5  # by hand
@@ -106,12 +107,12 @@ class Masker:
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with `valid` False also outside the field of view, at highlights, overlays, bad exposure.
 
-        Under-exposed is a pixel whose brightest channel, or the mean around it, is at most `dark_level`; over-exposed
+        Under-exposed is a pixel whose brightest channel, or the mean around it, is at most `_DARK_LEVEL`; over-exposed
         one whose second brightest channel reaches `BRIGHT_LEVEL`: red alone clips on sound tissue.
         """
         darkest, middle = darker_channels(frame.rgb)
         clipped = middle >= BRIGHT_LEVEL
-        lit = is_lit(frame.rgb, self.settings.dark_level)
+        lit = is_lit(frame.rgb)
         valid = frame.valid & lit & ~clipped if self.settings.exposure else frame.valid
         field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
         highlights = np.zeros_like(valid)
@@ -168,11 +169,11 @@ def specular(darkest: np.ndarray, field: np.ndarray) -> np.ndarray:
     return (darkest > _HIGHLIGHT_RATIO * surroundings) & (darkest > _DARKEST_HIGHLIGHT)
 
 
-def is_lit(rgb: np.ndarray, dark_level: int) -> np.ndarray:
-    """Return which pixels of an image (H, W, 3) uint8 are brighter than `dark_level`, and the mean around them, too."""
+def is_lit(rgb: np.ndarray) -> np.ndarray:
+    """Return which pixels of an image (H, W, 3) uint8 are brighter than `_DARK_LEVEL`, and so is the mean around."""
     calm = cv2.blur(rgb, (_CALM_WIDTH_PX, _CALM_WIDTH_PX))
     brightest = [cv2.max(cv2.max(r, g), b) for r, g, b in map(cv2.split, (rgb, calm))]
-    return cv2.min(*brightest) > dark_level
+    return cv2.min(*brightest) > _DARK_LEVEL
 
 
 def darker_channels(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

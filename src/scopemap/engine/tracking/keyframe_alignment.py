@@ -17,11 +17,15 @@ from scopemap.engine.tracking.corner_pose import nonrigidity, pose_from_correspo
 from scopemap.engine.tracking.features import RelativePose
 from scopemap.engine.tracking.pyramid import build_pyramid
 from scopemap.engine.tracking.residuals import View
-from scopemap.engine.tracking.rtdl import Alignment, Motion, align, judge
+from scopemap.engine.tracking.rtdl import Alignment, Motion, align, judge, least_correlation
 from scopemap.engine.tracking.track import TrackingLoss
 
-MIN_TEXTURE = 0.5
-"""Of an image that shows nothing but noise; tissue has 0.65 and more."""
+MIN_TEXTURE = 0.5  # measured: noise has 0.32, a wall that is touched up to 0.45, tissue 0.65 and more
+"""Of an image; below it nothing but noise is shown."""
+MIN_SHARPNESS = 0.6  # by hand, for smoke and blur
+"""Share of the recent frames' median sharpness below which a frame that also fits its keyframe badly is lost."""
+_MIN_INLIER_SHARE = 0.4  # measured: unrelated fine texture has 0.37
+_MAX_STEP = 0.5  # by hand: largest motion between frames: rad, and mm over mean depth
 MAX_EXTRAPOLATION = 5  # by hand
 """Frames for which the last motion is extrapolated after a loss."""
 # By hand: below it an unsharp frame is lost, unless so many features match: by chance 20 at most.
@@ -176,15 +180,15 @@ class KeyframeAligner:
             return TrackingLoss(LossCause.VIEW_CHANGED, "the alignment diverged")
         if alignment.overlap < self._settings.min_valid_share:
             return TrackingLoss(LossCause.VIEW_CHANGED, f"overlap {alignment.overlap:.0%} with the keyframe")
-        if alignment.inlier_share < settings.min_inlier_share and not alignment.is_supported:
+        if settings.pose_checks and alignment.inlier_share < _MIN_INLIER_SHARE and not alignment.is_supported:
             return TrackingLoss(LossCause.VIEW_CHANGED, f"inlier share {alignment.inlier_share:.0%} with the keyframe")
         # Measured depth constrains a pose by shape alone.
-        by_shape = keyframe.measured and settings.depth_weight > 0
-        if alignment.correlation < settings.min_correlation and not by_shape:
+        by_shape, least = keyframe.measured and settings.depth_weight > 0, least_correlation(settings)
+        if alignment.correlation < least and not by_shape:
             if alignment.texture < MIN_TEXTURE:
                 return TrackingLoss(LossCause.NO_TEXTURE, "weakly constrained, too little texture")
             # A supported pose may be a pixel off, which decorrelates fine texture.
-            if alignment.correlation < settings.min_correlation / 3 or not alignment.is_supported:
+            if alignment.correlation < least / 3 or not alignment.is_supported:
                 return TrackingLoss(
                     LossCause.VIEW_CHANGED, f"correlation {alignment.correlation:.2f} with the keyframe"
                 )
@@ -194,7 +198,7 @@ class KeyframeAligner:
         T_step = inverse(self._motion.T_world_last) @ T_world_camera
         rotation_rad = float(rotation_angle_rad(T_step[:3, :3]))
         translation = float(np.linalg.norm(T_step[:3, 3])) / keyframe.depth_mm
-        if max(rotation_rad, translation) > settings.max_step * (1 + self._motion.frames_lost):
+        if settings.pose_checks and max(rotation_rad, translation) > _MAX_STEP * (1 + self._motion.frames_lost):
             jump = f"jump of {np.degrees(rotation_rad):.0f} deg and {translation:.2f} mean depths"
             return TrackingLoss(LossCause.VIEW_CHANGED, jump)
         return None

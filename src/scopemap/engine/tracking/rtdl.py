@@ -30,6 +30,10 @@ _INLIER = 0.5  # by hand: residual of an inlier, in units of the normalised chan
 _MIN_SIGMA = 1e-3  # guard: division by zero in flat images
 _MIN_DEPTH_SIGMA = 1e-3  # guard: of the distance to measured depth, share of the keyframe's mean depth
 _GREY_SHARE = 0.3  # by hand: weight of the grey channel against the normalised one
+_MOST_STEPS = 30  # by hand: per pyramid level
+_MOST_STEPS_FAST = 15  # by hand
+# Measured: well tracked clips have 0.3 and more, tissue without structure 0.1 and less.
+_MIN_CORRELATION = 0.15
 _RADIUS = 0.1  # rho, first trust radius: rad, and translation over mean depth; the paper gives none, not searched
 
 
@@ -85,14 +89,19 @@ def align(reference: list[View], current: list[View], T_start: np.ndarray, setti
         motion, steps = _align_level(reference[level], current[level], motion, settings, rotation_only, unit_mm)
         iterations += steps
         coarse = math.inf if rotation_only else _correlation(reference[level:], current[level:], motion, settings)
-        if coarse < settings.min_correlation:
+        if coarse < least_correlation(settings):
             break
     # The inverse by transposition doubles the error of a rotation matrix at every frame.
     motion = motion._replace(T_current_reference=orthonormalised(motion.T_current_reference))
     found = judge(reference, current, motion, iterations)
     # What ended at a coarse level is not to be accepted, however well it happens to correlate at the finest.
-    ended = coarse < settings.min_correlation
+    ended = coarse < least_correlation(settings)
     return replace(found, correlation=min(found.correlation, coarse)) if ended else found
+
+
+def least_correlation(settings: TrackingSettings) -> float:
+    """Return the correlation with the keyframe below which a frame is lost; -1: none is."""
+    return _MIN_CORRELATION if settings.picture_checks else -1.0
 
 
 def _correlation(reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings) -> float:
@@ -149,6 +158,6 @@ def _align_level(
         return Motion(se3_exp(full[:6]) @ state.T_current_reference, state.affine + full[6:])
 
     takes_full_steps = settings.solver == "gauss-newton"
-    options = Options(_RADIUS, settings.max_iterations, gauss_newton=takes_full_steps)
+    options = Options(_RADIUS, _MOST_STEPS_FAST if settings.fast else _MOST_STEPS, gauss_newton=takes_full_steps)
     solution = minimise(Problem(linearise, retract), motion, options)
     return solution.state, solution.iterations

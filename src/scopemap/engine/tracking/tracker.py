@@ -17,6 +17,7 @@ from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.engine.tracking.keyframe_alignment import (
     MAX_EXTRAPOLATION,
+    MIN_SHARPNESS,
     MIN_TEXTURE,
     Keyframe,
     KeyframeAligner,
@@ -38,6 +39,11 @@ _WEAK_COVERAGE = 0.15  # by hand: of a pose that is compared with one by feature
 _KEYFRAME_COVERAGE = 0.3  # by hand: a frame in which fewer corners are matched becomes a keyframe
 # By hand: of an earlier keyframe's corners that must be matched for it to be tracked against again.
 _REVISITED_COVERAGE = 0.5
+_PATIENCE = 3  # by hand: frames that a keyframe waits longer where the picture is not clear
+# A camera that has moved less since the keyframe, rad and translation over depth, needs no other one: its views
+# triangulate nothing, and their errors are alike. Chosen on cecum_t1_a (C3VD): 0.02 left out some where it is slow.
+_MIN_KEYFRAME_MOTION = 0.01
+_SEARCHED_FAST = 3  # by hand: of a camera lost for longer every n-th frame is searched, where tracking is fast
 _CLEAR = 0.8  # by hand: of the best quality since the keyframe: below it the next one waits
 _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 
@@ -91,18 +97,18 @@ class KeyframeChoice:
             return True
         alignment = alignment or self._last
         settings = self._settings
-        patience = settings.keyframe_patience if self._quality < _CLEAR * self._best_quality else 0
-        if self.frames_since >= self._settings.keyframe_every + patience and self._has_moved(alignment):
+        waits = settings.keyframes_wait and self._quality < _CLEAR * self._best_quality
+        if self.frames_since >= settings.keyframe_every + (_PATIENCE if waits else 0) and self._has_moved(alignment):
             return True
         least = settings.min_keyframe_agreement * (self._first_agreement or 0.0)
         return alignment is not None and (alignment.agreement < least or alignment.coverage < _KEYFRAME_COVERAGE)
 
     def _has_moved(self, alignment: Alignment | None) -> bool:
-        if alignment is None:
+        if alignment is None or not self._settings.keyframes_wait:
             return True
         T = alignment.motion.T_current_reference
         moved = rotation_angle_rad(T[:3, :3]) + np.linalg.norm(T[:3, 3]) / self._depth_mm
-        return bool(moved >= self._settings.min_keyframe_motion)
+        return bool(moved >= _MIN_KEYFRAME_MOTION)
 
 
 class Tracker(FrameTracker):
@@ -133,6 +139,8 @@ class Tracker(FrameTracker):
         self, settings: TrackingSettings, flow: FlowEstimator | None = None, features: FeatureDetector | None = None
     ) -> None:
         self.settings = settings
+        self._min_sharpness = MIN_SHARPNESS if settings.picture_checks else 0.0
+        self._searched_every = _SEARCHED_FAST if settings.fast else 1
         self._motion = MotionModel()
         self._aligner = KeyframeAligner(settings, flow, self._motion)
         self._relocaliser = Relocaliser(settings, features or SiftFeatures())
@@ -152,13 +160,13 @@ class Tracker(FrameTracker):
 
     def _track(self, frame: Frame, sharpness: float) -> Track:
         """Return the track of a frame with enough usable pixels."""
-        self._is_unsharp = sharpness < self.settings.min_sharpness
+        self._is_unsharp = sharpness < self._min_sharpness
         keyframe, was_lost = self._keyframe, self._motion.frames_lost > 0
         if keyframe is None:
             return self._lost(frame, _unsharp(sharpness)) if self._is_unsharp else self._first(frame)
         if not self._is_searched():
             self._sharp_frames_lost += not self._is_unsharp
-            skipped = f"not searched: one of {self.settings.search_every} lost frames is"
+            skipped = f"not searched: one of {self._searched_every} lost frames is"
             return self._lost(frame, TrackingLoss(LossCause.OTHER, skipped))
         alignment, pyramid = self._aligner.align(keyframe, frame)
         if self._choice.is_due(alignment) and not was_lost and not self._rejection(alignment):
@@ -174,7 +182,7 @@ class Tracker(FrameTracker):
 
     def _is_searched(self) -> bool:
         """Whether a frame is looked for; of many in a row that are lost only some are."""
-        lost, every = self._motion.frames_lost, self.settings.search_every
+        lost, every = self._motion.frames_lost, self._searched_every
         return lost <= MAX_EXTRAPOLATION or lost % every == 0
 
     def _failure(self, frame: Frame, alignment: Alignment, sharpness: float) -> _Failure | None:
@@ -185,7 +193,7 @@ class Tracker(FrameTracker):
         """
         assert self._keyframe is not None
         failure, rejection = None, self._rejection(alignment)
-        if is_obscured(sharpness, alignment, self.settings.min_sharpness):
+        if is_obscured(sharpness, alignment, self._min_sharpness):
             failure = _Failure(_unsharp(sharpness), is_obscured=True)
         elif rejection is not None:
             failure = _Failure(rejection, is_obscured=False)
@@ -299,7 +307,7 @@ class Tracker(FrameTracker):
                 and alignment.overlap >= _FOUND_OVERLAP
                 # Of many keyframes one always fits a picture without texture.
                 and (keyframe.measured or alignment.texture >= MIN_TEXTURE)
-                and not is_obscured(sharpness, alignment, self.settings.min_sharpness)
+                and not is_obscured(sharpness, alignment, self._min_sharpness)
             ),
             near=near,
             recent=failed or self._motion.frames_lost > 0,

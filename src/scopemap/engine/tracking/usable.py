@@ -10,6 +10,7 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame, percentiles
 from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.causes import LossCause
+from scopemap.engine.tracking.keyframe_alignment import MIN_TEXTURE
 from scopemap.engine.tracking.pyramid import texture
 from scopemap.engine.tracking.track import TrackingLoss
 
@@ -51,9 +52,9 @@ class TextureMonitor:
 
     def too_little(self, frame: Frame) -> TrackingLoss | None:
         """Return that this frame and those before it have too little texture; None: it is worth trying."""
-        least = self._settings.min_texture
-        found = texture(frame, self._settings) if least else math.inf
-        self._low_texture = self._low_texture + 1 if found < least else 0
+        is_checked = self._settings.picture_checks and self._settings.pose_checks
+        found = texture(frame, self._settings) if is_checked else math.inf
+        self._low_texture = self._low_texture + 1 if found < MIN_TEXTURE else 0
         if self._low_texture <= _MOST_LOW_TEXTURE:
             return None
         return TrackingLoss(LossCause.NO_TEXTURE, f"{found:.2f} of texture, noise has 0.32: contact, blur or fluid")
