@@ -153,3 +153,14 @@ def test_a_world_of_another_size_gives_the_same_surface_in_that_size(tmp_path: P
     assert len(other.mesh.vertices) == pytest.approx(len(same.mesh.vertices), rel=0.15)
     assert other.mesh.area == pytest.approx(factor**2 * same.mesh.area, rel=0.1)
     assert any(f"Voxels measure {other.config.fusion.voxel_mm:g} mm" in note for note in said(other.provenance))
+
+
+def test_voxels_far_finer_than_a_pixel_are_made_larger_and_that_is_said() -> None:
+    settings = FusionSettings(voxel_mm=0.01, truncation_mm=3.0, every=1)
+    fusion, frame = SurfaceFusion(settings, FrameStore(), corrected=True), wall(60.0)
+    fusion.put(frame)
+    surface = fusion.fuse(fusion.store.frames(), 60.0)
+    assert surface.settings.voxel_mm == pytest.approx(60.0 / frame.camera.fx / 4, rel=0.05)
+    assert surface.settings.truncation_mm == 3.0
+    assert "fusion-coarsened" in {notice.code for notice in surface.notices}
+    assert len(surface.mesh.faces) > 100

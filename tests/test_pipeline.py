@@ -17,6 +17,7 @@ from tiny_phantom import FRAMES, SIZE, only_images, true_poses, with_true_depth,
 
 from scopemap import Config, Result, open_sequence, reconstruct
 from scopemap.engine.config import PRESETS
+from scopemap.engine.depth import mapis
 from scopemap.engine.errors import WeightsError
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
@@ -197,10 +198,13 @@ def test_every_preset_tracks_all_frames(preset: str, folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("order", "moved"), [("track-first", True), ("refine-first", False)])
-def test_the_warped_depth_is_moved_only_where_the_motion_is_known(order: str, moved: bool, tmp_path: Path) -> None:
+def test_the_warped_depth_is_moved_only_where_the_motion_is_known(
+    order: str, moved: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A wall that the camera approaches by 2 mm a frame: without the motion its values are warped as they are."""
     sequence = open_sequence(_approach(tmp_path / "wall", step_mm=2.0))
-    depth = {"depth__files_kind": "depth", "mapis__blend": "constant", "mapis__constant_weight": 1.0}
+    monkeypatch.setattr(mapis, "_CONSTANT_WEIGHT", 1.0)
+    depth = {"depth__files_kind": "depth", "mapis__blend": "constant"}
     plain = {"mapis__order": order, "mapis__frame_scale": "none", "mapping__method": "none"}
     config = with_true_depth(tmp_path / "wall", **(WITHOUT_NETWORKS | depth | plain))
     steps: list[Step] = []

@@ -109,7 +109,7 @@ def test_other_settings_begin_anew_or_are_refused_by_name(folder: Path, tmp_path
     out = tmp_path / "run"
     _kill(folder, out, "realtime", 4)
     other = Config.load("realtime", settings={"fusion.voxel_mm": 2.5})
-    with pytest.raises(InputError, match=r"cannot resume .* fusion\.voxel_mm was 1\.5, is 2\.5; --no-resume"):
+    with pytest.raises(InputError, match=r"cannot resume .* fusion\.voxel_mm was None, is 2\.5; --no-resume"):
         check_resumable(out, open_sequence(folder), other)
     # The refusal has left what there was.
     check_resumable(out, open_sequence(folder), Config.load("realtime"))

@@ -44,6 +44,9 @@ _DEPTH_SIGMA = 0.2  # by hand: relative error that all depth has; more uncertain
 # not set keep the proportions at other depths.
 _VOXELS_PER_MEDIAN_DEPTH = 60
 _VOXELS_PER_TRUNCATION = 5  # see above
+# Finer ones show nothing more, and fill memory with the square of their number: 10 um where a pixel is 0.5 mm would
+# take a terabyte a frame.
+_MOST_VOXELS_PER_PIXEL = 4
 # At this depth a voxel is still larger than a pixel, and a narrowing tube is seen for most of its length.
 _VOXELS_PER_MAX_DEPTH = 200  # by hand
 # Weight of small highlights, where depth is interpolated.
@@ -129,6 +132,8 @@ class TsdfVolume:
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
         depth_mm, T_world_camera = self._checked(frame)
+        if not self.block_count:
+            self._widen(median_depth_of(frame) / max(frame.camera.fx, frame.camera.fy))
         camera, settings, parameters = frame.camera, self.settings, self.parameters
         T_camera_world = inverse(T_world_camera)
         R, t = np.ascontiguousarray(T_camera_world[:3, :3]), T_camera_world[:3, 3].copy()
@@ -158,6 +163,13 @@ class TsdfVolume:
         keys = np.unique(touched_blocks(surface.inverse_depth, pinhole, grid))
         slots = self._blocks.slots(keys)
         integrate_blocks(self._blocks.voxels, slots, unpack(keys) * BLOCK, surface, picture, pinhole, grid)
+
+    def _widen(self, pixel_mm: float) -> None:
+        """Make voxels larger, before the first frame, that are far finer than a pixel at the median depth, mm."""
+        voxel_mm = float(f"{pixel_mm / _MOST_VOXELS_PER_PIXEL:.2g}")
+        if voxel_mm > self.parameters.voxel_mm:
+            truncation_mm = max(self.parameters.truncation_mm, round(_VOXELS_PER_TRUNCATION * voxel_mm, 4))
+            self.parameters = self.parameters._replace(voxel_mm=voxel_mm, truncation_mm=truncation_mm)
 
     def coarsen(self) -> None:
         """Double the size of voxels, and the truncation."""
