@@ -164,3 +164,13 @@ def test_voxels_far_finer_than_a_pixel_are_made_larger_and_that_is_said() -> Non
     assert surface.settings.truncation_mm == 3.0
     assert "fusion-coarsened" in {notice.code for notice in surface.notices}
     assert len(surface.mesh.faces) > 100
+
+
+def test_a_frame_without_depth_gives_no_volume_that_is_shown() -> None:
+    fusion = SurfaceFusion(FusionSettings(every=1), FrameStore(), corrected=True)
+    fusion.shown = True
+    frame = wall(60.0)
+    fusion.put(replace(frame, depth_mm=np.full_like(frame.depth_mm, np.nan)))
+    assert not len(fusion.surface(0).faces)
+    fusion.put(replace(frame, index=1))
+    assert len(fusion.surface(0).faces) > 100

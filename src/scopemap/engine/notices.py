@@ -205,8 +205,9 @@ KINDS: dict[str, _Kind] = {
     ),
     "fusion-coarsened": _Kind(
         "info",
-        "Voxels measure {voxel_mm:g} mm instead of {finest_mm:g} mm, so that the surface fits into memory.",
-        "Allow more with --memory.",
+        "Voxels measure {voxel_mm:g} mm instead of {finest_mm:g} mm: finer ones do not fit into memory, or are far "
+        "finer than a pixel.",
+        "Allow more memory with --memory.",
     ),
     "fusion-free-space": _Kind(
         "note",

@@ -290,6 +290,8 @@ class SurfaceFusion:
             if map_number not in self._volumes:
                 # Where voxels are set the largest depth follows them alone: the scene is not known yet.
                 median_mm = None if self.settings.voxel_mm else median_depth_of(chosen)
+                if median_mm is not None and not median_mm > 0:
+                    return  # no pixel has a depth
                 self._volumes[map_number] = TsdfVolume(self.settings, choose_parameters(self.settings, median_mm))
             self._volumes[map_number].integrate(chosen)
             _coarsen(list(self._volumes.values()), self.coarser_beyond)
