@@ -34,7 +34,7 @@ KNOWN = {"known": True, "source": "a ruler", "measured": True}
 BRIGHT = (230, 180, 130)  # of the drawn tube
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def browser() -> Iterator[Any]:
     with playwright.sync_playwright() as driver:
         started = driver.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))

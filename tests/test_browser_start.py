@@ -176,8 +176,9 @@ def served(tmp_path: Path) -> Iterator[tuple[str, Path]]:
         process.wait(60)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def browser() -> Iterator[Any]:
+    """One for a test: a page that is left open draws on, and takes the processor from the next test's."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
@@ -192,6 +193,7 @@ class Opened:
 
     def __init__(self, browser: Any, url: str, size: tuple[int, int] = (1280, 800)) -> None:
         self.page = browser.new_context(viewport={"width": size[0], "height": size[1]}).new_page()
+        self.page.set_default_timeout(1000 * PATIENCE_S)
         self.requests: list[str] = []
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.on("websocket", lambda socket: self.requests.append(socket.url))
