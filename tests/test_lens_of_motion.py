@@ -8,14 +8,16 @@ from pathlib import Path
 import pytest
 from turning_clip import write_clip
 
+from scopemap.engine.cameras.lenses import FisheyeCamera
 from scopemap.engine.config import Config
 from scopemap.engine.mapping.lens_test import LensTest
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.input.opening import open_sequence
+from scopemap.input.scopes import KINDS
 from scopemap.input.sequence import Sequence
 from scopemap.result.verdict import verdict
-from scopemap.runner.lens_of_motion import with_lens_of_motion
+from scopemap.runner.lens_of_motion import lenses_of, with_lens_of_motion
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Run
 
@@ -35,7 +37,7 @@ def test_an_assumed_lens_is_replaced_and_no_doubt_of_it_stays(clip: Path) -> Non
     assert isinstance(found, Sequence)
     assert found.camera.fx == pytest.approx(sequence.camera.fx * math.exp(-0.4))
     assert found.camera_origin == "estimated"
-    assert found.camera_source == "estimated: field of view 92 deg, from the motion, 87 to 98"
+    assert found.camera_source == "estimated: pinhole, field of view 92 deg, from the motion, 87 to 98"
     assert 0 < found.focal_sigma_px < 0.1 * found.camera.fx
     assert not found.warnings
 
@@ -55,6 +57,20 @@ def test_an_assumed_lens_is_replaced_and_no_doubt_of_it_stays(clip: Path) -> Non
 )
 def test_a_lens_that_is_given_or_not_contradicted_stays(clip: Path, given: dict, lens: LensTest) -> None:
     assert with_lens_of_motion(open_sequence(clip, **given), Config(), lens, again=False) is None
+
+
+def test_a_fisheye_straightens_the_pictures_and_states_its_own_field_of_view(clip: Path) -> None:
+    sequence = open_sequence(clip)
+    kind = "equidistant fisheye"
+    assert set(lenses_of(sequence, Config(), again=False).kinds) == set(KINDS)
+    found = with_lens_of_motion(sequence, Config(), WIDER._replace(kind=kind, log_focal=-0.2), again=False)
+    assert isinstance(found, Sequence)
+    assert isinstance(found.rectifier.source, FisheyeCamera)
+    assert found.rectifier.source.distortion == KINDS[kind]
+    fov_deg = math.degrees(sequence.camera.width / (sequence.camera.fx * math.exp(-0.2)))
+    assert found.camera_source.startswith(f"estimated: {kind}, field of view {fov_deg:.0f} deg")
+    assert lenses_of(found, Config(), again=True).bend == KINDS[kind]
+    assert not lenses_of(open_sequence(clip, fov_deg=90.0), Config(), again=False).kinds
 
 
 def test_a_lens_of_the_motion_is_refined_while_it_changes_much(clip: Path) -> None:

@@ -62,6 +62,12 @@ def test_a_whole_run_is_good_and_its_sizes_are_unknown() -> None:
     assert found.advice == "The shape can be used. Sizes are unknown: compare shapes, do not measure."
 
 
+def test_a_lens_that_the_motion_does_not_test_is_a_condition() -> None:
+    found = verdict(run_of([0] * 100, **notices(Notice("camera-unconfirmed", {"sigma": 0.2}))))
+    assert found.word == "good"
+    assert found.advice.startswith("The shape can be used if the calibration is right: the motion does not test it. ")
+
+
 def test_sizes_by_a_range_that_was_typed_are_not_called_known() -> None:
     scale = {"known": True, "measured": False, "stated": True, "source": "near-far 10:80 mm"}
     found = verdict(run_of([0] * 100, scale=scale))
@@ -153,7 +159,7 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
         (notices(Notice("camera-at-rest")), "is at rest while the tissue moves"),
         (notices(Notice("camera-distorted", {"share": 0.12})), "has radial distortion"),
         (notices(Notice("input-interlaced")), "is interlaced"),
-        (notices(Notice("camera-contradicted", ANOTHER_LENS)), "another focal length (-8 %)"),
+        (notices(Notice("camera-contradicted", ANOTHER_LENS)), "another lens (focal length -8 %)"),
         (
             notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})),
             "would differ by 20 % (10 % before)",

@@ -85,7 +85,7 @@ KINDS: dict[str, _Kind] = {
     ),
     "camera-contradicted": _Kind(
         "doubtful",
-        "The motion fits another focal length ({change:+.0%}): left-out tracks then fit {gain:.0%} better.",
+        "The motion fits another lens (focal length {change:+.0%}): left-out tracks then fit {gain:.0%} better.",
         "Check calibration and cropping; tissue motion can look the same.",
     ),
     "camera-aspect": _Kind(

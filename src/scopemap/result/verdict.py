@@ -167,12 +167,19 @@ def _advice(run: Result, level: Level) -> str:
         return "Do not use this result."
     use = _usable(run)
     if not use:
-        use = "The shape can be used." if level == "good" else "Use it with care: read the cautions first."
+        use = _of_good(run) if level == "good" else "Use it with care: read the cautions first."
     if _scale_is_stated(run.provenance):
         return f"{use} Sizes rest on your {scale_source(run.provenance)}: check a length that you know."
     if scale_is_known(run.provenance):
         return f"{use} Sizes are known (from {scale_source(run.provenance)})."
     return f"{use} Sizes are unknown: compare shapes, do not measure."
+
+
+def _of_good(run: Result) -> str:
+    """Return what a good result may be used for: a lens that the motion does not test is the user's word alone."""
+    if any(notice.code == "camera-unconfirmed" for notice in notices_of(run.provenance)):
+        return "The shape can be used if the calibration is right: the motion does not test it."
+    return "The shape can be used."
 
 
 def _sentence(run: Result) -> str:

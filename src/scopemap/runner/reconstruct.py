@@ -30,7 +30,7 @@ from scopemap.result.verdict import state_verdict
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.estimators import largest_depth_mm
 from scopemap.runner.frame_surfaces import SurfaceWriter
-from scopemap.runner.lens_of_motion import MOST_PASSES, with_lens_of_motion
+from scopemap.runner.lens_of_motion import MOST_PASSES, lenses_of, with_lens_of_motion
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import refuse_own_input
@@ -201,6 +201,7 @@ class _Passes:
         writers += tuple(observer.final for observer in self.observers if isinstance(observer, FinalFrameObserver))
         with closing(store):
             pipeline = Pipeline(config, estimators, store, self.tracker)
+            pipeline.mapper.try_lenses(lenses_of(sequence, config, again=number > 1))
             run = Run(sequence, pipeline, self.clock, writers, self.progress, self.plan)
             states = None
             if folder is not None and number == 1 and (self.tracker is None or kept(self.tracker.__class__)):

@@ -23,6 +23,7 @@ from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundlePr
 from scopemap.engine.mapping.depth_correction import depth_grid
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
+from scopemap.engine.mapping.lens_kinds import LensKinds
 from scopemap.engine.mapping.lens_test import lens_test
 from scopemap.engine.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.engine.mapping.map_merging import Part, merge_maps, split_maps
@@ -80,6 +81,8 @@ class Backend:
         self._all_weighed = False
         self.most_observations = MOST_OBSERVATIONS
         """About so many are adjusted."""
+        self.lenses = LensKinds()
+        """What the lens may be."""
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")
         self._pending: deque[Future[None]] = deque()
 
@@ -218,6 +221,7 @@ class Backend:
         """
         tested = found if alone.correction.refused else alone
         lens = lens_test(tested.problem, tested.solution)
+        lens = self.lenses.better_than(lens, tested.problem, tested.solution)
         if lens.is_worse and tested is found and not found.correction.refused:
             worse = Notice("mapping-worse", {"error_px": lens.held_px, "tracked_px": lens.tracked_px, "merged": ""})
             return replace(self._keyframes_of(worlds).uncorrected(lens.held_px), refused=worse, lens=lens)

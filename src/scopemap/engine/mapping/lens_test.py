@@ -42,8 +42,8 @@ class LensTest(NamedTuple):
     """What left-out tracks tell of the focal length; NaN: not tested.
 
     held_px, free_px, tracked_px : their errors, robust standard deviation, with the focal length held and free, and as
-    tracked. log_focal : change
-    of ln f that the adjusted half fits. sigma : its standard deviation.
+    tracked. log_focal : change of ln f that the adjusted half fits. sigma : its standard deviation. kind : of the lens
+    that they fit, "": the present one.
     """
 
     held_px: float = math.nan
@@ -51,6 +51,7 @@ class LensTest(NamedTuple):
     log_focal: float = math.nan
     sigma: float = math.nan
     tracked_px: float = math.nan
+    kind: str = ""
 
     @property
     def ratio(self) -> float:
@@ -59,8 +60,8 @@ class LensTest(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """Whether a rigid scene fits another focal length."""
-        is_significant = abs(self.log_focal) > max(_LEAST_CHANGE, _SIGNIFICANT * self.sigma)
+        """Whether a rigid scene fits another lens."""
+        is_significant = bool(self.kind) or abs(self.log_focal) > max(_LEAST_CHANGE, _SIGNIFICANT * self.sigma)
         return self.free_px <= _MOST_ERROR_PX and is_significant
 
     @property
@@ -70,7 +71,7 @@ class LensTest(NamedTuple):
 
     @property
     def contradicts(self) -> bool:
-        """Whether a rigid scene fits another focal length clearly better."""
+        """Whether a rigid scene fits another lens clearly better."""
         return self.differs and self.ratio < _MOST_RATIO
 
     @property

@@ -18,6 +18,7 @@ from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.backend import Backend
 from scopemap.engine.mapping.feature_tracks import KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
+from scopemap.engine.mapping.lens_kinds import LensKinds
 from scopemap.engine.mapping.map_merging import Part
 from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.notices import Notice
@@ -157,6 +158,11 @@ class Mapper:
         """Have at most about so many observations adjusted."""
         if self._backend is not None:
             self._backend.most_observations = observations
+
+    def try_lenses(self, lenses: LensKinds) -> None:
+        """Have the adjustment after the last frame tell which of these lenses the camera has."""
+        if self._backend is not None:
+            self._backend.lenses = lenses
 
     def stay_as_tracked(self) -> None:
         """Adjust nothing after the last frame; any thread may call it."""
