@@ -35,7 +35,7 @@ TABLES: dict[str, tuple[str, str]] = {
     "inside-out": (f"{SCRIPT}.inside_out --out OUT/inside-out", ""),
     "surface": (f"{SCRIPT}.surface --data DATA --out OUT", ""),
     "clinical-phantoms": (f"{SCRIPT}.clinical_phantoms --seed 21 22 23", ""),
-    "unknown-lenses": (f"{SCRIPT}.unknown_lenses", ""),
+    "unknown-lenses": (f"{SCRIPT}.unknown_lenses --data DATA", ""),
     "depth": (f"{SCRIPT}.depth_without_download --data DATA --size 320x256", ""),
     "methods": (f"{PLAN} real-and-phantom --data DATA --out OUT/methods", "methods/tables/overview.md"),
     "ablations": (f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations", "ablations/tables/overview.md"),
