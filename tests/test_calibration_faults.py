@@ -63,7 +63,7 @@ BINARY = {
     "colmap's claim": np.array([2**62, 1, 0], dtype="<u8").tobytes() + bytes(8),
     "colmap's count": np.array([20], dtype="<u8").tobytes() + np.array([1, 1], "<u4").tobytes()
     + np.array([640, 480], "<u8").tobytes() + bytes(40),
-    "utf-16": "520 525 318 245".encode("utf-16"),
+    "utf-16, cut": "520 525 318 245".encode("utf-16")[:9],
 }  # fmt: skip
 
 

@@ -30,13 +30,17 @@ def numpy_fields(content: bytes) -> Fields | None:
             if sum(member.file_size for member in archive.infolist()) > LARGEST_BYTES:
                 raise ValueError("it is larger than any calibration")
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return fields_of_arrays({name: found for name in arrays if (found := _loaded(arrays, name)) is not None})
+            found = {name: one for name in arrays if (one := _loaded(arrays, name)) is not None}
+            return fields_of_arrays(found, is_numpy=True)
     except _DAMAGED as damage:
         raise ValueError(f"its arrays cannot be read ({str(damage).partition(chr(10))[0][:80]})") from None
 
 
-def fields_of_arrays(variables: Mapping[str, Any], depth: int = 0) -> Fields:
-    """Return arrays, numbers, texts and mappings of them as a tree; everything else, objects, is left out."""
+def fields_of_arrays(variables: Mapping[str, Any], depth: int = 0, *, is_numpy: bool = False) -> Fields:
+    """Return arrays, numbers, texts and mappings of them as a tree; everything else, objects, is left out.
+
+    is_numpy : keep a column of four as rows: in NumPy's files it tells a fisheye's coefficients.
+    """
     pairs: list[tuple[str, Any]] = []
     for name, value in variables.items():
         if isinstance(value, dict) and depth < _DEEPEST:
@@ -45,7 +49,9 @@ def fields_of_arrays(variables: Mapping[str, Any], depth: int = 0) -> Fields:
             pairs.append((name, value))
         elif np.asarray(value).dtype.kind in "fiu":
             array = np.asarray(value, np.float64)
-            pairs.append((name, array.ravel().tolist() if array.ndim else float(array)))
+            keeps_rows = is_numpy and array.shape == (4, 1)
+            values = array.tolist() if keeps_rows else array.ravel().tolist()
+            pairs.append((name, values if array.ndim else float(array)))
     return Fields((name, node) for name, node in pairs if not name.startswith("__"))
 
 

@@ -23,7 +23,15 @@ _RELATIVE_CENTRE = (0.1, 0.9)
 _LONGEST_MM = 50.0
 _ASPECT_TOLERANCE = 0.01
 _CROP = re.compile(r"crop:(\d{1,6}),(\d{1,6})")
-_FOCAL_PER_WIDTH = (0.3, 5.0)
+_FOCAL_PER_WIDTH = (0.25, 5.0)  # of a pinhole: 127 to 11 degrees
+_SHORTEST_BENT = 0.15  # of a lens with distortion: a capsule's .29, fisheyes whose circle is smaller than the picture
+# Sizes of pictures that a principal point may be the middle of.
+_STANDARD_SIZES = (
+    (320, 240), (640, 480), (720, 480), (720, 576), (768, 576), (800, 600), (1024, 768), (1280, 720), (1280, 960),
+    (1280, 1024), (1350, 1080), (1440, 1080), (1600, 1200), (1920, 1080), (1920, 1200), (3840, 2160),
+)  # fmt: skip
+_OFF_CENTRE = 0.15  # share of a side, farther than which the middle is that of other pictures
+_NEAR_STANDARD = 0.06  # of a standard size, within which twice the principal point is: real lenses are off by 3 %
 _FOCAL_RATIO = (0.2, 5.0)
 
 
@@ -106,13 +114,29 @@ def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Ca
         advice += "cut out of it, else another calibration (--camera)"
         raise CalibrationError(f"{_sizes(calibration, image_size)}; {advice}")
     check_plausible(camera, calibration.name)
+    if calibration.size_origin == "images" and crop is None and (other := _size_of_centre(camera.central)):
+        middle, images = (f"{width}x{height} px" for width, height in (other, image_size))
+        fault = f"has no size, and its principal point is the middle of {middle}, but the images are {images}"
+        raise CalibrationError(f"{calibration.name} {fault}: add image_width and image_height")
     return calibration
+
+
+def _size_of_centre(central: PinholeCamera) -> Size | None:
+    """Return the standard size that the principal point is the middle of, far from that of the images; None: none."""
+    size, twice = (central.width, central.height), (2 * central.cx + 1, 2 * central.cy + 1)
+    if all(abs(two - side) <= 2 * _OFF_CENTRE * side for two, side in zip(twice, size, strict=True)):
+        return None
+    for other in _STANDARD_SIZES:
+        if all(abs(two / side - 1) <= _NEAR_STANDARD for two, side in zip(twice, other, strict=True)):
+            return other
+    return None
 
 
 def check_plausible(camera: CameraModel, name: str) -> None:
     """Raise `CalibrationError` where no endoscope has such a camera for images of its size."""
     central, width, height = camera.central, camera.width, camera.height
-    least, most = (share * width for share in _FOCAL_PER_WIDTH)
+    shortest, longest = _FOCAL_PER_WIDTH
+    least, most = (shortest if isinstance(camera, PinholeCamera) else _SHORTEST_BENT) * width, longest * width
     narrow, wide = _FOCAL_RATIO
     # Written so that NaN is refused, too.
     if not least < central.fx < most or not narrow < central.fy / central.fx < wide:

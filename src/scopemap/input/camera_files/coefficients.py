@@ -116,7 +116,7 @@ def _sets_at(place: Fields, kind: Kind) -> Iterator[_Set]:
 def _named_sets(place: Fields, kind: Kind) -> Iterator[_Set]:
     """Yield the coefficients that have a name each."""
     radial = _numbered(place, _RADIAL)
-    letters = (letter for letter in _TANGENTIAL if letter == "p" or not _numbered(place, letter).keys() & {3})
+    letters = (letter for letter in _TANGENTIAL if letter == "p" or not _is_of_pose(place, letter))
     letter, tangential = next(((at, found) for at in letters if (found := _numbered(place, at))), ("p", {}))
     if radial or tangential:
         first = 2 if kind == "fisheye" and set(radial) == _FROM_TWO else int(0 not in radial)
@@ -132,6 +132,11 @@ def _named_sets(place: Fields, kind: Kind) -> Iterator[_Set]:
             raise ValueError(f"its distortion coefficients have no {missing[0]}")
         if found:
             yield _Set(place, tuple(f"{letters_of_list}{i}" for i in sorted(found)), [found[i] for i in sorted(found)])
+
+
+def _is_of_pose(place: Fields, letter: str) -> bool:
+    """Return whether numbers of a letter are a translation, t1 t2 t3, or a pose, t_00 to t_23 (Polycam)."""
+    return bool(_numbered(place, letter).keys() & {3}) or any(place.nodes((f"{letter}_03",)))
 
 
 def _numbered(place: Fields, letters: str) -> dict[int, float]:

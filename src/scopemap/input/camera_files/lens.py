@@ -65,8 +65,18 @@ def lens_of(pinhole: PinholeCamera, levels: Sequence[Fields], model: str) -> tup
 
     Raises `ValueError` as `with_lens` and `coefficients_in`.
     """
+    places, note = _places(levels), ""
+    if not model and (model := "fisheye" if _is_column(places) else ""):
+        note = ", its lens taken as a fisheye's: D is 4x1, as cv2.fisheye returns it"
     kind: Kind = "fisheye" if _FISHEYE.search(model) else "fov" if _FOV.search(model) else "opencv" if model else ""
-    return with_lens(pinhole, model, coefficients_in(_places(levels), kind))
+    coefficients = coefficients_in(places, kind)
+    if not model and any(coefficients) and _is_undecided(places, coefficients):
+        raise ValueError(
+            "its four coefficients may be k1 k2 p1 p2 of OpenCV's lens or k1 k2 k3 k4 of a fisheye's: "
+            "add `model: opencv` or `model: fisheye`"
+        )
+    camera, assumed = with_lens(pinhole, model, coefficients)
+    return camera, note + assumed
 
 
 def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float]) -> tuple[CameraModel, str]:
@@ -100,6 +110,21 @@ def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float])
     if model and not _OPENCV.search(model):
         return camera, f", its lens taken as OpenCV's ({model[:_LONGEST_QUOTE]!r} names none)"
     return camera, ""
+
+
+def _is_column(places: Sequence[Fields]) -> bool:
+    """Return whether coefficients are four rows of one, which only `cv2.fisheye.calibrate` returns."""
+    lists = (node for place in places for _, node in place.nodes(LISTS) if isinstance(node, list))
+    return any(len(rows) == 4 and all(isinstance(row, list) and len(row) == 1 for row in rows) for rows in lists)
+
+
+def _is_undecided(places: Sequence[Fields], coefficients: Sequence[float]) -> bool:
+    """Return whether four coefficients are in a file's column, or beside the DIM of programs that use `cv2.fisheye`."""
+    if len(coefficients) != 4:
+        return False
+    matrices = [node for place in places for _, node in place.nodes(LISTS) if isinstance(node, Fields)]
+    is_column = any((node.number(("rows",)), node.number(("cols",))) == (4, 1) for node in matrices)
+    return is_column or any(any(place.nodes(("DIM",))) for place in places)
 
 
 def _with_count(lens: tuple[float, ...], count: int) -> tuple[float, ...]:

@@ -34,6 +34,9 @@ _SEPARATORS = str.maketrans(",;[]", "    ")
 _SECTION = re.compile(r"\[\s*([A-Za-z_][^\[\],\"']*)\]")
 _YAML_NODES = "[{*&!|>"
 _COMMENT = re.compile(r"(#|//|%|^\s*;).*")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+_WITH_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?;?")
+_LEAST_WITH_COMMA = 4  # numbers of a camera
 _UNSET = ("false", "no", "off", "", "0", "0.0")
 
 
@@ -119,7 +122,10 @@ def as_number(node: Any, name: str) -> float:
     except (TypeError, ValueError, OverflowError):
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, found {str(node)[:_LONGEST_QUOTE]!r}")
+        if isinstance(node, str) and _DECIMAL_COMMA.fullmatch(node.strip()):
+            raise ValueError(f"{name} has a decimal comma ({node.strip()}): write a point")
+        found = "a list" if isinstance(node, list | Fields) else repr(str(node)[:_LONGEST_QUOTE])
+        raise ValueError(f"{name} must be a finite number, found {found}")
     return value
 
 
@@ -150,8 +156,16 @@ def is_number(leaf: Any) -> bool:
 
 
 def number_rows(text: str) -> list[list[float]] | None:
-    """Return the numbers of each line that has some, comments after #, % and // aside; None for anything else."""
-    lines = (_COMMENT.sub("", line).translate(_SEPARATORS) for line in text.splitlines())
+    """Return the numbers of each line that has some, comments after #, % and // aside; None for anything else.
+
+    Raises `ValueError` for numbers with decimal commas.
+    """
+    plain = [_COMMENT.sub("", line) for line in text.splitlines()]
+    words = " ".join(plain).split()
+    commas = [word for word in words if "," in word]
+    if commas and len(words) >= _LEAST_WITH_COMMA and all(map(_WITH_COMMA.fullmatch, words)):
+        raise ValueError(f"it has decimal commas ({commas[0]}): write points")
+    lines = (line.translate(_SEPARATORS) for line in plain)
     try:
         return [row for line in lines if (row := [float(word) for word in line.split()])]
     except ValueError:
@@ -202,7 +216,7 @@ def read_tree(text: str) -> Any:
         # OpenCV wrote numbers such as 318. into its JSON.
         return json.loads(_BARE_POINT.sub(".0", text), object_pairs_hook=Fields, parse_int=float)
     except json.JSONDecodeError as error:
-        raise ValueError(f"it is no JSON: {error}") from None
+        raise ValueError(f"it is no JSON that can be read: line {error.lineno}, column {error.colno}") from None
     except RecursionError:
         raise ValueError("it is nested deeper than any calibration") from None
 
@@ -233,7 +247,9 @@ def _yaml(text: str) -> Any:
                 break  # a recorded topic repeats itself
         return next(yaml.load_all(text, Loader=_YamlLoader), None)
     except yaml.YAMLError as error:
-        raise ValueError(f"it is no YAML: {' '.join(str(error).split())[:200]}") from None
+        mark = getattr(error, "problem_mark", None)
+        where = f": line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise ValueError(f"it is no YAML that can be read{where}") from None
 
 
 def xml_root(text: str) -> ElementTree.Element:
@@ -243,7 +259,8 @@ def xml_root(text: str) -> ElementTree.Element:
     try:
         return ElementTree.fromstring(text.lstrip())  # noqa: S314 - entities are refused above
     except ElementTree.ParseError as error:
-        raise ValueError(f"it is no XML: {error}") from None
+        line, column = error.position
+        raise ValueError(f"it is no XML that can be read: line {line}, column {column + 1}") from None
 
 
 def _of_element(element: ElementTree.Element) -> Any:

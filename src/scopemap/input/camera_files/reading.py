@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 import re
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from scopemap.input.camera_files.calibration import LARGEST_SIDE_PX, Calibration
 from scopemap.input.camera_files.direct_methods import CORNER_PX, direct_method_camera
 from scopemap.input.camera_files.lens import lens_of, model_in, refuse_other_lens
 from scopemap.input.camera_files.metashape import metashape_fields
+from scopemap.input.camera_files.other_programs import as_ours, program_of
 from scopemap.input.camera_files.parsing import Fields, calibration_bytes, number_rows, read_tree
 from scopemap.input.camera_files.scaramuzza import omnidirectional_of
 from scopemap.input.camera_files.sizes import size_in_comments, size_of
@@ -65,18 +67,26 @@ def read_calibration(camera: Path | str, image_size: Size, fit: str = "exact") -
 
 def stated_calibration(camera: Path | str, image_size: Size) -> Calibration:
     """Return the camera at the file's own size, or that of the images where it has none; raises `CalibrationError`."""
-    typed, file = number_rows(str(camera)), Path(camera)
-    if typed and len(typed[0]) > 1 and not os.path.isfile(file):
-        try:
-            return replace(text_formats.of_numbers(typed, image_size), source="camera of the numbers given (--camera)")
-        except ValueError as error:
-            raise CalibrationError(f"cannot use the camera '{str(camera)[:200]}': {error}") from None
+    file = Path(camera)
+    if not os.path.isfile(file) and (typed := _typed(str(camera), image_size)) is not None:
+        return typed
     try:
         calibration = _read(file, image_size)
     except ValueError as error:
         raise CalibrationError(f"the calibration {file} cannot be used: {error}") from None
     shares = ", its numbers taken as shares of the size" if calibration.size_origin == "relative" else ""
     return replace(calibration, source=f"calibration file {file.name}{calibration.source}{shares}", file=file)
+
+
+def _typed(camera: str, image_size: Size) -> Calibration | None:
+    """Return the camera of typed numbers, None for any other text."""
+    try:
+        rows = number_rows(camera)
+        if not rows or len(rows[0]) < 2:
+            return None
+        return replace(text_formats.of_numbers(rows, image_size), source="camera of the numbers given (--camera)")
+    except ValueError as error:
+        raise CalibrationError(f"cannot use the camera '{camera[:200]}': {error}") from None
 
 
 def _read(file: Path, image_size: Size) -> Calibration:
@@ -87,9 +97,21 @@ def _read(file: Path, image_size: Size) -> Calibration:
         return of_fields(matlab.mat_fields(content), image_size)
     if (arrays := numpy_fields(content)) is not None:
         return of_fields(arrays, image_size)
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        content = content.decode("utf-16", errors="replace").encode()  # what PowerShell's > writes
     if b"\0" in content:
         raise ValueError("it is binary, not text")
     text = content.decode("utf-8-sig", errors="replace")  # comments may have any encoding
+    try:
+        return _of_any_text(file, text, image_size)
+    except ValueError as error:
+        if program := program_of(text):
+            raise ValueError(program) from error
+        raise
+
+
+def _of_any_text(file: Path, text: str, image_size: Size) -> Calibration:
+    """Return the camera of a text; `file` : where it is from, beside which COLMAP keeps the pictures' sizes."""
     if colmap_model.is_cameras_text(text):
         return Calibration(colmap_model.only_camera(file), None, "")
     calibration = _of_text(text, image_size)
@@ -119,7 +141,7 @@ def of_fields(fields: Fields, image_size: Size) -> Calibration:
     """Return the camera of a mapping: OpenCV, ROS, Kalibr, Basalt, ORB-SLAM, nerfstudio, MATLAB; or `ValueError`."""
     if (ocam := matlab.of_ocam_model(fields)) is not None:
         return ocam
-    fields = matlab.without_matlabs_conventions(fields)
+    fields = as_ours(matlab.without_matlabs_conventions(fields))
     levels, chain_note = _levels(fields)
     if (omnidirectional := omnidirectional_of(levels, fields, image_size)) is not None:
         return replace(omnidirectional, depth_scale_mm=_depth_scale_mm(levels))

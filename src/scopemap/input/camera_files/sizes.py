@@ -14,7 +14,7 @@ _Sides: TypeAlias = tuple[float | None, float | None, bool]
 _OF = ("image", "img", "im", "frame", "picture", "video", "input", "calibration", "calib", "original")
 _SIZES = (
     *(f"{of}_{name}" for of in (*_OF, "camera") for name in ("size", "resolution", "shape", "dimensions")),
-    "resolution",
+    "resolution", "dim", "image_dimension", "calib_dimension",
 )  # fmt: skip
 _UNSURE_SIZES = ("size", "dimensions", "shape")
 _SIDES = (
