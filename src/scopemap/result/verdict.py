@@ -185,9 +185,9 @@ def _of_good(run: Result) -> str:
 def _sentence(run: Result) -> str:
     inside, used = frames_in_result(run.frames)
     surface = run.provenance.get("surface") or {}
-    judged = _submaps_in_words(run)
+    judged, usable = _submaps_in_words(run), _usable(run).rstrip(".")
     facts = [
-        *_usable(run),
+        *([usable] if usable else []),
         f"{inside} of {used} frames are in the result" + (f", others in {judged}" if judged else ""),
     ]
     known = "The scale is as you stated it" if _scale_is_stated(run.provenance) else "The scale is known"
