@@ -56,7 +56,7 @@ def test_poses_stay_as_tracked_where_left_out_tracks_prefer_them(monkeypatch: py
     correction = plane_scene.adjusted(_frame(number) for number in range(4))
     assert correction.refused is not None
     assert correction.refused.code == "mapping-worse"
-    assert "than as tracked (0.74 px)" in correction.refused.text
+    assert "than as tracked (0.74 px)" in text_of(correction.refused)
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
 
 
