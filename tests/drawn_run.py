@@ -25,6 +25,7 @@ from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import ELSEWHERE, NOT_USED, ROTATED, FrameTable
 from scopemap.result.frame_table import LOST as LOST_FRAME
 from scopemap.result.result import Result
+from scopemap.result.wording import facts_of_notices
 
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 IN_RESULT, IN_FIRST_MAP, FRAMES = 14, 7, 24
@@ -72,7 +73,7 @@ def drawn_result(name: str = "video.mp4", **facts: Any) -> Result:
         | {"source": "calibration file camera.yaml"},
         "estimators": {"depth": "scopenet", "flow": "dis"},
         "scale": {"known": False, "source": "scopenet's own scale"},
-        "notices": [notice.as_json() for notice in of_input(["a note"], ["a warning"])],
+        "notices": facts_of_notices(of_input(["a note"], ["a warning"])),
         "seconds": {"total": 3.0},
         "versions": {"scopemap": "0.1.0"},
         "surface": GOOD_SURFACE,

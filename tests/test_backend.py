@@ -22,6 +22,7 @@ from scopemap.engine.mapping.feature_tracks import FeatureTracks
 from scopemap.engine.mapping.frame_correction import KeyframeStep
 from scopemap.engine.mapping.lens_test import LensTest
 from scopemap.engine.mapping.other_starts import ShapeTest
+from scopemap.result.wording import text_of
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)
@@ -47,7 +48,7 @@ def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
     assert rotation_rad < 0.1 * before[0]
     assert translation_mm < 0.15 * before[1]
     assert correction.sigma_px < 0.3
-    assert "adjustment of 5 keyframes" in correction.notice.text
+    assert "adjustment of 5 keyframes" in text_of(correction.notice)
 
 
 def test_poses_stay_as_tracked_where_left_out_tracks_prefer_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,7 +56,7 @@ def test_poses_stay_as_tracked_where_left_out_tracks_prefer_them(monkeypatch: py
     correction = plane_scene.adjusted(_frame(number) for number in range(4))
     assert correction.refused is not None
     assert correction.refused.code == "mapping-worse"
-    assert "than as tracked (0.74 px)" in correction.refused.text
+    assert "than as tracked (0.74 px)" in text_of(correction.refused)
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
 
 
@@ -81,7 +82,7 @@ def test_keyframes_without_corners_change_nothing() -> None:
     speckled = np.random.default_rng(0).random(plane_scene.EVERYWHERE.shape) < 0.6
     correction = plane_scene.adjusted(replace(_frame(number), valid=speckled) for number in range(3))
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
-    assert "no common observations" in correction.notice.text
+    assert "no common observations" in text_of(correction.notice)
 
 
 def test_flow_is_sampled_at_more_points_than_opencv_allows() -> None:
@@ -116,7 +117,7 @@ def test_corrections_are_interpolated_by_the_camera_motion() -> None:
     # Before and after all keyframes the nearest correction holds.
     np.testing.assert_array_equal(replace(correction, index=correction.index + 5).pose(3, np.eye(4)), T[0])
     assert correction.depth_factor(99) == pytest.approx(2.0)
-    assert "no common observations" in correction.notice.text
+    assert "no common observations" in text_of(correction.notice)
     # Frame 4 has no tracked pose, and a camera at rest has no motion: time is used.
     assert correction.pose(4, np.eye(4))[0, 3] == pytest.approx(1.6)
     resting = replace(correction, tracked={0: _tracked(0, 3), 5: _tracked(0, 3), 10: _tracked(0, 3)})
@@ -205,7 +206,7 @@ def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
     assert correction.sigma_px > 0.8
     assert correction.depth_factor(20) == 1.0
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
-    assert "no rigid scene" in correction.notice.text
+    assert "no rigid scene" in text_of(correction.notice)
 
 
 def test_an_adjustment_says_what_determines_the_shape() -> None:
@@ -225,7 +226,7 @@ def test_poses_stay_as_tracked_where_the_starts_end_in_different_shapes(monkeypa
     monkeypatch.setattr(other_starts, "RIGID_SIGMA_PX", 0.01)
     correction = plane_scene.adjusted(map(_frame, range(5)))
     assert [notice.code for notice in correction.notices] == ["mapping-not-determined"]
-    assert "depth network alone" in correction.notice.text
+    assert "depth network alone" in text_of(correction.notice)
     assert correction.depth_factor(20) == 1.0
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
 

@@ -15,9 +15,9 @@ from front_door import call
 from scopemap.apps.browser.next_steps import NextRun, arguments_again, next_runs, source_of
 from scopemap.apps.run.command import run as run_command
 from scopemap.engine.config.config import Config
-from scopemap.engine.notices import KINDS
 from scopemap.input.opening import open_sequence
 from scopemap.result.result import Result
+from scopemap.result.wording import WORDINGS
 
 # Options that need a file, a box or a choice that nobody can make for the user.
 NOT_OFFERED = {"camera", "redact", "memory", "frames"}
@@ -32,10 +32,10 @@ def result_by(origin: str, **settings: Any) -> Result:
 
 def test_every_next_step_that_names_an_option_is_offered() -> None:
     known = {name.replace("_", "-") for name in inspect.signature(run_command).parameters} | {"set"}
-    for code, kind in KINDS.items():
-        named = set(re.findall(r"--([a-z][a-z-]+)", kind.next_step))
+    for code, wording in WORDINGS.items():
+        named = set(re.findall(r"--([a-z][a-z-]+)", wording.next_step))
         assert named <= known, code
-        assert {run.option for run in next_runs(kind.next_step, result_by("assumed"))} == named - NOT_OFFERED, code
+        assert {run.option for run in next_runs(wording.next_step, result_by("assumed"))} == named - NOT_OFFERED, code
 
 
 def test_choices_and_values() -> None:

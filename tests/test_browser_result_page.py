@@ -21,11 +21,12 @@ from scopemap.engine.notices import Notice
 from scopemap.report.page_data import read_measurements
 from scopemap.result.result import Result
 from scopemap.result.summary import summary_lines
+from scopemap.result.wording import facts_of_notices
 
 pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
 
 KNOWN = {"known": True, "source": "a ruler", "measured": True}
-NOT_ADJUSTED = [Notice("mapping-none").as_json()]
+NOT_ADJUSTED = facts_of_notices([Notice("mapping-none")])
 FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 
 

@@ -15,12 +15,12 @@ from tiny_phantom import FRAMES, only_images, write_tiny
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.config import Config
 from scopemap.engine.frame import Frame
-from scopemap.engine.notices import scale_words
 from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import MASKED_GREY, DepthPreviews
 from scopemap.result.depth_maps import DepthReader, DepthWriter
 from scopemap.result.result import Result
 from scopemap.result.summary import summary_lines
+from scopemap.result.wording import scale_words
 
 UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
 

@@ -85,7 +85,7 @@ def test_where_half_of_the_picture_moves_keyframes_stay_as_tracked() -> None:
     (notice,) = local.notices(0)
     assert notice.code == "mapping-local-not-rigid"
     assert notice.level == "doubtful"
-    assert json.loads(json.dumps(notice.as_json()))["values"] == {"adjusted": 0, "refused": COUNT - 1}
+    assert json.loads(json.dumps(dict(notice.values))) == {"adjusted": 0, "refused": COUNT - 1}
     for frame, pose in zip(adjusted, _poses(_keyframes(None)), strict=True):
         np.testing.assert_allclose(frame.T_world_camera, pose, atol=1e-9)
 

@@ -21,8 +21,7 @@ from scopemap.report.page import page_html, write_comparison, write_report
 from scopemap.report.page_data import page_data, shown_meshes
 from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
 from scopemap.result.result import Result
-from scopemap.result.summary import time_words
-from scopemap.result.verdict import frames_per_s
+from scopemap.result.summary import frames_per_s, time_words
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 import pytest
@@ -12,13 +13,14 @@ import trimesh
 from drawn_run import CAMERA, GOOD_SURFACE, changed, placed_frames, tube
 
 from scopemap.engine.config import Config
-from scopemap.engine.notices import KINDS, Notice, fields_of_kind, notices_of
+from scopemap.engine.notices import KINDS, Notice
 from scopemap.report.summary_picture import _head_lines
-from scopemap.result import verdict as rules
+from scopemap.result.evidence import Evidence, notices_of
 from scopemap.result.frame_table import LOST, NOT_USED
 from scopemap.result.result import Result
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.result.verdict import verdict
+from scopemap.result.verdict import LEAST_FRAMES, RULES, SEGMENT_RULES, Limit, Rule, gives_reason, verdict
+from scopemap.result.wording import LEVEL_WORDS, WORDINGS, facts_of_notices, in_words, text_of
 
 DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "report.md"
 
@@ -78,7 +80,7 @@ def test_sizes_by_a_range_that_was_typed_are_not_called_known() -> None:
 
 
 def notices(*found: Notice) -> dict[str, Any]:
-    return {"notices": [notice.as_json() for notice in found]}
+    return {"notices": facts_of_notices(found)}
 
 
 ANOTHER_LENS = {"change": -0.08, "gain": 0.05}
@@ -116,10 +118,10 @@ def test_the_share_of_frames_in_the_result(inside: int, word: str) -> None:
 def test_submaps_of_three_seconds_that_are_usable_stand_for_their_part(apart: int, level: str, word: str) -> None:
     """At ten frames a second; 40 of 80 frames are in the result."""
     run = run_of([0] * 40 + [1] * apart + [LOST] * (40 - apart))
-    other = changed(run.others[0], provenance={"verdict": {"level": level}})
+    other = changed(run.others[0], provenance={"verdict": {"level": level, "reasons": []}})
     found = verdict(changed(run, others=[other]))
     assert found.word == word
-    assert f"40 of 80 frames are in the result, others in 1 submap (1 {rules.WORDS[level]}). " in found.sentence
+    assert f"40 of 80 frames are in the result, others in 1 submap (1 {LEVEL_WORDS[level]}). " in found.sentence
 
 
 @pytest.mark.parametrize(
@@ -225,12 +227,47 @@ def test_frames_that_were_not_used_are_no_gap() -> None:
     assert "the longest gap is 5 frames" in " ".join(reason.text for reason in verdict(run_of(places)).reasons)
 
 
-def test_the_document_states_the_thresholds() -> None:
-    text = DOCUMENT.read_text(encoding="utf-8")
-    shares = (rules.GOOD_SHARE, rules.LEAST_SHARE, rules.GOOD_COVERAGE, rules.LEAST_COVERAGE)
-    for share in (*shares, rules.GOOD_DISAGREEMENT, rules.MOST_DISAGREEMENT):
-        assert f"{share:.0%}".replace("%", " %") in text
-    assert f"fewer than {rules.LEAST_FRAMES} frames" in text
+DOCUMENTED = {
+    "usable_share": "frames in usable segments",
+    "coverage_mean": "surface covers",
+    "depth_error": "depth of the surface",
+    "within_10_percent_mean": "share of the picture",
+    "triangulated_share": "keyframes whose depth several views confirm",
+    "moving_share": "frames in which tissue moves",
+}
+"""The rows of docs/report.md with a limit on a share, by the figure."""
+
+
+def in_the_document(limit: Limit) -> str:
+    """The words of docs/report.md for a limit on a share."""
+    share = "half" if limit.value == 0.5 and limit.sign in "<>" else f"{100 * limit.value:.0f} %"
+    words = {">=": "{} or more", "<=": "{} or less", ">": "more than {}", "<": "less than {}"}
+    return words[limit.sign].format(share)
+
+
+def test_the_document_states_the_limits_of_the_table() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8").split("## The verdict")[1].split("\n## ")[0]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
+    with_limit = {rule.figure: rule for rule in RULES if rule.good and 0 < rule.good.value < 1}
+    assert set(with_limit) == set(DOCUMENTED)
+    for figure, beginning in DOCUMENTED.items():
+        (row,) = (row for row in rows if row[0].startswith(beginning))
+        rule = with_limit[figure]
+        assert rule.good is not None
+        assert row[1] == in_the_document(rule.good)
+        if rule.doubtful:
+            assert row[2] == in_the_document(rule.doubtful)
+        assert bool(row[3]) == (rule.otherwise == "bad")
+    assert f"fewer than {LEAST_FRAMES} frames" in text
+
+
+@pytest.mark.parametrize("rule", {*RULES, *SEGMENT_RULES}, ids=lambda rule: f"{rule.code} {rule.figure}")
+def test_a_row_of_the_table_names_a_figure_and_codes_that_exist(rule: Rule) -> None:
+    none_known = Evidence(0, 0, None, None, None, None, None, ())
+    assert rule.level(none_known) in {None, "good", rule.otherwise}
+    codes = {*KINDS, *(row.code for row in RULES)}
+    assert {*rule.unless, *rule.replaces} <= codes
+    assert rule.sentence or any(other.sentence for other in RULES if other.code == rule.code) or rule.code in KINDS
 
 
 def test_a_camera_stated_to_be_at_rest_is_no_doubt() -> None:
@@ -242,31 +279,40 @@ def test_a_camera_stated_to_be_at_rest_is_no_doubt() -> None:
     assert any(reason.code == "camera-at-rest-stated" for reason in found.reasons)
 
 
+def fields_of(code: str) -> set[str]:
+    """The values that the sentence of a notice names."""
+    return {name for _, name, _, _ in Formatter().parse(WORDINGS[code].text) if name}
+
+
 @pytest.mark.parametrize("code", KINDS)
 def test_every_notice_has_words_and_survives_json(code: str) -> None:
-    kind = KINDS[code]
-    values = {name: 0.5 if re.search(rf"{{{name}:", kind.text) else f"<{name}>" for name in fields_of_kind(code)}
+    text, named = WORDINGS[code].text, fields_of(code)
+    assert named <= set(KINDS[code].values)
+    values = {name: 0.5 if re.search(rf"{{{name}:", text) else f"<{name}>" for name in KINDS[code].values}
     notice = Notice(code, values)
-    shown = [value for name, value in values.items() if isinstance(value, str) and name not in kind.unsaid]
-    assert all(value.casefold() in notice.text.casefold() for value in shown)
-    assert not any(f"{{{name}" in kind.text for name in kind.unsaid)
-    assert "{" not in str(notice)
-    assert notice.text.endswith(".")
+    shown = [value for name, value in values.items() if isinstance(value, str) and name in named]
+    assert all(value.casefold() in text_of(notice).casefold() for value in shown)
+    assert "{" not in in_words(notice)
+    assert text_of(notice).endswith(".")
     (found,) = notices_of(json.loads(json.dumps(notices(notice, notice))))
     assert found == notice
     with pytest.raises(ValueError, match=code):
         Notice(code, values | {"more": 1})
 
 
+def test_words_are_of_notices_alone() -> None:
+    assert set(WORDINGS) == set(KINDS)
+
+
 def test_the_documents_list_every_code_with_its_values() -> None:
     table = (DOCUMENT.parent / "formats.md").read_text(encoding="utf-8").split("### Notices")[1].split("\n## ")[0]
     rows = re.findall(r"^\| `([a-z-]+)` \| (\w+) \|(?: `([a-z_, ]+)`)? \|", table, flags=re.MULTILINE)
     listed = {code: (level, values) for code, level, values in rows}
-    assert listed == {code: (kind.level, ", ".join(sorted(fields_of_kind(code)))) for code, kind in KINDS.items()}
+    assert listed == {code: (kind.level, ", ".join(sorted(kind.values))) for code, kind in KINDS.items()}
 
 
 def test_no_doubtful_notice_is_left_out_of_the_verdict() -> None:
-    assert [code for code, kind in KINDS.items() if kind.level == "doubtful" and not kind.in_verdict] == []
+    assert [code for code, kind in KINDS.items() if kind.level == "doubtful" and not gives_reason(code)] == []
 
 
 def test_the_summary_names_every_caution() -> None:

@@ -211,6 +211,7 @@ def test_a_few_frames_confirm_no_shape() -> None:
 def test_the_verdict_says_what_is_usable_and_when() -> None:
     found = verdict(_result())
     assert found.advice.startswith("Usable: 2.0 to 7.9 s, 75 % of the video.")
+    assert found.sentence.startswith("Usable: 2.0 to 7.9 s, 75 % of the video. 80 of 80 frames are in the result. ")
     (counted,) = (reason for reason in found.reasons if reason.code == "frames-in-result")
     assert "60 of 80" in counted.text
     assert {reason.code for reason in found.reasons if reason.level == "note"} >= {"segments"}

@@ -15,6 +15,7 @@ import typer.main
 from scopemap.cli.app import app
 from scopemap.engine.notices import KINDS, Notice
 from scopemap.engine.tracking.causes import ADVICE
+from scopemap.result.wording import WORDINGS, text_of
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATED = {ROOT / "docs" / name for name in ("api.md", "settings.md", "licences.md")}
@@ -61,8 +62,8 @@ def unclear(text: str) -> list[str]:
 
 def typical(code: str) -> Notice:
     """Return a notice with values of usual length."""
-    values: dict[str, Any] = dict.fromkeys(KINDS[code].unsaid, 0)
-    for _, name, spec, _ in Formatter().parse(KINDS[code].text):
+    values: dict[str, Any] = dict.fromkeys(KINDS[code].values, 0)
+    for _, name, spec, _ in Formatter().parse(WORDINGS[code].text):
         if name:
             values[name] = TEXTS.get(name, 1234) if not spec else 0.125 if spec[-1] in "%f" else 123
     return Notice(code, values)
@@ -112,11 +113,11 @@ def test_texts_of_the_program_have_no_unclear_words() -> None:
 
 @pytest.mark.parametrize("code", KINDS)
 def test_a_notice_is_one_short_sentence_and_a_next_step(code: str) -> None:
-    notice = typical(code)
-    assert len(notice.text) <= 120
-    assert not re.search(r"\. [A-Z]", notice.text)
-    assert len(notice.next_step) <= 80
-    assert notice.next_step == "" or re.fullmatch(r"[A-Z].*\.", notice.next_step)
+    text, next_step = text_of(typical(code)), WORDINGS[code].next_step
+    assert len(text) <= 120
+    assert not re.search(r"\. [A-Z]", text)
+    assert len(next_step) <= 80
+    assert next_step == "" or re.fullmatch(r"[A-Z].*\.", next_step)
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: "/".join(path.parts[-2:]))

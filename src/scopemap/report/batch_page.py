@@ -15,11 +15,11 @@ from urllib.parse import quote
 
 from scopemap.engine.errors import reporting
 from scopemap.report.page import PAGE, PICTURE
-from scopemap.result.verdict import WORDS
+from scopemap.result.wording import LEVEL_WORDS
 
 _COLUMNS = ("input", "folder", "status", "reason", "seconds", "frames", "tracked", "verdict")
 _ORDER = ("failed", "started", "done", "waiting")
-_LEVELS = {word: level for level, word in WORDS.items()}
+_LEVELS = {word: level for level, word in LEVEL_WORDS.items()}
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def counts_of(rows: Sequence[BatchRow]) -> str:
     """Return how many rows have which status, and which verdict, in one line."""
     statuses, verdicts = Counter(row.status for row in rows), Counter(row.verdict for row in rows if row.verdict)
     counted = ", ".join(f"{statuses[status]} {status}" for status in reversed(_ORDER) if statuses[status])
-    judged = ", ".join(f"{verdicts[word]} {word}" for word in WORDS.values() if verdicts[word])
+    judged = ", ".join(f"{verdicts[word]} {word}" for word in LEVEL_WORDS.values() if verdicts[word])
     return f"{len(rows)} video{'s' * (len(rows) != 1)}: {counted}" + (f" ({judged})" if judged else "")
 
 

@@ -15,12 +15,12 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from scopemap.engine.errors import ScopemapError
 from scopemap.engine.geometry.align import align_trajectories
-from scopemap.engine.notices import notices_of
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
 from scopemap.report.shown_maps import MapOnPage, shown_map_numbers, shown_maps
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
 from scopemap.report.video_parts import video_parts
+from scopemap.result.evidence import notices_of, scale_source
 from scopemap.result.frame_table import NOT_USED
 from scopemap.result.input_part import part_of_input
 from scopemap.result.losses import losses
@@ -28,12 +28,9 @@ from scopemap.result.reference import read_reference
 from scopemap.result.result import Result
 from scopemap.result.run_input import PLACES, places_of_input
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.result.verdict import (
-    frames_per_s,
-    scale_is_known,
-    scale_source,
-    verdict,
-)
+from scopemap.result.summary import frames_per_s
+from scopemap.result.verdict import gives_reason, verdict
+from scopemap.result.wording import in_words
 
 MEASUREMENTS = "measurements.json"
 COVERAGE = "coverage"
@@ -78,9 +75,9 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
         "input": source,
         "verdict": asdict(found) | {"word": found.word},
         "titles": [one.facts for one in maps],
-        "scale_known": scale_is_known(run.provenance),
+        "scale_known": run.scale_known,
         "scale_source": scale_source(run.provenance),
-        "notes": [str(notice) for notice in notices_of(run.provenance) if not notice.in_verdict],
+        "notes": [in_words(one) for one in notices_of(run.provenance) if not gives_reason(one.code)],
         "frames_per_s": frames_per_s(run),
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "frames": _frames(run, maps),

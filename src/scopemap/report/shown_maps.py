@@ -8,8 +8,10 @@ from functools import cached_property
 import numpy as np
 import trimesh
 
+from scopemap.engine.notices import Level
 from scopemap.result.result import Result
-from scopemap.result.verdict import WORDS, level_of_submap
+from scopemap.result.verdict import level_of_submap
+from scopemap.result.wording import LEVEL_WORDS
 
 _MOST_SUBMAPS = 8
 _MOST_SEGMENTS = 24
@@ -29,7 +31,7 @@ class MapOnPage:
     name: str
     short: str
     folder: str
-    level: str
+    level: Level
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
@@ -39,14 +41,14 @@ class MapOnPage:
     @property
     def facts(self) -> dict[str, str]:
         """What the page needs of it beside its surface."""
-        word = {str(level): word for level, word in WORDS.items()}[self.level]
+        word = LEVEL_WORDS[self.level]
         return {"name": self.name, "short": self.short, "folder": self.folder, "level": self.level, "word": word}
 
 
 def shown_maps(run: Result) -> list[MapOnPage]:
     """Return the result's main surface, then those of its other submaps, then those of its other segments."""
     segments, main = run.segments, run.main_segment
-    name, level = "The result", str(level_of_submap(run))
+    name, level = "The result", level_of_submap(run)
     if len(segments) > 1:
         name, level = f"Segment {segments[main].words}, the main one", segments[main].level
     found = [MapOnPage(run, main, name, "R", ".", level)]

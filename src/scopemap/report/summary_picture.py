@@ -31,7 +31,7 @@ from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import SOFT, Sheet, rgb_of
 from scopemap.result.result import Result
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.result.verdict import Verdict, scale_is_known, verdict
+from scopemap.result.verdict import Verdict, verdict
 
 _CELL_PX = 384
 _GAP_PX = 12
@@ -162,13 +162,13 @@ def _mesh_row(run: Result, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
     views = {"surface and camera path": outside, "from the other side": other}
     views["from behind the start"] = view_from_behind(poses[0], path)
     pictures = {
-        title: _with_path(mesh if view is other else _opened(mesh, view), view, path, scale_is_known(run.provenance))
+        title: _with_path(mesh if view is other else _opened(mesh, view), view, path, run.scale_known)
         for title, view in views.items()
     }
     middle = inside_view(poses[len(poses) // 2])
     opened = _opened(mesh, middle)
     inside = _fitted(mesh_picture(opened, middle, smooth=False))
-    if scale_is_known(run.provenance):
+    if run.scale_known:
         seen = render_mesh(opened, middle.camera, middle.T_world_camera)
         _scale_at_median(inside, middle.camera, seen.depth_mm)
     return pictures | {"from the middle of the path": inside}
@@ -199,7 +199,7 @@ def _submap_rows(run: Result, meshes: Sequence[trimesh.Trimesh]) -> list[dict[st
             view = outside_views(mesh, poses[0], poses[:, :3, 3])["from outside"]
             title = f"{submap.name}: frames {submap.first} to {submap.last}"
             title = ", ".join(filter(None, (title, submap.inliers, "most doubtful" * (submap is worst))))
-            shown[title] = _with_path(_opened(mesh, view), view, poses[:, :3, 3], scale_is_known(run.provenance))
+            shown[title] = _with_path(_opened(mesh, view), view, poses[:, :3, 3], run.scale_known)
     titles = list(shown)
     return [{t: shown[t] for t in titles[row : row + _COLUMNS]} for row in range(0, len(titles), _COLUMNS)]
 

@@ -55,13 +55,10 @@ def losses(frames: FrameTable) -> list[LostSegment]:
     return found
 
 
-def main_cause(found: list[LostSegment]) -> tuple[str, str]:
-    """Return the cause of most of the lost frames and the advice on it; "" where nothing is known of it."""
+def main_cause(found: list[LostSegment]) -> LossCause:
+    """Return the cause of most of the lost frames; `NONE` where nothing is known of it."""
     frames: Counter[LossCause] = Counter()
     for loss in found:
         if loss.cause:
             frames[loss.cause] += loss.frames
-    if not frames:
-        return "", ""
-    cause = frames.most_common(1)[0][0]
-    return cause.value, ADVICE[cause]
+    return frames.most_common(1)[0][0] if frames else LossCause.NONE

@@ -22,7 +22,6 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.fusion.mesh_files import read_mesh, save_mesh
-from scopemap.engine.notices import scale_words
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import Trajectory, write_tum
 from scopemap.result.depth_maps import DepthReader
@@ -30,6 +29,7 @@ from scopemap.result.frame_table import FrameTable
 from scopemap.result.stated_verdict import StatedVerdict
 from scopemap.result.surface_segments import SurfaceSegment, read_segments, save_segments, surface_file
 from scopemap.result.trajectory_folders import read_frames, submap_folders
+from scopemap.result.wording import scale_words
 
 if TYPE_CHECKING:
     from scopemap.apps.coverage.coverage import Coverage

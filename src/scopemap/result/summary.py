@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 from typing import Any
 
+import numpy as np
+
 from scopemap.result.input_part import part_of_input
 from scopemap.result.result import Result
-from scopemap.result.verdict import frames_per_s, verdict
+from scopemap.result.verdict import verdict
 
 _SKIPPED = {"repeated": "skipped as repeats", "thinned": "skipped by --fps", "size": "skipped: of another size"}
 _MOST_REASONS = 6
@@ -54,6 +56,17 @@ def time_words(result: Result) -> str:
     seconds, after = facts.get("seconds", {}).get("total", 0.0), facts.get("resumed_after_frame")
     since = "" if after is None else f" since it was resumed after frame {after}"
     return f"{seconds:.1f} s{since}, {frames_per_s(result) or 0.0:.1f} frames/s"
+
+
+def frames_per_s(result: Result) -> float | None:
+    """Return the frames per second of the whole run, without compiling kernels; None where its time is unknown.
+
+    Start-up, adjustment and fusion count, too; of a resumed run the frames and the time since then.
+    """
+    seconds, after = result.provenance.get("seconds", {}), result.provenance.get("resumed_after_frame")
+    passed_s = seconds.get("total", 0.0) - seconds.get("compile kernels", 0.0)
+    done = int(np.sum(result.frames["index"] > (-1 if after is None else after)))
+    return done / passed_s if passed_s > 0 else None
 
 
 def compiling_words(seconds: float) -> str:

@@ -13,12 +13,14 @@ import trimesh
 
 from scopemap.engine.errors import reporting
 from scopemap.engine.fusion.mesh_files import save_mesh, save_meshes_in_time
+from scopemap.engine.notices import Level
 
 SURFACES = "surfaces"
 """Folder of a result with the surfaces of its segments."""
 _TABLE = "segments.csv"
 GOOD_DISAGREEMENT = 0.05
 """Median relative difference between a surface's depth and that of its frames up to which it is good."""
+_BEST_FIRST: tuple[Level, ...] = ("good", "doubtful", "bad")
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class SurfaceSegment:
     last_frame: int
     start_s: float
     end_s: float
-    level: str
+    level: Level
     depth_error: float
     within_10_percent: float
 
@@ -55,7 +57,7 @@ COLUMNS = [field.name for field in fields(SurfaceSegment)]
 _FORMATS = {"start_s": ".3f", "end_s": ".3f", "depth_error": ".4f", "within_10_percent": ".3f"}
 
 
-def segment_of_facts(number: int, facts: dict[str, Any], level: str) -> SurfaceSegment:
+def segment_of_facts(number: int, facts: dict[str, Any], level: Level) -> SurfaceSegment:
     """Return a segment by what `provenance.json` has of it in `segments`."""
     figures = facts["surface"]
     error, within = (float(figures.get(name, np.nan)) for name in ("depth_error", "within_10_percent_mean"))
@@ -68,10 +70,9 @@ def main_segment(segments: Sequence[SurfaceSegment]) -> int:
 
     Of segments of one level those grade better whose surface agrees with their frames as a good one does.
     """
-    order = ("good", "doubtful", "bad")
 
     def place(one: SurfaceSegment) -> tuple[int, bool, int]:
-        return order.index(one.level), not one.depth_error <= GOOD_DISAGREEMENT, one.first_frame - one.last_frame
+        return _BEST_FIRST.index(one.level), not one.depth_error <= GOOD_DISAGREEMENT, one.first_frame - one.last_frame
 
     return min(segments, key=place).segment
 
@@ -114,11 +115,12 @@ def read_segments(folder: Path) -> list[SurfaceSegment]:
 
 
 def _row(row: dict[str, str]) -> SurfaceSegment:
-    if row["level"] not in ("good", "doubtful", "bad"):
+    level = next((one for one in _BEST_FIRST if one == row["level"]), None)
+    if level is None:
         raise ValueError(f"no level is called {row['level']!r}")
     number, first, last = (int(row[name]) for name in COLUMNS[:3])
     start_s, end_s, error, within = (float(row[name] or "nan") for name in (*COLUMNS[3:5], *COLUMNS[6:]))
-    return SurfaceSegment(number, first, last, start_s, end_s, row["level"], error, within)
+    return SurfaceSegment(number, first, last, start_s, end_s, level, error, within)
 
 
 def _cell(name: str, value: Any) -> str:

@@ -12,7 +12,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.depth_mesh import depth_mesh
 from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.fusion.surface_fusion import steepest_cosine
-from scopemap.engine.notices import scale_words
+from scopemap.result.wording import scale_words
 from scopemap.runner.provenance import scale_facts
 
 SURFACES = "surfaces"

@@ -25,6 +25,7 @@ from scopemap.engine.tracking.features import FeatureDetector
 from scopemap.input.frame_choice import selection_text
 from scopemap.input.sequence import Sequence
 from scopemap.result.frame_table import FrameTable
+from scopemap.result.wording import facts_of_notices
 
 _VERSIONS = ("scopemap", "numpy", "scipy", "opencv-python-headless", "numba", "onnxruntime")
 _VERSIONS_OF_NETWORKS = ("torch", "torchvision", "transformers", "lpips")
@@ -120,7 +121,7 @@ def provenance_of(
         },
         "scale": scale_facts(estimators),
         "estimators": estimators_provenance(estimators),
-        "notices": [notice.as_json() for notice in of_input(sequence.source.notes, sequence.warnings)],
+        "notices": facts_of_notices(of_input(sequence.source.notes, sequence.warnings)),
         "seconds": {part: round(seconds, 3) for part, seconds in seconds.items()},
         "versions": package_versions(),
         "machine": f"{platform.system()} {platform.machine()}, {platform.processor() or 'unknown processor'}",
@@ -140,7 +141,7 @@ def facts_of_segment(segment: Segment, surface: SegmentSurface, frames: FrameTab
         "joined": segment.is_joined,
         "surface": surface.agreement,
         "faces": len(surface.mesh.faces),
-        "notices": [notice.as_json() for notice in surface.notices],
+        "notices": facts_of_notices(surface.notices),
     }
 
 

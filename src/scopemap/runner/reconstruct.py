@@ -27,6 +27,7 @@ from scopemap.result.result import Result
 from scopemap.result.result_folder import NOT_OF_THE_RESULT, STORED, check_result_folder, result_folder
 from scopemap.result.run_input import stated_input
 from scopemap.result.verdict import state_verdict
+from scopemap.result.wording import facts_of_notices
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.estimators import largest_depth_mm
 from scopemap.runner.frame_surfaces import SurfaceWriter
@@ -121,7 +122,7 @@ def _reconstruct(
         result, written = passes.result(sequence)
         result.provenance.update(stated_input(sequence.path, None if out is None else Path(out)))
         changes = input_changes(identity, result.provenance["input_content"], sequence.path)
-        result.provenance["notices"] += [notice.as_json() for notice in changes]
+        result.provenance["notices"] += facts_of_notices(changes)
         state_verdict(result)
         if folder is not None and written is not None:
             progress("writing", 0, 0)

@@ -30,6 +30,7 @@ from scopemap.result.frame_table import FrameTable, GrowingFrameTable
 from scopemap.result.result import Result
 from scopemap.result.surface_segments import main_segment
 from scopemap.result.verdict import graded
+from scopemap.result.wording import facts_of_notices
 from scopemap.runner.backwards import track_backwards
 from scopemap.runner.memory import MemoryPlan, trim_memory
 from scopemap.runner.provenance import Limits, facts_of_segment, motion_notices, notices_of_end, provenance_of
@@ -224,7 +225,7 @@ class Run:
         facts = {"interrupted_at_frame": last, "resumed_after_frame": self.resumed_after}
         notices = notices_of_end(result.frames, last, self.kept_maps.forgotten, self.kept_maps.limits)
         result.provenance.update(facts)
-        result.provenance["notices"] += [notice.as_json() for notice in notices]
+        result.provenance["notices"] += facts_of_notices(notices)
         return result
 
 
@@ -245,7 +246,7 @@ class _Finishing:
         apart = set(frames["index"].tolist()) - submapped if pipeline.fusion.at_end else set()
         for frame in pipeline.fusion.store.frames(apart):
             self._write(frame)  # as tracked
-        results[0].provenance["notices"] += [notice.as_json() for notice in pipeline.notices + notices]
+        results[0].provenance["notices"] += facts_of_notices(pipeline.notices + notices)
         results[0].others = results[1:]
         return results[0]
 
@@ -263,7 +264,7 @@ class _Finishing:
         surface = surfaces[main]
         moving = motion_notices(frames, config, confirmed=surface.is_confirmed)
         provenance = provenance_of(sequence, self.run.pipeline.estimators, self.run.clock.seconds, frames)
-        provenance["notices"] += [notice.as_json() for notice in self.notices + moving + surface.notices]
+        provenance["notices"] += facts_of_notices(self.notices + moving + surface.notices)
         provenance["surface"] = surface.agreement
         provenance["segments"], provenance["main_segment"] = facts, main
         corrections = [segment.correction for segment in submap.segments if segment.correction is not None]

@@ -190,8 +190,9 @@ def _short(value: Any) -> str:
 
 def print_warnings(provenance: Mapping[str, Any]) -> None:
     """Print the notices of a run that are more than assumptions, with their next steps, to the standard error."""
-    from scopemap.engine.notices import notices_of
+    from scopemap.result.evidence import notices_of
+    from scopemap.result.wording import in_words
 
     for notice in notices_of(provenance):
         if notice.level != "info":
-            typer.echo(f"warning: {notice}", err=True)
+            typer.echo(f"warning: {in_words(notice)}", err=True)

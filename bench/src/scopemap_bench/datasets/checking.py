@@ -17,6 +17,7 @@ from scopemap.apps.inspect.clip import Finding, Severity
 from scopemap.engine.errors import CalibrationError, ScopemapError
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.input.decoding import frame_number
+from scopemap.result.wording import in_words
 from scopemap_bench.datasets.survey import (
     OTHERS,
     RIGID_TOLERANCE,
@@ -84,7 +85,7 @@ def check_reading(survey: Survey) -> list[Finding]:
         found += _when(count < 2, "error", "frame-few", f"{count} readable frame(s), two are needed")
     warnings = survey.sequence.warnings
     more_warnings = [f"and {len(warnings) - _NAMED} more warnings of the reader"] * (len(warnings) > _NAMED)
-    return found + [Finding("warning", "source", str(warning)) for warning in warnings[:_NAMED] + more_warnings]
+    return found + [Finding("warning", "source", in_words(warning)) for warning in warnings[:_NAMED] + more_warnings]
 
 
 def check_numbers(survey: Survey) -> list[Finding]:
@@ -232,7 +233,7 @@ def check_agreement(survey: Survey) -> list[Finding]:
 
 def check_assumptions(survey: Survey) -> list[Finding]:
     """What the reader assumed."""
-    return [Finding("info", "assumed", str(note)) for note in survey.sequence.notes]
+    return [Finding("info", "assumed", in_words(note)) for note in survey.sequence.notes]
 
 
 CHECKS = (

@@ -15,8 +15,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scopemap.engine.notices import notices_of
 from scopemap.input.opening import open_sequence
+from scopemap.result.evidence import notices_of
 from scopemap.result.result import Result
 from scopemap_bench.scripts import measuring
 from scopemap_bench.scripts.clinical_phantoms import FRAMES, PHANTOMS, SEED

@@ -28,8 +28,9 @@ from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence as Frames
 from scopemap.report.batch_page import BatchRow, write_at_once, write_batch_page, write_batch_table
 from scopemap.report.page import write_report
+from scopemap.result.evidence import frames_in_result
 from scopemap.result.result import Result
-from scopemap.result.verdict import frames_in_result, verdict
+from scopemap.result.verdict import verdict
 from scopemap.runner.processes import Outcome, ProcessLimits, run_in_processes
 from scopemap.runner.with_report import reconstruct_with_report
 

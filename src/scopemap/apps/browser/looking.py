@@ -184,7 +184,7 @@ def time_in_words(frames: int | None, preset: str, measured: Iterable[float]) ->
 def measured_rates(results: Iterable[Path], preset: str) -> list[float]:
     """Return the frames per second of finished results that were made with a preset; of the first few."""
     from scopemap.result.result import Result
-    from scopemap.result.verdict import frames_per_s
+    from scopemap.result.summary import frames_per_s
 
     rates = []
     for folder in results:

@@ -16,7 +16,8 @@ from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import COLOURS
 from scopemap.report.shown_mesh import simplified
 from scopemap.report.video_parts import video_parts
-from scopemap.result.verdict import WORDS, level_of_submap
+from scopemap.result.verdict import level_of_submap
+from scopemap.result.wording import LEVEL_WORDS
 
 if TYPE_CHECKING:
     from scopemap.apps.coverage.coverage import Coverage
@@ -149,4 +150,4 @@ def strip_words(view: ResultView) -> str:
 
 def _submap_words(view: ResultView, number: int) -> str:
     count, submap = int((view.whole.frames.submap == number).sum()), view.whole.submaps[number]
-    return f"{number + 1}: {count} frames, {WORDS[level_of_submap(submap)]}"
+    return f"{number + 1}: {count} frames, {LEVEL_WORDS[level_of_submap(submap)]}"

@@ -17,7 +17,8 @@ from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.input.opening import VIDEO_ENDINGS
 from scopemap.result.result import Result
 from scopemap.result.result_folder import UNFINISHED
-from scopemap.result.verdict import WORDS, level_of_submap
+from scopemap.result.verdict import level_of_submap
+from scopemap.result.wording import LEVEL_WORDS
 
 _RESULTS = "scopemap"
 _UPLOADS = "uploads"
@@ -159,7 +160,7 @@ def made_and_word(folder: Path) -> str:
     # In the person's own time.
     made = datetime.fromtimestamp((folder / _MARK).stat().st_mtime)
     run = Result(folder)
-    return f"{made:%Y-%m-%d %H:%M}, {WORDS[level_of_submap(run)]}"
+    return f"{made:%Y-%m-%d %H:%M}, {LEVEL_WORDS[level_of_submap(run)]}"
 
 
 def _is_result(path: Path) -> bool:

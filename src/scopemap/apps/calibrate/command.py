@@ -79,6 +79,7 @@ def calibrate(
     from scopemap.apps.calibrate.residual_picture import draw_calibration
     from scopemap.apps.calibrate.targets import find_views
     from scopemap.input.opening import open_source
+    from scopemap.result.wording import in_words
 
     silent = quiet or as_json
     pictures = open_source(source, dataset=dataset, settings=reading)
@@ -90,9 +91,9 @@ def calibrate(
     camera_calibration.save_calibration(done, out)
     draw_calibration(done, picture)
     for note in [] if silent else pictures.notes:
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(f"note: {in_words(note)}", err=True)
     for warning in [] if quiet else [*pictures.warnings, *done.warnings]:
-        typer.echo(f"warning: {warning}", err=True)
+        typer.echo(f"warning: {in_words(warning)}", err=True)
     if as_json:
         looked = {"looked_at": search.looked_at, "every": search.every, "found": len(search.views)}
         places = {"calibration": str(out), "picture": str(picture), "board": target.described}

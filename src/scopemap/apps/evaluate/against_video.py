@@ -29,8 +29,8 @@ from scopemap.engine.geometry.rendering import Rendering, render_mesh, render_po
 from scopemap.engine.geometry.se3 import transform
 from scopemap.engine.models import weights
 from scopemap.engine.models.device import missing_packages
-from scopemap.engine.notices import notices_of
 from scopemap.report.depth_figures import draw_renderings
+from scopemap.result.evidence import notices_of
 from scopemap.result.result import Result
 from scopemap.runner.reread_frames import open_input
 

@@ -24,6 +24,7 @@ from scopemap.input.opening import open_sequence, open_source
 from scopemap.input.prepared import OF_UNKNOWN_VIEWS, sample_pairs, shows_two_fields
 from scopemap.input.sequence import Sequence
 from scopemap.input.video_format.stereo_packing import Packing, packing
+from scopemap.result.wording import in_words
 
 _KEPT = 8
 _NAMED = 3
@@ -130,7 +131,7 @@ def inspect(
     size = sequence.source.width, sequence.source.height
     findings = [
         *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
-        *_of_source(list(map(str, sequence.warnings))),
+        *_of_source(list(map(in_words, sequence.warnings))),
         *(check_container(container) if container else []),
         *checks.check_timing(clip, container["length_s"] if container else None),
         *checks.check_packing(packed, interlaced=interlaced),

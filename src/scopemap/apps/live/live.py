@@ -21,6 +21,7 @@ from scopemap.engine.odometry import Step
 from scopemap.input.live_source import LiveSource
 from scopemap.input.sequence import Sequence
 from scopemap.result.result import Result
+from scopemap.result.wording import facts_of_notices
 from scopemap.runner.provenance import Limits
 from scopemap.runner.reconstructor import Reconstructor
 from scopemap.runner.run import FrameWriter, Progress
@@ -177,5 +178,5 @@ def finished(reconstructor: Reconstructor, source: LiveSource, final: FrameWrite
     result = reconstructor.result(final)
     if source.dropped:
         dropped = Notice("frames-dropped", {"dropped": source.dropped, "read": source.read})
-        result.provenance["notices"].append(dropped.as_json())
+        result.provenance["notices"] += facts_of_notices([dropped])
     return result

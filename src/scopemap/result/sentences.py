@@ -1,0 +1,177 @@
+"""The sentences of a verdict, from the evidence: its reasons, the main facts, and what the result may be used for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scopemap.engine.notices import Level, Notice
+from scopemap.engine.tracking.causes import ADVICE
+from scopemap.result.evidence import LEAST_SUBMAP_S, Evidence
+from scopemap.result.submap_summaries import doubt_words
+from scopemap.result.surface_segments import SurfaceSegment
+from scopemap.result.wording import LEVEL_WORDS, text_of
+
+_MOST_RANGES = 3
+"""Parts of the time that the verdict's sentence names, the longest."""
+
+
+def interrupted(evidence: Evidence, level: Level) -> str:
+    """Return that the run was stopped, and where."""
+    return text_of(Notice("input-interrupted", {"frame": evidence.interrupted_at_frame}))
+
+
+def too_few_frames(evidence: Evidence, level: Level) -> str:
+    """Return how few frames are in the result."""
+    chosen, which = _chosen(evidence)
+    counted = f"{evidence.frames_in_result} of {evidence.frames_used}{chosen}"
+    return f"Only {counted} frames are in the result: too few for a shape.{which}"
+
+
+def frames_in_result(evidence: Evidence, level: Level) -> str:
+    """Return which share of the frames is usable."""
+    chosen, which = _chosen(evidence)
+    longest = f"; the longest gap is {evidence.longest_gap} frames" if evidence.longest_gap else ""
+    last = evidence.interrupted_at_frame
+    until = "" if last is None else f" until frame {last}"
+    in_segments = any(segment.level == "bad" for segment in evidence.segments)
+    where = "in usable segments" if in_segments else "in the result"
+    counted = f"{evidence.frames_usable} of {evidence.frames_used}"
+    if evidence.frames_in_usable_submaps:
+        where += f" or in usable submaps of {LEAST_SUBMAP_S:g} s and more"
+        counted = f"{evidence.frames_usable} and {evidence.frames_in_usable_submaps} of {evidence.frames_used}"
+    share = _percent(evidence.usable_share or 0.0)
+    return f"{share} of the{chosen} frames{until} are {where} ({counted}){longest}.{which}"
+
+
+def look_at_submaps(evidence: Evidence) -> str:
+    """Return which submaps there are to look at; "" where none was kept."""
+    judged = _submaps_in_words(evidence)
+    return f"Look at the {judged} in maps/." if judged else ""
+
+
+def doubtful_submap(evidence: Evidence, level: Level) -> str:
+    """Return which submap agrees least with its own frames."""
+    return f"The most doubtful submap is {doubt_words([*evidence.submaps])}."
+
+
+def frames_lost(evidence: Evidence, level: Level) -> str:
+    """Return in how many frames the camera was lost, and mostly why."""
+    lost, rotated = evidence.frames_lost, evidence.frames_rotation_only
+    how = f", with known rotation in {rotated}" if rotated else ""
+    why = f", mostly due to this: {evidence.loss_cause.value}" if evidence.loss_cause else ""
+    return f"The camera was lost in {lost} {'frame' if lost == 1 else 'frames'}{how}{why}."
+
+
+def against_losses(evidence: Evidence) -> str:
+    """Return what the operator can do against the cause of most losses; "" where it is unknown."""
+    return ADVICE.get(evidence.loss_cause, "")
+
+
+def surface_coverage(evidence: Evidence, level: Level) -> str:
+    """Return how much the surface covers."""
+    mean, least = _percent(evidence.coverage_mean or 0.0), _percent(evidence.coverage_least or 0.0)
+    return f"The surface covers {mean} of the tissue in its own frames (worst frame: {least}), not of the organ."
+
+
+def surface_depth(evidence: Evidence, level: Level) -> str:
+    """Return how well the surface fits the depth of its frames."""
+    words = {"good": "fits", "doubtful": "only roughly fits", "bad": "contradicts"}[level]
+    seen, mean = "", evidence.within_10_percent_mean
+    if mean is not None:
+        least = _percent(evidence.within_10_percent_least or 0.0)
+        seen = f"; {_percent(mean)} of the picture agrees within 10 % (worst frame: {least})"
+    error = _percent(evidence.depth_error or 0.0, 1)
+    return f"The surface {words} the frames: depth differs by {error} (median){seen}."
+
+
+def segments(evidence: Evidence, level: Level) -> str:
+    """Return that several surfaces, each for a part of the time, make up the result."""
+    levels = [segment.level for segment in evidence.segments]
+    text = f"The scene changes, so {len(levels)} segments of the video have a surface each ({_counted(levels)})."
+    loose = evidence.loose_segments
+    return text + (f" {loose} are joined by tracking alone." if loose else "")
+
+
+def advice(evidence: Evidence, level: Level) -> str:
+    """Return what a result of this level may be used for."""
+    if level == "bad":
+        return "Do not use this result."
+    use = _usable_parts(evidence)
+    if not use:
+        use = _of_good(evidence) if level == "good" else "Use it with care: read the cautions first."
+    if evidence.scale_stated:
+        return f"{use} Sizes rest on your {evidence.scale_source}: check a length that you know."
+    if evidence.scale_known:
+        return f"{use} Sizes are known (from {evidence.scale_source})."
+    return f"{use} Sizes are unknown: compare shapes, do not measure."
+
+
+def main_facts(evidence: Evidence) -> str:
+    """Return the main facts of a result: frames, scale and surface."""
+    judged, usable = _submaps_in_words(evidence), _usable_parts(evidence).rstrip(".")
+    counted = f"{evidence.frames_in_result} of {evidence.frames_used} frames are in the result"
+    facts = [*([usable] if usable else []), counted + (f", others in {judged}" if judged else "")]
+    known = "The scale is as you stated it" if evidence.scale_stated else "The scale is known"
+    facts.append(known if evidence.scale_known else "The scale is unknown")
+    if not evidence.faces:
+        facts.append("There is no surface")
+    elif evidence.coverage_mean is not None:
+        covered = _percent(evidence.coverage_mean)
+        facts.append(f"The surface covers {covered} of what these frames show, not of the organ")
+    return "".join(f"{fact}. " for fact in facts).rstrip()
+
+
+def _of_good(evidence: Evidence) -> str:
+    """Return what a good result may be used for: a lens that the motion does not test is the user's word alone."""
+    if "camera-unconfirmed" in evidence.codes:
+        return "The shape can be used if the calibration is right: the motion does not test it."
+    return "The shape can be used."
+
+
+def _usable_parts(evidence: Evidence) -> str:
+    """Return which parts of the time can be used, and what for; "" where one surface stands for all frames."""
+    if evidence.segment_count < 2:
+        return ""
+    usable = [segment for segment in evidence.segments if segment.level != "bad"]
+    if not usable:
+        return "No part of the video can be used."
+    ranges = _ranges_s(usable)
+    longest = sorted(sorted(ranges, key=lambda ends: ends[0] - ends[1])[:_MOST_RANGES])
+    words = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in longest)
+    words += f" and {len(ranges) - len(longest)} shorter parts" if len(ranges) > len(longest) else ""
+    share = _percent(evidence.frames_usable / max(evidence.frames_used, 1))
+    good = any(segment.level == "good" for segment in usable)
+    return f"Usable: {words}, {share} of the video{'' if good else ', for looking, not for measuring'}."
+
+
+def _ranges_s(usable: list[SurfaceSegment]) -> list[list[float]]:
+    """Return start and end, s, of successive segments together."""
+    ranges: list[list[float]] = []
+    for before, segment in zip([None, *usable], usable, strict=False):
+        if before is not None and before.segment == segment.segment - 1:
+            ranges[-1][1] = segment.end_s
+        else:
+            ranges.append([segment.start_s, segment.end_s])
+    return ranges
+
+
+def _chosen(evidence: Evidence) -> tuple[str, str]:
+    """Return what a sentence says where a part of the frames was chosen, and which part; "" where all were used."""
+    return (" chosen", f" Chosen: {evidence.chosen_frames}.") if evidence.chosen_frames else ("", "")
+
+
+def _submaps_in_words(evidence: Evidence) -> str:
+    """Return how many other submaps there are and how they are judged by themselves; "" where there are none."""
+    levels = [*evidence.submap_levels]
+    return f"{len(levels)} {'submap' if len(levels) == 1 else 'submaps'} ({_counted(levels)})" if levels else ""
+
+
+def _counted(levels: list[Level]) -> str:
+    """Return how many of each level there are, in words."""
+    return ", ".join(f"{levels.count(level)} {word}" for level, word in LEVEL_WORDS.items() if level in levels)
+
+
+def _percent(share: float, digits: int = 0) -> str:
+    """Return a share as text; rounded down, so that not even a pixel short of all is all."""
+    factor = 10.0**digits
+    return f"{np.floor(100 * share * factor + 1e-9) / factor:.{digits}f} %"
