@@ -32,7 +32,7 @@ _METHODS = """
 A stage's `method` chooses its advanced settings. Methods can be joined, the later one wins:
 `--set tracking.method=paper+least-squares`. An advanced setting that is given itself counts before the method. A method
 that comes later (in a file after the preset, on the command line after both) replaces advanced settings that came
-earlier.
+earlier. A method that changes none leaves out the part that it names, as the setting's meaning says.
 
 | setting | method | advanced settings that it changes |
 |---|---|---|

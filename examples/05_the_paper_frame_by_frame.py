@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap import Config, Frame, open_sequence
-from scopemap.engine.config import SmoothingSettings
+from scopemap.engine.depth.mapis import FILTER_SIGMA_MM
 from scopemap.engine.depth.pseudo_stereo import AffineDisparity, fit_baseline_lbfgsb
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
@@ -28,6 +28,7 @@ from scopemap.engine.geometry.se3 import inverse, mean_near, orthonormalised, se
 from scopemap.engine.geometry.warp import bilateral_filtered, pull
 from scopemap.engine.tracking.pyramid import build_pyramid
 from scopemap.engine.tracking.residuals import Loss, View, normal_equations, residual_images
+from scopemap.engine.tracking.smoothing import OMEGA, WEIGHTS
 from scopemap.runner.estimators import create_estimators
 from scopemap_bench import PhantomSpec, write_phantom
 
@@ -61,7 +62,7 @@ def paper(frames: Iterable[Frame], config: Config, networks: Estimators) -> tupl
         poses.append(orthonormalised(T_world_keyframe @ inverse(T_current_keyframe)))  # (11)
         if i % config.tracking.keyframe_every == 0:  # K_j, j = 2 m
             keyframe, T_world_keyframe = build_pyramid(frame, config.tracking), poses[i]
-        frame = replace(frame, T_world_camera=smoothed(poses, config.smoothing))
+        frame = replace(frame, T_world_camera=smoothed(poses))
         volume.integrate(frame)  # TSDF fusion
         done.append(frame)
     return done, volume
@@ -71,7 +72,7 @@ def refined(
     previous: np.ndarray, current: np.ndarray, mde_previous: np.ndarray, mde: np.ndarray, config: Config, by: Estimators
 ) -> np.ndarray:
     """Return the MAPIS-Depth map (H, W) of two pictures and their D^mde."""
-    sigmas = config.mapis.filter_sigma_px, config.mapis.filter_sigma_mm
+    sigmas = config.mapis.filter_sigma_px, FILTER_SIGMA_MM
     to_previous = by.flow.estimate(current, previous)  # (U, V), RAFT; `remap` pulls, so it leads to the previous frame
     warped = bilateral_filtered(pull(mde_previous, to_previous), *sigmas)  # (2)
     score = np.float32(by.perceptual.compare(previous, current).score)  # (3): 0 where the pictures are alike
@@ -113,13 +114,12 @@ def aligned_at_level(keyframe: View, current: View, T_start: np.ndarray, free: i
     return minimise(Problem(linearise, retract), T_start, Options(FIRST_RADIUS, max_iterations=30)).state
 
 
-def smoothed(poses: list[np.ndarray], settings: SmoothingSettings) -> np.ndarray:
+def smoothed(poses: list[np.ndarray]) -> np.ndarray:
     """Return the last pose after WEMA; poses do not add, so the mean is taken on the group."""
     if len(poses) < 3:
         return poses[-1]
-    w, i = settings, len(poses) - 1
-    s = 1 - np.exp(-i * w.omega)
-    return mean_near(poses[-1], poses[:-4:-1], [s * w.alpha, s * w.beta, s * w.gamma])  # (13); 1 - s is the base's
+    s = 1 - np.exp(-(len(poses) - 1) * OMEGA)
+    return mean_near(poses[-1], poses[:-4:-1], [s * weight for weight in WEIGHTS])  # (13); 1 - s is the base's
 
 
 def stand_ins(frames: Path, folder: Path) -> dict[str, object]:

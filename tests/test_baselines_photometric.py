@@ -70,9 +70,9 @@ def test_two_scales_and_grey_values_alone() -> None:
     assert [view.weight.shape for view in build_pyramid(frame, SETTINGS)] == [(48, 64), (24, 32)]
     # Of the settings that make our tracker what it is, none is left.
     ours = TrackingSettings()
-    for name in ("channels", "lamp_gamma", "gain_bias", "solver", "start"):
+    for name in ("photometric", "solver"):
         assert getattr(SETTINGS, name) != getattr(ours, name)
-    assert SETTINGS.depth_weight == SETTINGS.min_keyframe_agreement == SETTINGS.corner_depth_sigma == 0
+    assert SETTINGS.photometry.depth_weight == SETTINGS.min_keyframe_agreement == SETTINGS.corner_depth_sigma == 0
     assert SETTINGS.picture_checks is SETTINGS.pose_checks is False
     assert SETTINGS.relocalisation_keyframes == SETTINGS.new_map_after == 0
 

@@ -111,14 +111,14 @@ def test_json_has_its_keys_and_nothing_else_is_printed(images: Path, tmp_path: P
 
 def test_options_reach_the_settings_and_win_over_a_file(images: Path, tmp_path: Path, capfd: Capture) -> None:
     (tmp_path / "s.toml").write_text(
-        "[tracking]\nmethod = 'paper'\nlamp_gamma = 0.4\nkeyframe_every = 3\n[networks]\nflow = 'dis'\n"
+        "[tracking]\nmethod = 'paper'\nhuber = 0.4\nkeyframe_every = 3\n[networks]\nflow = 'dis'\n"
     )
-    options = ("--config", tmp_path / "s.toml", "--set", "tracking.channels=both", "--flow", "none")
+    options = ("--config", tmp_path / "s.toml", "--set", "tracking.photometric=scopemap", "--flow", "none")
     options += ("--device", "cpu", "--size", "80x64", "--fov", "90", "--frames", "2:8:2", "--json")
     assert call("run", images, "--out", tmp_path / "out", *options) == 0
     written = (tmp_path / "out" / "config.toml").read_text()
-    lines = ('tracking.method = "paper"', 'tracking.channels = "both"', "tracking.lamp_gamma = 0.4", '"cpu"')
-    for line in (*lines, "tracking.keyframe_every = 3", 'networks.flow = "none"', 'tracking.start = "identity"'):
+    lines = ('tracking.method = "paper"', 'tracking.photometric = "scopemap"', "tracking.huber = 0.4", '"cpu"')
+    for line in (*lines, "tracking.keyframe_every = 3", 'networks.flow = "none"', 'tracking.checks = "poses"'):
         assert line in written
     camera = json.loads(capfd.readouterr().out)["camera"]
     assert (camera["width"], camera["height"], camera["fx"]) == (80, 64, pytest.approx(40.0))

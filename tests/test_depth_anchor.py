@@ -86,7 +86,7 @@ def test_the_conversion_is_fitted_once_and_held() -> None:
 
 
 def test_without_shift_it_is_the_papers_baseline_and_frame_1_keeps_the_metric_depth() -> None:
-    anchor = anchored(anchor="depth-pro", fit_shift=False)
+    anchor = anchored(anchor="depth-pro", fit="pseudo-stereo")
     estimate, first = disparity(), frame()
     np.testing.assert_array_equal(depth_of(anchor, estimate, first), TRUTH_MM)
     second_mm = depth_of(anchor, estimate, frame(1))

@@ -105,12 +105,12 @@ def test_shape_alone_is_tracked_where_depth_is_measured() -> None:
     step = se3_exp(np.array([0.004, -0.006, 0.008, 0.2, -0.15, 0.1]))
     poses = [np.linalg.matrix_power(step, n) for n in range(5)]
     frames = [_bumpy(T, n) for n, T in enumerate(poses)]
-    settings = TrackingSettings(finest_level=0, pose_checks=False)
+    settings = TrackingSettings(finest_level=0, checks="none")
     for found, true in zip(_tracked(frames, settings, measured=True), poses[1:], strict=True):
         error = inverse(true) @ found
         assert np.linalg.norm(error[:3, 3]) < 0.02
         assert np.degrees(rotation_angle_rad(error[:3, :3])) < 0.02
-    blind = _tracked(frames, TrackingSettings(finest_level=0, pose_checks=False, depth_weight=0.0), measured=True)
+    blind = _tracked(frames, TrackingSettings(finest_level=0, checks="none", photometric="paper"), measured=True)
     assert np.linalg.norm((inverse(poses[-1]) @ blind[-1])[:3, 3]) > 0.3
 
 
@@ -120,7 +120,7 @@ def test_predicted_depth_of_a_frame_has_no_say_in_its_own_pose() -> None:
     rgb = random.integers(40, 200, (64, 80, 3)).astype(np.uint8)
     frames = [replace(frame, rgb=np.roll(rgb, n, 1)) for n, frame in enumerate(frames)]
     spoilt = [frames[0], replace(frames[1], depth_mm=frames[1].depth_mm * np.float32(1.05))]
-    settings = TrackingSettings(finest_level=0, pose_checks=False)
+    settings = TrackingSettings(finest_level=0, checks="none")
     for measured in (False, True):
         one, other = (_tracked(some, settings, measured=measured)[0] for some in (frames, spoilt))
         assert np.array_equal(one, other) is not measured

@@ -92,7 +92,7 @@ def test_the_anchor_scales_sigma_as_it_scales_depth() -> None:
 def test_nothing_is_said_of_a_disparity_nor_of_the_anchors_own_depth() -> None:
     assert _anchored(DepthEstimate(DEPTH, "depth")).sigma_mm is None
     assert _anchored(DepthEstimate(1 / DEPTH, "disparity", sigma=SHARE)).sigma_mm is None
-    replaced = _anchored(DepthEstimate(DEPTH, "depth", sigma=SHARE), anchor="shading", fit_shift=False)
+    replaced = _anchored(DepthEstimate(DEPTH, "depth", sigma=SHARE), anchor="shading", fit="pseudo-stereo")
     assert replaced.sigma_mm is None
     blind = _anchored(DepthEstimate(np.full(SHAPE, np.nan, np.float32), "depth", sigma=SHARE))
     assert blind.sigma_mm is None

@@ -15,9 +15,6 @@ from scopemap import Config, open_sequence, reconstruct
 from scopemap.engine.errors import InputError, SettingsError
 
 FRAMES = 30
-_WEIGHTS = ("smoothing.alpha", "smoothing.beta", "smoothing.gamma")
-WEIGHT_OF_1 = {name: {"smoothing.method": "wema"} | {each: int(each == name) for each in _WEIGHTS} for name in _WEIGHTS}
-"""Weights with a sum of 1: one at its largest, and the others at their least, 0."""
 QUICK = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 3}
 NEEDS_MORE = {
     "depth.anchor=depth-pro": "weights of Depth Pro",
@@ -69,12 +66,8 @@ def _id(end: tuple[str, Any]) -> str:
 
 def _runs() -> list[dict[str, Any]]:
     """The settings of each run: for time one of each stage at an end, so that they hide nothing from each other."""
-    weights_of_0 = {f"{name}=0" for name in WEIGHT_OF_1}
-    stages = [[end for end in stage if _id(end) not in {*ALONE, *REFUSED, *weights_of_0}] for stage in _by_stage()]
+    stages = [[end for end in stage if _id(end) not in {*ALONE, *REFUSED}] for stage in _by_stage()]
     together = [dict(end for end in ends if end is not None) for ends in zip_longest(*stages)]
-    for run in together:
-        for name in WEIGHT_OF_1.keys() & run.keys():
-            run |= WEIGHT_OF_1[name]
     return together + [dict([end]) for stage in _by_stage() for end in stage if _id(end) in ALONE]
 
 

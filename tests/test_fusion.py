@@ -113,7 +113,7 @@ def test_pixels_that_must_not_count_do_not() -> None:
     cosine = VIEW.rays @ normal / np.linalg.norm(VIEW.rays, axis=-1)
     grazing = replace(plane_frame(normal, 5.0), valid=(cosine > 0.06) & (cosine < 0.09))
     for weighted in (True, False):
-        volume = TsdfVolume(lenient(weighted=weighted))
+        volume = TsdfVolume(lenient(method="scopemap" if weighted else "unweighted"))
         volume.integrate(grazing)
         assert (volume.block_count == 0) == weighted
 
@@ -127,7 +127,7 @@ def test_a_highlight_that_stays_in_place_is_fused_with_little_weight() -> None:
     valid[:, :30] = False
     x_mm, y_mm = (40 * VIEW.rays[[row - 3, row + 3], [col - 3, col + 3], axis] for axis in (0, 1))
 
-    def fused(*, highlights: bool = True, **advanced: float) -> tuple[trimesh.Trimesh, np.ndarray]:
+    def fused(*, highlights: bool = True, **advanced: str) -> tuple[trimesh.Trimesh, np.ndarray]:
         """The mesh, and which vertices are under the highlight."""
         volume = TsdfVolume(lenient(**advanced))
         for _ in range(5):
@@ -144,5 +144,5 @@ def test_a_highlight_that_stays_in_place_is_fused_with_little_weight() -> None:
     assert np.abs(colours[under] - np.median(colours, axis=0)).max() < 12
     # What is masked at the picture's border is no highlight, nor what is masked for another reason.
     assert mesh.vertices[:, 0].min() > 40 * VIEW.rays[row, 27, 0]
-    assert not fused(weighted=False)[1].any()
+    assert not fused(method="unweighted")[1].any()
     assert not fused(highlights=False)[1].any()

@@ -136,7 +136,7 @@ def test_values_are_pulled_along_the_flow() -> None:
 
 @pytest.mark.parametrize("recursive", [True, False])
 def test_what_is_carried_on(recursive: bool) -> None:
-    mapis = _mapis(recursive=recursive)
+    mapis = _mapis(previous="refined" if recursive else "raw")
     second = _second(mapis, _link()).depth_mm
     np.testing.assert_allclose(second, (DEPTH + OTHER) / 2, rtol=1e-6)
     third = mapis.refine(OTHER, "depth", CAMERA, _link(), None).depth_mm

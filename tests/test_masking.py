@@ -72,7 +72,7 @@ def test_highlights_are_found_and_widened_but_bright_tissue_is_not_one() -> None
     assert not valid[spot].any()
     assert valid[red].all()
     assert (~valid).sum() < 2.5 * spot.sum()
-    kept = Masker(MaskSettings(highlights=False))(frame(image)).valid
+    kept = Masker(MaskSettings(method="no-highlights"))(frame(image)).valid
     assert kept.all()
 
 
@@ -100,7 +100,7 @@ def test_the_noise_of_a_black_image_is_not_tissue(sigma: float) -> None:
     assert Masker(MaskSettings())(frame(dark)).valid.mean() < 0.01
     noisy = np.clip(tissue() + rng.normal(0, sigma, dark.shape), 0, 255).astype(np.uint8)
     assert not is_constant(noisy)
-    assert Masker(MaskSettings(highlights=False))(frame(noisy)).valid.all()
+    assert Masker(MaskSettings(method="no-highlights"))(frame(noisy)).valid.all()
 
 
 @pytest.mark.real

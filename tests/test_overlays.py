@@ -116,7 +116,7 @@ def test_an_overlay_that_has_gone_is_not_kept_by_a_camera_at_rest() -> None:
 
 
 def test_runs_leave_text_out_unless_told_and_as_the_paper_does() -> None:
-    maskers = [Masker(MaskSettings(highlights=False, overlays=on)) for on in (True, False)]
+    maskers = [Masker(MaskSettings(method=method)) for method in ("no-highlights", "no-highlights+no-overlays")]
     for number, picture in enumerate(clip(40, text())):
         frame = Frame(number, 0.0, picture, CAMERA, EVERYWHERE)
         masked, plain = (masker(frame).valid for masker in maskers)
@@ -125,8 +125,8 @@ def test_runs_leave_text_out_unless_told_and_as_the_paper_does() -> None:
     # White letters are over-exposed, their edges are not.
     assert plain[letters].mean() > 0.1
     assert plain[~letters].mean() > 0.99
-    assert Config.load("default").mask.overlays
-    assert not Config.load("paper").mask.overlays
+    assert not Config.load("default").mask.has("no-overlays")
+    assert Config.load("paper").mask.has("no-overlays")
 
 
 @pytest.mark.real
@@ -139,7 +139,8 @@ def test_runs_leave_text_out_unless_told_and_as_the_paper_does() -> None:
      ("endoscopy/endonerf/pulling_soft_tissues", 0.006)],
 )  # fmt: skip
 def test_real_tissue_is_no_overlay(real_data: Path, path: str, largest_share: float) -> None:
-    on, off = (Masker(MaskSettings(highlights=False, overlays=which)) for which in (True, False))
+    methods = ("no-highlights", "no-highlights+no-overlays")
+    on, off = (Masker(MaskSettings(method=method)) for method in methods)
     largest = 0.0
     for frame in open_sequence(real_data / path).frames():
         left_out = off(frame).valid & ~on(frame).valid

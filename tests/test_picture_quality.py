@@ -44,7 +44,7 @@ def _dark(much: float) -> np.ndarray:
 
 def _after_clear(rgb: np.ndarray) -> float:
     """The quality of a picture, masked as in a run, after ten clear ones."""
-    masker, quality = Masker(MaskSettings(overlays=False)), PictureQuality()
+    masker, quality = Masker(MaskSettings(method="no-overlays")), PictureQuality()
     frames = [masker(Frame(n, n / 30, shown, CAMERA, EVERYWHERE)) for n, shown in enumerate([TISSUE] * 10 + [rgb])]
     return [quality(frame.rgb, frame.valid) for frame in frames][-1]
 
@@ -83,7 +83,7 @@ def test_a_picture_without_a_usable_pixel_has_the_least_worth_and_is_no_measure_
 @pytest.mark.parametrize(("weighted", "mean_mm"), [(True, 4 * 0.1 / 3.1), (False, 1.0)])
 def test_an_unclear_frame_moves_the_surface_little(weighted: bool, mean_mm: float) -> None:
     """Three frames see the plane where it is; the depth of an unclear one is 4 mm off."""
-    settings = lenient(weighted=weighted)
+    settings = lenient(method="scopemap" if weighted else "unweighted")
     volume, ahead = TsdfVolume(settings), np.array([0.0, 0.0, 1.0])
     for _ in range(3):
         volume.integrate(plane_frame(ahead, 50.0))

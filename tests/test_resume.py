@@ -109,7 +109,7 @@ def test_other_settings_begin_anew_or_are_refused_by_name(folder: Path, tmp_path
     out = tmp_path / "run"
     _kill(folder, out, "realtime", 4)
     other = Config.load("realtime", settings={"fusion.voxel_mm": 2.5})
-    with pytest.raises(InputError, match=r"cannot resume .* fusion\.voxel_mm was None, is 2\.5; --no-resume"):
+    with pytest.raises(InputError, match=r"cannot resume .* fusion\.voxel_mm was not set, and is 2\.5; --no-resume"):
         check_resumable(out, open_sequence(folder), other)
     # The refusal has left what there was.
     check_resumable(out, open_sequence(folder), Config.load("realtime"))
@@ -121,6 +121,8 @@ def test_other_settings_begin_anew_or_are_refused_by_name(folder: Path, tmp_path
 def test_another_input_and_no_resume_begin_anew(folder: Path, tmp_path: Path) -> None:
     out, other = tmp_path / "run", write_tiny(tmp_path / "phantom", "black:6-6")
     _kill(folder, out, "realtime", 4)
+    with pytest.raises(InputError, match=r"cannot resume .*: the input has changed; --no-resume"):
+        check_resumable(out, open_sequence(other), Config.load("realtime"))
     assert _run(other, out, "realtime").provenance["resumed_after_frame"] is None
     _kill(folder, out, "realtime", 4, overwrite=True)
     discard_unfinished(out)
@@ -311,7 +313,7 @@ def test_the_command_resumes_and_reports_it(folder: Path, tmp_path: Path, capfd:
     out = tmp_path / "run"
     _kill(folder, out, "realtime", 4)
     ask = ("run", folder, "--out", out, "--preset", "realtime", "--resume")
-    assert "input.fps was None, is 3.0" in refused(capfd, *ask, "--fps", "3")
+    assert "input.fps was not set, and is 3.0" in refused(capfd, *ask, "--fps", "3")
     assert call(*ask) == 0
     said = capfd.readouterr()
     assert "resuming after" in said.err

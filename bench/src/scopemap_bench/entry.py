@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from importlib.metadata import version
@@ -176,3 +177,8 @@ def _below(data: Path | None, path: str) -> Path:
     if data is None:
         raise SettingsError(f"give --data, the folder of '{path}'")
     return data / path
+
+
+def worker_command(file: Path) -> list[str]:
+    """Return the command that runs the entry in `file`."""
+    return [sys.executable, "-m", "scopemap_bench.runner", str(file)]

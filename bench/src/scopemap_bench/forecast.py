@@ -15,7 +15,7 @@ from pathlib import Path
 
 from scopemap.apps.demo.demo import CLIP, prepare_out
 from scopemap.engine.config import Config
-from scopemap_bench.entry import Entry
+from scopemap_bench.entry import Entry, worker_command
 from scopemap_bench.plan import MethodPlan, ProtocolPlan, SequencePlan
 from scopemap_bench.result import RunResult
 
@@ -64,8 +64,6 @@ def _frame_s(config: Config, share: float) -> float:
 
 def measured_pace() -> Pace:
     """Measure this machine, some 15 s."""
-    from scopemap_bench.runner import worker_command
-
     with tempfile.TemporaryDirectory() as temporary:
         clip = prepare_out(Path(temporary), overwrite=False)
         sequence = SequencePlan(path=CLIP, frames=(0, _MEASURED_FRAMES))

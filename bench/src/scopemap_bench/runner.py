@@ -30,7 +30,7 @@ from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError, ScopemapError, SettingsError
 from scopemap.input.sequence import Sequence
 from scopemap.runner.estimators import missing_weights
-from scopemap_bench.entry import Entry, entries_of
+from scopemap_bench.entry import Entry, entries_of, worker_command
 from scopemap_bench.forecast import measured_pace
 from scopemap_bench.methods.method import Method, PipelineMethod, create_method
 from scopemap_bench.plan import Plan, found_sequences, spec_of
@@ -194,11 +194,6 @@ def run_entry(entry: Entry) -> RunResult:
         timing=timing | {"peak_memory_mb": memory_mb},
         facts=_facts(entry) | {"truth": _quality_of_truth(sequence)},
     )
-
-
-def worker_command(file: Path) -> list[str]:
-    """Return the command that runs the entry in `file`."""
-    return [sys.executable, "-m", "scopemap_bench.runner", str(file)]
 
 
 def end_with_parent() -> None:

@@ -9,6 +9,7 @@ import atexit
 import gc
 import io
 import sys
+import warnings
 from typing import Any
 
 import typer
@@ -101,6 +102,7 @@ def _freeze() -> None:
 def main() -> None:
     """Run the command line."""
     atexit.register(_freeze)
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             # A pipe on Windows has a code page that lacks most letters.

@@ -11,6 +11,9 @@ KINDS: dict[str, tuple[float, ...]] = {
 }
 """Kinds of lenses, and the coefficients of fisheyes as of `FisheyeCamera`: f t, and f sin t as a series."""
 
+FOV_RANGE_DEG = (30.0, 150.0)
+"""Horizontal fields of view that endoscopes have."""
+
 
 class LensPrior(NamedTuple):
     """What is expected of a lens.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 _SCALE_NOT_STATED = "scale unknown (the run does not state it): compare shapes, not sizes"
 _MOST_PX = 1 << 15
+_SHOWN_SETTINGS = 3
 
 
 class Result:
@@ -136,9 +138,16 @@ class Result:
     def config(self) -> Config:
         """The settings of the run, resolved: the TSDF parameters are numbers.
 
-        Raises `SettingsError` for those of another version.
+        Those that this version does not have are ignored, with a `UserWarning`. Raises `SettingsError` for values that
+        it does not have.
         """
-        return Config.load(file=self.folder / "config.toml")
+        file, unknown = self.folder / "config.toml", list[str]()
+        config = Config.load(file=file, unknown=unknown)
+        if unknown:
+            names = ", ".join(unknown[:_SHOWN_SETTINGS]) + (", ..." if len(unknown) > _SHOWN_SETTINGS else "")
+            ignored = f"scopemap ignores settings of another version in {file} ({len(unknown)}): {names}"
+            warnings.warn(ignored, stacklevel=3)
+        return config
 
     @cached_property
     def frames(self) -> FrameTable:

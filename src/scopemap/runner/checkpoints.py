@@ -181,4 +181,11 @@ def _differences(facts: dict[str, Any], identity: dict[str, Any]) -> list[str]:
     """Return in words in what a run with these facts of its checkpoint differs from one with this identity."""
     before = facts.get("identity", identity)
     names = [name for name in sorted({*before, *identity}) if before.get(name) != identity.get(name)]
-    return [f"{name} was {before.get(name)}, is {identity.get(name)}" for name in names]
+    return [_difference(name, before.get(name), identity.get(name)) for name in names]
+
+
+def _difference(name: str, before: Any, now: Any) -> str:
+    if name == "input" or name.startswith("content of "):
+        return f"the {name} has changed"
+    was, is_now = ("not set" if value in (None, "") else value for value in (before, now))
+    return f"{name} was {was}, and is {is_now}"

@@ -9,9 +9,7 @@ from scopemap.engine.config import DepthSettings
 from scopemap.engine.depth.anchor import AnchoredDepth
 from scopemap.engine.depth.estimate import DepthEstimator
 from scopemap.engine.depth.shading import ShadingDepth
-from scopemap.engine.depth.stereo import StereoDepth
 from scopemap.engine.errors import CalibrationError, SettingsError
-from scopemap.input.depth_files import FilesDepth
 
 _FILES = "files:"
 
@@ -39,15 +37,19 @@ def create_depth(
     Raises `SettingsError` for another name, `WeightsError` or `InputError` where weights or files are missing,
     `CalibrationError` where the cameras of both views are not known.
     """
-    if (pair is None) != (settings.backend != StereoDepth.name):
+    if (pair is None) != (settings.backend != "stereo"):
         found = f"{'one view' if pair is None else 'two views'} and depth.backend={settings.backend}"
         raise SettingsError(f"two views (--stereo use) and depth.backend=stereo go together, found {found}")
     if isinstance(pair, CalibrationError):
         raise pair
     if pair is not None:
+        from scopemap.engine.depth.stereo import StereoDepth
+
         return StereoDepth(pair, rectifier.target)
     folder = files_folder(settings)
     if folder is not None:
+        from scopemap.input.depth_files import FilesDepth
+
         return FilesDepth(folder, rectifier, settings, depth_scale_mm)
     if settings.backend == "shading":
         return ShadingDepth(settings)

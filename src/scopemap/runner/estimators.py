@@ -12,20 +12,16 @@ from scopemap.engine.depth.anchor import max_depth_mm
 from scopemap.engine.depth.estimate import DepthEstimator
 from scopemap.engine.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOINTS
 from scopemap.engine.depth.perceptual import create_perceptual
-from scopemap.engine.depth.stereo import StereoDepth
 from scopemap.engine.errors import WeightsError
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.flow.flows import create_flow
-from scopemap.engine.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
 from scopemap.engine.mapping.bundle_problem import TRACKED
 from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.engine.models import weights
 from scopemap.engine.models.device import choose_device
 from scopemap.engine.tracking.alike import AlikeFeatures
-from scopemap.engine.tracking.at_rest import CameraAtRest
 from scopemap.engine.tracking.features import SiftFeatures
-from scopemap.input.depth_files import FilesDepth
 from scopemap.input.mask_files import create_masks
 from scopemap.input.sequence import Sequence
 from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder
@@ -62,6 +58,11 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         pair=sequence.pair,
     )
     corner_flow = own.flow or create_flow(networks.keyframe_flow, networks.device)
+    tracker = None
+    if config.tracking.camera_at_rest:
+        from scopemap.engine.tracking.at_rest import CameraAtRest
+
+        tracker = partial(CameraAtRest, config.tracking, corner_flow)
     return Estimators(
         depth,
         create_anchor(config.depth, networks.device),
@@ -71,7 +72,7 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         create_perceptual(networks.perceptual, networks.device),
         create_masks(config.mask, sequence.rectifier, sequence.source.masks),
         AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
-        partial(CameraAtRest, config.tracking, corner_flow) if config.tracking.camera_at_rest else None,
+        tracker,
     )
 
 
@@ -88,7 +89,10 @@ def missing_weights(config: Config, *other_flows: str, verified: bool = False) -
         (model or name,) for name, model in models.items() if not (model and Path(model).is_dir())
     ]
     flows = {networks.flow, networks.keyframe_flow, *other_flows}
-    needed += [names for size, names in RAFT_CHECKPOINTS.items() if f"raft-{size}" in flows]
+    if flows & {"raft-small", "raft-large"}:
+        from scopemap.engine.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
+
+        needed += [names for size, names in RAFT_CHECKPOINTS.items() if f"raft-{size}" in flows]
     if networks.perceptual == "lpips":
         needed.append(PERCEPTUAL_CHECKPOINTS)
     if verified:
@@ -101,8 +105,9 @@ def largest_depth_mm(config: Config, estimators: Estimators) -> float:
 
     A back end may scale predicted depth; three standard deviations of that are included.
     """
-    if isinstance(estimators.depth, FilesDepth | StereoDepth) and estimators.depth.measured_max_mm:
-        return estimators.depth.measured_max_mm
+    measured_max_mm: float | None = getattr(estimators.depth, "measured_max_mm", None)
+    if measured_max_mm:
+        return measured_max_mm
     mapping, log_factor = config.mapping, 0.0
     if mapping.adjusts:
         log_factor = 3 * TRACKED.scale + (MAX_LOG_FACTOR if mapping.depth_step_sigma > 0 else 0.0)

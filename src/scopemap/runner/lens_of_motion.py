@@ -9,8 +9,7 @@ from scopemap.engine.config import Config
 from scopemap.engine.mapping.lens_kinds import LensKinds, angle_of_radius
 from scopemap.engine.mapping.lens_test import LensTest
 from scopemap.engine.notices import Notice
-from scopemap.input.focal_length.from_motion import FOV_RANGE_DEG
-from scopemap.input.scopes import ANY_LENS, KINDS, SCOPES
+from scopemap.input.scopes import ANY_LENS, FOV_RANGE_DEG, KINDS, SCOPES
 from scopemap.input.sequence import Sequence
 
 _MOST_SHARE = 0.1

@@ -10,7 +10,6 @@ from scopemap.engine.depth.estimate import DepthEstimator
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import is_constant
 from scopemap.engine.notices import Notice
-from scopemap.input.focal_length.from_motion import with_focal_from_motion
 from scopemap.input.sequence import Sequence
 from scopemap.runner.estimators import CustomEstimators, create_estimators
 from scopemap.runner.run import Progress
@@ -41,6 +40,8 @@ def _with_estimated_focal(
     network = next((part for part in (estimators.depth, estimators.anchor.reference) if part.name == "depth-pro"), None)
     if config.input.focal == "auto" and network is not None:
         return _with_networks_focal(sequence, network), []
+    from scopemap.input.focal_length.from_motion import with_focal_from_motion
+
     estimated: tuple[Sequence, list[Notice]] = timed("focal length", with_focal_from_motion, sequence, config)
     return estimated
 

@@ -6,7 +6,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scopemap.engine.config import Config
 from scopemap.engine.fusion.frame_store import FrameStore
@@ -15,11 +15,7 @@ from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
 from scopemap.engine.tracking.track import FrameTracker
 from scopemap.input.frame_choice import selection_text, slice_of
-from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
-from scopemap.report.depth_figures import DepthPreviews
-from scopemap.report.notebook_progress import in_notebook, notebook_progress
-from scopemap.report.run_state import TRACKING_AGAIN
 from scopemap.result.checkpoint import discard_checkpoint
 from scopemap.result.checksums import write_checksums
 from scopemap.result.depth_maps import DepthWriter
@@ -30,7 +26,6 @@ from scopemap.result.verdict import state_verdict
 from scopemap.result.wording import facts_of_notices
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.estimators import largest_depth_mm
-from scopemap.runner.frame_surfaces import SurfaceWriter
 from scopemap.runner.lens_of_motion import MOST_PASSES, lenses_of, with_lens_of_motion
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.preparation import prepare
@@ -45,6 +40,9 @@ from scopemap.runner.run import (
     RestartedObserver,
     Run,
 )
+
+if TYPE_CHECKING:
+    from scopemap.report.depth_figures import DepthPreviews
 
 _NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
 
@@ -87,12 +85,17 @@ def reconstruct(
     """
     config = Config.chosen(config)
     if isinstance(sequence, Path | str):
+        from scopemap.input.opening import open_sequence  # readers of all formats
+
         sequence = open_sequence(sequence, settings=config.input)
     folder = None if out is None else Path(out)
     with ExitStack() as stack:
-        if progress is None and in_notebook():
-            observe, progress = stack.enter_context(notebook_progress(sequence.used_count))
-            observers += (observe,)
+        if progress is None:
+            from scopemap.report.notebook_progress import in_notebook, notebook_progress
+
+            if in_notebook():
+                observe, progress = stack.enter_context(notebook_progress(sequence.used_count))
+                observers += (observe,)
         progress = progress or (lambda doing, done, total: None)
         return _reconstruct(sequence, config, folder, overwrite, observers, progress, tracker)
 
@@ -182,6 +185,8 @@ class _Passes:
             for observer in self.observers:
                 if isinstance(observer, RestartedObserver):
                     observer.forget()
+            from scopemap.report.run_state import TRACKING_AGAIN
+
             self.progress(f"{TRACKING_AGAIN}, lens {sequence.camera_source}", 0, 0)
         assert not isinstance(found, Sequence)
         return found
@@ -195,9 +200,13 @@ class _Passes:
         writers: tuple[FrameWriter, ...] = ()
         written = None
         if folder is not None:
+            from scopemap.report.depth_figures import DepthPreviews
+
             written = _DepthPictures(DepthWriter(folder, largest_depth_mm(config, estimators)), DepthPreviews(folder))
             writers = written.depth, written.previews
             if config.tracking.camera_at_rest:
+                from scopemap.runner.frame_surfaces import SurfaceWriter
+
                 writers += (SurfaceWriter(folder, config, estimators),)
         writers += tuple(observer.final for observer in self.observers if isinstance(observer, FinalFrameObserver))
         with closing(store):

@@ -146,7 +146,7 @@ def _input_settings(run: Path) -> InputSettings:
     """Return how the run read its input, but for skipped frames: the truth is needed for every frame number."""
     file = run / "config.toml"
     try:
-        settings = Config.load(file=file).input if file.is_file() else InputSettings()
+        settings = Config.load(file=file, unknown=[]).input if file.is_file() else InputSettings()
     except SettingsError:  # of another version
         settings = InputSettings()
     left = {"stereo": "none"} if settings.second_view else {}

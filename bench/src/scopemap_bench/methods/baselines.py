@@ -45,7 +45,6 @@ ICP_METHODS = {
 
 SETTINGS = TrackingSettings(
     keyframe_every=2,
-    picture_checks=False,
     relocalisation_keyframes=0,
     new_map_after=0,
     corner_depth_sigma=0.0,
@@ -53,14 +52,10 @@ SETTINGS = TrackingSettings(
     levels=2,
     finest_level=0,
     huber=1.345,
-    depth_weight=0.0,
-    pose_checks=False,
+    checks="none",
     solver="gauss-newton",
     rotation_first=True,
-    start="identity",
-    channels="grey",
-    lamp_gamma=0.0,
-    gain_bias=False,
+    photometric="paper",
 )
 """Settings of our tracker for this method; all others have no effect or only detect empty images."""
 _MIN_USABLE_SHARE = 0.1  # of the image, the default of our own tracker

@@ -28,7 +28,7 @@ SWITCHES = (
     "mapping.min_loop_inliers=0",
     "mapping.other_starts=false",
     "mapping.depth_step_sigma=0",
-    "fusion.free_space=false",
+    "fusion.method=no-free-space",
     "tracking.relocalisation_keyframes=0",
 )
 """Parts of a run that can be turned off; the first column has none of them off."""

@@ -10,12 +10,10 @@ import cv2
 import numpy as np
 
 from scopemap.apps.browser.legends import ramp_html, words_html
-from scopemap.apps.browser.pages import start_page
 from scopemap.apps.browser.scene import draw_path, look_at
 from scopemap.apps.browser.surface_pair import SurfacePair
 from scopemap.apps.browser.two_results import TwoResults, apart_of, compare_results, is_alone, is_same_input
 from scopemap.apps.browser.window import escaped
-from scopemap.apps.browser.workspace import Workspace
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import OUTSIDE
@@ -35,24 +33,24 @@ _STOPS = 9
 
 
 class ComparePage:
-    """Two results: of one video, or of two examinations of a place. workspace : where the first page is, None: nowhere.
+    """Two results: of one video, or of two examinations of a place.
 
     Raises `InputError` where a folder holds no finished run, or both are one.
     """
 
-    def __init__(self, first: Path, second: Path, workspace: Workspace | None = None) -> None:
+    def __init__(self, first: Path, second: Path) -> None:
         self._runs = Result(first).checked(with_poses=True), Result(second).checked(with_poses=True)
         if first.resolve() == second.resolve():
             raise InputError(f"{first} cannot be compared with itself: name another result")
-        self._folders, self._workspace = (first, second), workspace
+        self._folders = first, second
 
     def open(self, window: BrowserWindow) -> None:
         """Make the elements; what takes long is done beside."""
         self._window, gui = window, window.gui
         given = [window.names.of(folder.resolve(), "result") for folder in self._folders]
         self._names = (given[0], given[1]) if given[0] != given[1] else ("the first", "the second")
-        if self._workspace is not None:
-            window.on(gui.add_button("Back to the start", color="gray"), self._back, self._workspace)
+        if window.first_page is not None:
+            window.on(gui.add_button("Back to the start", color="gray"), window.start)
         first, second = (escaped(name) for name in self._names)
         gui.add_markdown(f"### {first} and {second}")
         if is_same_input(*self._runs):
@@ -69,9 +67,6 @@ class ComparePage:
 
     def close(self) -> None:
         """Nothing was begun."""
-
-    def _back(self, workspace: Workspace) -> None:
-        self._window.show(start_page(workspace))
 
     def _show_exams(self, found: Any) -> None:
         from scopemap.apps.browser.changes import ShownChanges

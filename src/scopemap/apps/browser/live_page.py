@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scopemap.apps.browser.beside import LIVE_BUTTONS
-from scopemap.apps.browser.pages import start_page
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.runs import end_of, started
@@ -78,7 +77,7 @@ def open_live(window: BrowserWindow, workspace: Workspace, source: str) -> None:
 
     def back() -> None:
         run.stop()
-        window.show(start_page(workspace))
+        window.start()
 
     buttons = {words: partial(run.press, name) for words, name in LIVE_BUTTONS.items()}
     window.show(RunPage(run, view_folder(out), "Live", finished, back, buttons=buttons))

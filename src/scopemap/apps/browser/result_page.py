@@ -11,7 +11,6 @@ from scopemap.apps.browser.files_part import FilesPart
 from scopemap.apps.browser.frame_part import FramePart
 from scopemap.apps.browser.measure_part import MeasurePart
 from scopemap.apps.browser.next_steps import NextRun, arguments_again
-from scopemap.apps.browser.pages import compare_page, start_page
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.surface_part import SurfacePart
@@ -115,18 +114,16 @@ class ResultPage:
 
     def _go(self, way: str) -> None:
         if way == _BACK:
-            self._start()
+            self._window.start()
         elif way == _WHOLE:
             self._view.look_at_all()
         else:
             self._measure.stop()
 
     def _compare(self, other: Path) -> None:
-        self._window.show(compare_page(self._run.folder, other, self._workspace))
+        from scopemap.apps.browser.compare_page import ComparePage
 
-    def _start(self) -> None:
-        assert self._workspace is not None
-        self._window.show(start_page(self._workspace))
+        self._window.show(ComparePage(self._run.folder, other))
 
     def _run_again(self, again: NextRun, value: str) -> None:
         """Start this run with one more option, and show it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable
-from importlib import import_module
+from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,6 @@ _LOOK = "Look at it"
 _STOP = "Stop"
 _CLIP = ("colon.mp4", "camera.yaml")
 _MOST_RUNS = 6
-_BACKENDS = "scopemap.apps.browser"
 
 
 class StartPage:
@@ -43,6 +42,7 @@ class StartPage:
     def open(self, window: BrowserWindow) -> None:
         """Make the elements."""
         self._window, gui = window, window.gui
+        window.first_page = partial(StartPage, self._workspace)
         window.names.hide_folder(self._workspace.folder)
         self._receiver = self._workspace.receiver(window.server)
         # What came before this page was opened is in the list.
@@ -188,12 +188,14 @@ class StartPage:
         self._choose(self._workspace.inside(name))
 
     def _choose(self, source: Path) -> None:
-        self._window.show(InputPage(self._workspace, source, self.show_run, self._again))
+        self._window.show(InputPage(self._workspace, source, self.show_run, self._window.start))
 
     def _open_live(self, source: str) -> None:
         if not source:
             raise InputError("type the number of a camera, /dev/video0, or an address such as rtsp://...")
-        import_module(f"{_BACKENDS}.live_page").open_live(self._window, self._workspace, source)
+        from scopemap.apps.browser.live_page import open_live
+
+        open_live(self._window, self._workspace, source)
 
     def _show_result(self, results: dict[str, Path], label: str) -> None:
         if label in results:
@@ -203,11 +205,9 @@ class StartPage:
         if first == second:
             raise InputError("choose two results to compare")
         if first in results and second in results:
-            page = import_module(f"{_BACKENDS}.compare_page").ComparePage
-            self._window.show(page(results[first], results[second], self._workspace))
+            from scopemap.apps.browser.compare_page import ComparePage
 
-    def _again(self) -> None:
-        self._window.show(StartPage(self._workspace))
+            self._window.show(ComparePage(results[first], results[second]))
 
     def show_run(self, run: BrowserRun) -> None:
         """Show a run while it goes on, or its result."""
@@ -221,4 +221,4 @@ class StartPage:
             return
         title = window.names.of(run.source, "video")
         waiting = lambda: workspace.runs.place(run)  # noqa: E731
-        window.show(RunPage(run, view_folder(run.out), title, finished, self._again, waiting))
+        window.show(RunPage(run, view_folder(run.out), title, finished, self._window.start, waiting))

@@ -55,6 +55,8 @@ class BrowserWindow:
         self._calls: queue.Queue[Callable[[], None]] = queue.Queue()
         self._worker = ThreadPoolExecutor(1, "job")
         self._page: Page | None = None
+        self.first_page: Callable[[], Page] | None = None
+        """Makes the page that `start` leads to; None: there is none."""
         self._ticking: list[Callable[[], None]] = []
         self._ended = False
         self.gui.set_panel_label("scopemap")
@@ -76,6 +78,11 @@ class BrowserWindow:
         """Show a page in place of the one before, next."""
         # Not now: the elements that go may be those whose call this is.
         self._calls.put(lambda: self._show(page))
+
+    def start(self) -> None:
+        """Show the first page, where there is one."""
+        if self.first_page is not None:
+            self.show(self.first_page())
 
     def on(self, handle: Any, call: Callable[..., None], *arguments: Any) -> Any:
         """Call in the window's thread where a button is pressed or an input changed; return the handle.

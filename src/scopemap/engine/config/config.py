@@ -68,15 +68,23 @@ class Config(Settings):
 
     @classmethod
     def load(
-        cls, preset: Preset | None = None, file: Path | None = None, settings: dict[str, Any] | None = None
+        cls,
+        preset: Preset | None = None,
+        file: Path | None = None,
+        settings: dict[str, Any] | None = None,
+        unknown: list[str] | None = None,
     ) -> Config:
         """Return the defaults, changed by a preset, then a TOML file, then dotted single settings.
 
         `settings` maps names such as "fusion.every" to values or to their text. The preset is the one that they
-        name, else `preset`, else the one that the file names. Raises `SettingsError`.
+        name, else `preset`, else the one that the file names. `unknown` takes the names in the file that are none of a
+        setting, and these are ignored. Raises `SettingsError`.
         """
         settings = settings or {}
         in_file = {} if file is None else _read_toml(file)
+        if unknown is not None:
+            unknown += sorted(in_file.keys() - set(setting_names()))
+            in_file = {name: value for name, value in in_file.items() if name not in unknown}
         chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
         if chosen not in PRESETS:
             raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
@@ -14,8 +14,8 @@ class DepthSettings(StageSettings):
 
     METHODS: ClassVar[Methods] = {
         "scopemap": {},
-        "paper": {"fit_shift": False},
-        "no-disparity-floor": {"disparity_floor": 0.0},
+        "paper": {"fit": "pseudo-stereo"},
+        "no-disparity-floor": {"fit": "pseudo-stereo-all"},
         "network-focal": {"depth_pro_focal": "network"},
         "realtime": {"network_every": 2},
     }
@@ -49,13 +49,10 @@ class DepthSettings(StageSettings):
         300.0, gt=0, description="predicted depth beyond this is unknown, unless near-far names a farther one, mm"
     )
 
-    fit_shift: bool = advanced(
-        True, "fit scale and shift to the anchor; false: the pseudo-stereo baseline (the paper)", "by hand"
-    )
-    disparity_floor: Annotated[float, Field(ge=0, lt=1)] = advanced(
-        0.1,
-        "pixels below this share of the largest disparity (the far end) are left out of the fit of the pseudo-stereo "
-        "baseline; 0: only those without disparity (the paper)",
+    fit: Literal["scale-and-shift", "pseudo-stereo", "pseudo-stereo-all"] = advanced(
+        "scale-and-shift",
+        "what is fitted to the anchor, pseudo-stereo: the baseline of the paper, without pixels below a tenth of the "
+        "largest disparity (the far end); pseudo-stereo-all: with all that have a disparity (the paper)",
         "by hand",
     )
     depth_pro_focal: Literal["camera", "network"] = advanced(
@@ -85,9 +82,7 @@ class MapisSettings(StageSettings):
             "frame_scale": "none",
             "order": "refine-first",
             "blend": "linear",
-            "recursive": False,
-            "compare_warped": False,
-            "perceptual_score": True,
+            "previous": "raw",
         },
         "no-flow-check": {"consistency_px": 0.0},
     }
@@ -100,10 +95,9 @@ class MapisSettings(StageSettings):
         "by hand: a network's scale changes from frame to frame",
     )
     filter_sigma_px: NonNegativeFloat = advanced(
-        2.0, "sigma_d of the bilateral filter; 0: off", "plausible, not searched; the paper gives none"
-    )
-    filter_sigma_mm: PositiveFloat = advanced(
-        2.0, "sigma_r of the bilateral filter", "plausible, not searched; the paper gives none"
+        2.0,
+        "sigma_d of the bilateral filter, whose sigma_r is 2 mm; 0: off",
+        "plausible, not searched; the paper gives none",
     )
     consistency_px: NonNegativeFloat = advanced(
         1.0, "largest forward-backward error of flow; 0: not checked (the paper)", "by hand"
@@ -120,11 +114,12 @@ class MapisSettings(StageSettings):
         "constant: 0.5; paper-equation: S; auto: linear for predicted depth, none for measured",
         "linear: the paper's section MAPIS-Depth, by its text; better than exponential wherever it was tried",
     )
-    recursive: bool = advanced(True, "warp the refined previous depth; false: the raw one (the paper)", "by hand")
-    compare_warped: bool = advanced(
-        True, "perceptual distance to the warped previous image; false: to the image as it is (the paper)", "by hand"
+    previous: Literal["refined", "raw"] = advanced(
+        "refined",
+        "what a frame is blended with, refined: the refined previous depth, by a map of the perceptual distance to the "
+        "warped previous image; raw: the raw one, by one distance to the previous image as it is (the paper)",
+        "by hand",
     )
-    perceptual_score: bool = advanced(False, "one perceptual score per pair instead of a map (the paper)", "by hand")
 
 
 class NetworkSettings(Settings):

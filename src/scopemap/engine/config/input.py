@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal, cast, get_args
 
 from pydantic import BeforeValidator, Field
 
-from scopemap.engine.config.settings import Methods, Settings, StageSettings, advanced
+from scopemap.engine.config.settings import Methods, Settings, StageSettings
 
 Box = tuple[
     Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]
@@ -101,13 +101,16 @@ class MaskSettings(StageSettings):
 
     METHODS: ClassVar[Methods] = {
         "scopemap": {},
-        "no-overlays": {"overlays": False},
-        "no-field-of-view": {"field_of_view": False},
-        "no-highlights": {"highlights": False},
-        "no-exposure": {"exposure": False},
+        "no-overlays": {},
+        "no-field-of-view": {},
+        "no-highlights": {},
+        "no-exposure": {},
     }
     method: str = Field(
-        "scopemap", description="what is found in the picture itself and masked; chooses advanced settings"
+        "scopemap",
+        description="scopemap: what lies outside of the circular or octagonal field of view, specular highlights, "
+        "burned-in text and logos (overlays), and pixels of bad exposure are found in the picture itself and masked; "
+        "no-field-of-view, no-highlights, no-overlays, no-exposure: without one of these",
     )
     files: str = Field(
         "",
@@ -120,12 +123,3 @@ class MaskSettings(StageSettings):
         "without one the depth network, where it can (scopenet), which misses some and takes pale tissue for others; "
         "off: nobody, masks from files are not read either",
     )
-
-    field_of_view: bool = advanced(
-        True, "find the circular or octagonal field of view and black borders", "by hand; the paper has none"
-    )
-    highlights: bool = advanced(True, "find specular highlights and mask them", "by hand; the paper has none")
-    overlays: bool = advanced(
-        True, "find burned-in text and logos, which stay while the rest moves", "by hand; the paper has none"
-    )
-    exposure: bool = advanced(True, "mask under-exposed and over-exposed pixels", "by hand; the paper has none")

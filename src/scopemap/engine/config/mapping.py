@@ -74,11 +74,17 @@ class FusionSettings(StageSettings):
 
     METHODS: ClassVar[Methods] = {
         "scopemap": {},
-        "no-free-space": {"free_space": False},
-        "unweighted": {"weighted": False},
+        "no-free-space": {},
+        "unweighted": {},
         "all-components": {"min_component_share": 0.0},
     }
-    method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, no-free-space, ...")
+    method: str = Field(
+        "scopemap",
+        description="scopemap: frames are weighted by quality, pixels by incidence, distance and uncertainty, voxels "
+        "behind a surface less, grazing pixels and voxels of little weight are left out, truncation is farther where "
+        "depth is larger, and what other frames look through is left out where frames are fused after the last one; "
+        "unweighted: without the weights and all that; no-free-space: with what others look through; all-components",
+    )
     enabled: bool = Field(True, description="false: no mesh")
     voxel_mm: float | None = Field(
         None, ge=0.01, le=1000, description="voxel size, mm; default: 1/60 of the clip's median depth"
@@ -105,15 +111,16 @@ class FusionSettings(StageSettings):
     mesh_smooth: int = Field(0, ge=0, description="iterations of Taubin's filter on the mesh; 0: none")
     mesh_faces: int | None = Field(None, ge=4, description="simplify the mesh to about so many faces; default: not")
 
-    weighted: bool = advanced(
-        True,
-        "weight frames by quality, pixels by incidence, distance and uncertainty, voxels behind a surface less; leave "
-        "out grazing pixels and voxels of little weight; truncate farther where depth is larger; false: none of these",
-        "Curless and Levoy 1996, and by hand",
-    )
     min_component_share: Share = advanced(
         0.02, "components with less than this share of the faces are removed", "by hand"
     )
-    free_space: bool = advanced(
-        True, "leave out what other frames look through, where frames are fused after the last one", "by hand"
-    )
+
+    @property
+    def weighted(self) -> bool:
+        """Whether frames, pixels and voxels have weights (Curless and Levoy 1996)."""
+        return not self.has("unweighted")
+
+    @property
+    def free_space(self) -> bool:
+        """Whether what other frames look through is left out, where frames are fused after the last one."""
+        return not self.has("no-free-space")

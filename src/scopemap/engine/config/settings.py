@@ -28,11 +28,16 @@ class Settings(BaseModel):
 class StageSettings(Settings):
     """Settings of a stage, whose `method` chooses its advanced ones where these are not given themselves.
 
-    A method is one entry of METHODS, or several joined by "+", of which later ones win: "paper+least-squares".
+    A method is one entry of METHODS, or several joined by "+", of which later ones win: "paper+least-squares". One that
+    changes no advanced setting is asked for by `has`, where the stage leaves a part out.
     """
 
     METHODS: ClassVar[Methods] = {}
     method: str
+
+    def has(self, method: str) -> bool:
+        """Return whether a method is the stage's, or one of those that are joined."""
+        return method in self.method.split("+")
 
     @model_validator(mode="before")
     @classmethod

@@ -2,15 +2,41 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from scopemap.engine.config.settings import Methods, Share, StageSettings, advanced
 
 # The clips on which the tracker was chosen, with their truth (BENCHMARK.md).
 _CHOSEN = "chosen on cecum_t1_a (C3VD) and four phantoms"
+
+
+@dataclass(frozen=True)
+class Photometry:
+    """What photometric alignment compares, and where it starts.
+
+    normalised : also grey values minus local mean over local deviation. lamp_gamma : grey = (cosine /
+    distance^2)^gamma; 0: off. gain_bias : estimate gain and bias of each frame pair. depth_weight : weight of the
+    point-to-plane distance to the frame's measured depth; 0: off. from_previous : the first guess is the previous
+    frame's pose, else the keyframe's.
+    """
+
+    normalised: bool
+    lamp_gamma: float
+    gain_bias: bool
+    depth_weight: float
+    from_previous: bool
+
+
+PHOTOMETRIES = {
+    # The channels, gain and bias were chosen on cecum_t1_a (C3VD) and four phantoms; gamma on four phantoms over 0.45,
+    # which sRGB alone would give. The rest is by hand.
+    "scopemap": Photometry(True, 0.35, True, 1.0, True),
+    # arXiv 2508.11282, section WEMA-RTDL: grey values alone, from the keyframe's pose.
+    "paper": Photometry(False, 0.0, False, 0.0, False),
+}
 
 
 class TrackingSettings(StageSettings):
@@ -19,21 +45,17 @@ class TrackingSettings(StageSettings):
     METHODS: ClassVar[Methods] = {
         "scopemap": {},
         "paper": {
-            "picture_checks": False,
+            "checks": "poses",
             "relocalisation_keyframes": 0,
             "new_map_after": 0,
             "corner_depth_sigma": 0.0,
             "min_keyframe_agreement": 0.0,
             "keyframes_wait": False,
             "finest_level": 0,
-            "depth_weight": 0.0,
-            "start": "identity",
-            "channels": "grey",
-            "lamp_gamma": 0.0,
-            "gain_bias": False,
+            "photometric": "paper",
         },
         "least-squares": {"huber": 1e6},
-        "no-pose-checks": {"min_valid_share": 0.001, "pose_checks": False},
+        "no-pose-checks": {"min_valid_share": 0.001, "checks": "none"},
         "realtime": {"fast": True},
     }
     method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, realtime, paper, ...")
@@ -47,15 +69,11 @@ class TrackingSettings(StageSettings):
     )
 
     min_valid_share: Share = advanced(0.1, "a frame with a smaller usable overlap with its keyframe is lost", "by hand")
-    picture_checks: bool = advanced(
-        True,
-        "a frame with little texture, an unsharp one, and one unlike its keyframe (correlation) is lost; false: not",
+    checks: Literal["all", "poses", "none"] = advanced(
+        "all",
+        "which frames are lost, poses: those that few pixels fit, or whose pose is a jump; all: also those with little "
+        "texture, unsharp ones, and those unlike their keyframe (correlation); none: neither",
         "by hand; the paper has none",
-    )
-    pose_checks: bool = advanced(
-        True,
-        "a frame that few pixels fit, or whose pose is a jump, is lost; false: not checked, and texture neither",
-        "by hand",
     )
     relocalisation_keyframes: NonNegativeInt = advanced(
         10, "recent keyframes in which a lost camera is relocalised; 0: off", "by hand"
@@ -88,9 +106,6 @@ class TrackingSettings(StageSettings):
     huber: PositiveFloat = advanced(
         1.0, "threshold of Huber's loss (1964), in robust standard deviations (MAD)", _CHOSEN
     )
-    depth_weight: NonNegativeFloat = advanced(
-        1.0, "weight of the point-to-plane distance to the frame's measured depth; 0: off", "by hand"
-    )
     solver: Literal["dogleg", "gauss-newton"] = advanced(
         "dogleg", "minimiser of the photometric error", "the paper's section WEMA-RTDL, subsection Optimisation"
     )
@@ -99,18 +114,27 @@ class TrackingSettings(StageSettings):
         "SO(3) only at the coarsest level",
         "the paper, Rotation-Translation Decoupling",
     )
-    start: Literal["identity", "previous"] = advanced(
-        "previous", "first guess: the keyframe's pose, or the previous frame's", "by hand"
+    photometric: Literal["scopemap", "paper"] = advanced(
+        "scopemap",
+        "what photometric alignment compares, paper: grey values, from the keyframe's pose on; scopemap: also locally "
+        "normalised values, with the lamp's fall-off, gain and bias, and measured depth, from the previous pose on",
+        _CHOSEN,
     )
-    channels: Literal["grey", "both"] = advanced(
-        "both", "both: also grey values minus local mean over local deviation", _CHOSEN
-    )
-    lamp_gamma: NonNegativeFloat = advanced(
-        0.35,
-        "grey = (cosine / distance^2)^gamma; 0: off",
-        "chosen on four phantoms over 0.45, which sRGB alone would give",
-    )
-    gain_bias: bool = advanced(True, "estimate gain and bias of each frame pair", _CHOSEN)
+
+    @property
+    def photometry(self) -> Photometry:
+        """What photometric alignment compares, and where it starts."""
+        return PHOTOMETRIES[self.photometric]
+
+    @property
+    def picture_checks(self) -> bool:
+        """Whether a frame with little texture, an unsharp one, and one unlike its keyframe is lost."""
+        return self.checks == "all"
+
+    @property
+    def pose_checks(self) -> bool:
+        """Whether a frame that few pixels fit, or whose pose is a jump, is lost."""
+        return self.checks != "none"
 
 
 class SmoothingSettings(StageSettings):
@@ -119,17 +143,4 @@ class SmoothingSettings(StageSettings):
     METHODS: ClassVar[Methods] = {"none": {}, "wema": {}}
     method: str = Field("none", description="wema: smooth poses")
 
-    alpha: Share = advanced(0.6, "weight of pose i", "plausible, not searched; the paper gives none")
-    beta: Share = advanced(0.3, "weight of pose i-1", "plausible, not searched; the paper gives none")
-    gamma: Share = advanced(0.1, "weight of pose i-2", "plausible, not searched; the paper gives none")
-    omega: PositiveFloat = advanced(
-        0.1, "s = 1 - exp(-i omega); frames count from 0", "plausible, not searched; the paper gives none"
-    )
     dynamic: bool = advanced(True, "false: s = 1 (the paper's ablation without DyEMA)", "the paper's section WEMA")
-
-    @model_validator(mode="after")
-    def _weights_sum_to_one(self) -> SmoothingSettings:
-        total = self.alpha + self.beta + self.gamma
-        if not math.isclose(total, 1.0, abs_tol=1e-6):
-            raise ValueError(f"alpha + beta + gamma must be 1, their sum is {total:g}")
-        return self

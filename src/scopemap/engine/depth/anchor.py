@@ -22,6 +22,7 @@ _MIN_SHARE = 0.02  # by hand
 _MIN_SHARE_NOTED = 0.005  # by hand: a smaller share beyond the largest depth is not mentioned
 _MAX_SHARE_BEYOND = 0.5  # by hand: of the depth that may be beyond the limit without a note
 _FACTOR_MM = 1000.0  # `depth.factor` divides it, as in table 3 of the paper
+_DISPARITY_FLOOR = 0.1  # by hand: share of the largest disparity, below which the far end would determine a baseline
 # Longest side of most images that scopenet was trained on: at twice the size it needs four times as long, and surfaces
 # are less consistent.
 _SCOPENET_PX = 160
@@ -136,7 +137,7 @@ class AnchoredDepth:
             focal_px = reference.focal_px or frame.camera.fx
             self.conversion = self._fitted(estimate.kind, estimate.values[known], reference.values[known], focal_px)
             # In the paper's form frame 1 keeps the metric network's depth; D = f B / d begins at frame 2.
-            first_mm = None if self._settings.fit_shift else reference.values
+            first_mm = None if self._settings.fit == "scale-and-shift" else reference.values
         self.just_fitted = True
         self.description = self._describe(source, estimate, frame) + details
         network = (
@@ -180,9 +181,10 @@ class AnchoredDepth:
         """Return the conversion of estimated values (N,) to their metric depth (N,), mm."""
         if kind == "depth":
             return DepthScale(float(np.exp(np.median(np.log(depth_mm / values)))))
-        if self._settings.fit_shift:
+        if self._settings.fit == "scale-and-shift":
             return fit_affine_disparity(depth_mm, values, max_depth_mm(self._settings))
-        baseline_mm = fit_baseline_lbfgsb(depth_mm, values, focal_px, self._settings.disparity_floor)
+        floor_share = 0.0 if self._settings.fit == "pseudo-stereo-all" else _DISPARITY_FLOOR
+        baseline_mm = fit_baseline_lbfgsb(depth_mm, values, focal_px, floor_share)
         return AffineDisparity.from_baseline(baseline_mm, focal_px)
 
     def _describe(self, source: str, estimate: DepthEstimate, frame: Frame) -> str:

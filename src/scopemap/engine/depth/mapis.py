@@ -29,6 +29,7 @@ _MIN_OVERLAP = 0.2
 _SCALE_PULL = 0.1  # by hand
 _SIGMA_FADING = 0.3  # by hand: growth of the warped depth's variance per frame, share of its gap to the frame's
 _TAU = 0.15  # plausible, not searched; the paper gives none: distance at which an exponential weight is 1/e
+FILTER_SIGMA_MM = 2.0  # plausible, not searched; the paper gives none: sigma_r of the bilateral filter
 _CONSTANT_WEIGHT = 0.5  # by hand, for the ablation without LPIPS
 
 
@@ -64,11 +65,13 @@ class DenseMatcher:
         flow = pair_flow(self._flow, rgb_previous, rgb, self._settings.consistency_px)
         # Masked pixels of either image show no tissue.
         seen = pull(valid_previous.astype(np.float32), flow.to_previous) > 0.5
-        compared = pull(rgb_previous, flow.to_previous) if self._settings.compare_warped else rgb_previous
-        distance = self._perceptual.compare(compared, rgb)
-        values = np.full_like(distance.map, distance.score) if self._settings.perceptual_score else distance.map
+        if self._settings.previous == "raw":
+            score = self._perceptual.compare(rgb_previous, rgb)
+            distance = np.full_like(score.map, score.score)
+        else:
+            distance = self._perceptual.compare(pull(rgb_previous, flow.to_previous), rgb).map
         consistent = flow.consistent & seen & valid
-        return DenseCorrespondence(flow.to_previous, consistent, values, float(valid.mean()))
+        return DenseCorrespondence(flow.to_previous, consistent, distance, float(valid.mean()))
 
     def reset(self) -> None:
         """Let the next image have no previous one."""
@@ -138,9 +141,8 @@ class Mapis:
             weight = by_variance(weight, warped_sigma, sigma)
             depth_mm = np.where(weight > 0, weight * warped_mm + (1 - weight) * scaled_mm, scaled_mm)
             refined_sigma = blended_sigma(weight, warped_sigma, sigma)
-        self._propagated = (
-            _Propagated(depth_mm, refined_sigma) if self.settings.recursive else _Propagated(scaled_mm, sigma)
-        )
+        is_raw = self.settings.previous == "raw"
+        self._propagated = _Propagated(scaled_mm, sigma) if is_raw else _Propagated(depth_mm, refined_sigma)
         return RefinedDepth(depth_mm, self._scale, overlap, refined_sigma * depth_mm)
 
     def needs_previous(self, kind: DepthKind) -> bool:
@@ -183,7 +185,7 @@ class Mapis:
         warped_mm = np.where(correspondence.consistent, warped_mm, np.float32(np.nan))
         if T_current_previous is not None:
             warped_mm = moved_depth(warped_mm, correspondence.to_previous, camera, T_current_previous)
-        filtered_mm = bilateral_filtered(warped_mm, self.settings.filter_sigma_px, self.settings.filter_sigma_mm)
+        filtered_mm = bilateral_filtered(warped_mm, self.settings.filter_sigma_px, FILTER_SIGMA_MM)
         warped_sigma = pull(self._propagated.relative_sigma, correspondence.to_previous)
         return _Propagated(filtered_mm, faded_sigma(warped_sigma, sigma, _SIGMA_FADING))
 

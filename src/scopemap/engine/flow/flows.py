@@ -3,7 +3,6 @@
 from scopemap.engine.errors import SettingsError
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.flow.estimator import FlowEstimator, NoFlow
-from scopemap.engine.flow.raft import RaftFlow
 
 FLOWS = ("dis", "raft-small", "raft-large", "none")
 
@@ -11,10 +10,10 @@ FLOWS = ("dis", "raft-small", "raft-large", "none")
 def create_flow(name: str, device: str = "auto") -> FlowEstimator:
     """Return the estimator `name` (one of `FLOWS`); raises `SettingsError`, `WeightsError` without RAFT's weights."""
     match name:
-        case "raft-small":
-            return RaftFlow("small", device=device)
-        case "raft-large":
-            return RaftFlow("large", device=device)
+        case "raft-small" | "raft-large":
+            from scopemap.engine.flow.raft import RaftFlow
+
+            return RaftFlow("small" if name == "raft-small" else "large", device=device)
         case "dis":
             return DisFlow()
         case "none":

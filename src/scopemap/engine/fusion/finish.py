@@ -10,7 +10,6 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from scopemap.engine.config import FusionSettings
-from scopemap.engine.fusion.watertight import watertight
 from scopemap.engine.geometry.rendering import vertex_colours
 
 # Taubin, SIGGRAPH 1995: steps that shrink and steps that grow, 1 / 0.5 - 1 / 0.52 = 0.08, hardly change the volume.
@@ -27,6 +26,8 @@ def finished(mesh: trimesh.Trimesh, settings: FusionSettings) -> trimesh.Trimesh
     if settings.holes == "small" and settings.voxel_mm is not None:
         mesh = without_small_holes(mesh, _LARGEST_PERIMETER_VOXELS * settings.voxel_mm)
     elif settings.holes == "watertight" and settings.voxel_mm is not None:
+        from scopemap.engine.fusion.watertight import watertight
+
         mesh = watertight(mesh, settings.voxel_mm)
     mesh = smoothed(mesh, settings.mesh_smooth)
     return mesh if settings.mesh_faces is None else simplified(mesh, settings.mesh_faces)

@@ -102,7 +102,7 @@ class Masker:
     def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
         self._field = FieldOfView()
-        self._overlays = OverlayFinder() if settings.overlays else None
+        self._overlays = None if settings.has("no-overlays") else OverlayFinder()
 
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with `valid` False also outside the field of view, at highlights, overlays, bad exposure.
@@ -113,10 +113,10 @@ class Masker:
         darkest, middle = darker_channels(frame.rgb)
         clipped = middle >= BRIGHT_LEVEL
         lit = is_lit(frame.rgb)
-        valid = frame.valid & lit & ~clipped if self.settings.exposure else frame.valid
-        field = self._field(lit, frame.valid) if self.settings.field_of_view else frame.valid
+        valid = frame.valid if self.settings.has("no-exposure") else frame.valid & lit & ~clipped
+        field = frame.valid if self.settings.has("no-field-of-view") else self._field(lit, frame.valid)
         highlights = np.zeros_like(valid)
-        if self.settings.highlights:
+        if not self.settings.has("no-highlights"):
             bright = clipped | specular(darkest, field)
             highlights = frame.valid & field & (cv2.dilate(bright.astype(np.uint8), disc(_HIGHLIGHT_GROW_PX)) > 0)
             valid &= ~highlights

@@ -128,7 +128,7 @@ class KeyframeAligner:
             return by_corners, None
         pyramid, predicted = self.pyramid(keyframe, frame), self._motion.predictions()
         starts = [inverse(T) @ keyframe.T_world_camera for T in predicted]
-        if self._settings.start == "identity" and len(starts) == 1:
+        if not self._settings.photometry.from_previous and len(starts) == 1:
             starts = [np.eye(4)]
         searched = self.has_corners(keyframe) and self._settings.relocalisation_keyframes > 0
         found = []
@@ -183,7 +183,7 @@ class KeyframeAligner:
         if settings.pose_checks and alignment.inlier_share < _MIN_INLIER_SHARE and not alignment.is_supported:
             return TrackingLoss(LossCause.VIEW_CHANGED, f"inlier share {alignment.inlier_share:.0%} with the keyframe")
         # Measured depth constrains a pose by shape alone.
-        by_shape, least = keyframe.measured and settings.depth_weight > 0, least_correlation(settings)
+        by_shape, least = keyframe.measured and settings.photometry.depth_weight > 0, least_correlation(settings)
         if alignment.correlation < least and not by_shape:
             if alignment.texture < MIN_TEXTURE:
                 return TrackingLoss(LossCause.NO_TEXTURE, "weakly constrained, too little texture")

@@ -106,7 +106,7 @@ def least_correlation(settings: TrackingSettings) -> float:
 
 def _correlation(reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings) -> float:
     """Return the correlation at the finest of these levels; infinite where measured depth takes part."""
-    by_shape = settings.depth_weight > 0 and np.isfinite(current[0].depth_mm).any()
+    by_shape = settings.photometry.depth_weight > 0 and np.isfinite(current[0].depth_mm).any()
     return math.inf if by_shape else judge(reference, current, motion).correlation
 
 
@@ -124,8 +124,8 @@ def judge(reference: list[View], current: list[View], motion: Motion, iterations
 
 
 def _loss(sigma: np.ndarray, settings: TrackingSettings) -> Loss:
-    share = (1.0, 0.0) if settings.channels == "grey" else (_GREY_SHARE, 1.0)
-    return Loss(sigma, settings.huber, np.array(share), _LIT, settings.lamp_gamma)
+    share = (_GREY_SHARE, 1.0) if settings.photometry.normalised else (1.0, 0.0)
+    return Loss(sigma, settings.huber, np.array(share), _LIT, settings.photometry.lamp_gamma)
 
 
 def _align_level(
@@ -134,16 +134,16 @@ def _align_level(
     loss = _loss(np.ones(len(reference.channels)), settings)
     start = residual_images(reference, current, motion.T_current_reference, motion.affine, loss)
     loss = _loss(np.array([robust_sigma(r[np.isfinite(r)], _MIN_SIGMA) for r in start]), settings)
-    if settings.depth_weight > 0 and np.isfinite(current.depth_mm).any():
+    photometry = settings.photometry
+    if photometry.depth_weight > 0 and np.isfinite(current.depth_mm).any():
         gaps = depth_residuals(reference, current, motion.T_current_reference, unit_mm)
         gaps = gaps[np.isfinite(gaps)]
         if gaps.size:
             sigma = robust_sigma(gaps, _MIN_DEPTH_SIGMA)
-            loss = loss._replace(depth_sigma=sigma, depth_share=settings.depth_weight)
+            loss = loss._replace(depth_sigma=sigma, depth_share=photometry.depth_weight)
     min_weight = 0.5 * float(reference.weight[np.isfinite(start[0])].sum())
-    free = np.array(
-        [0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if settings.gain_bias and loss.share[0] > 0 else [])
-    )
+    with_gain = photometry.gain_bias and loss.share[0] > 0
+    free = np.array([0, 1, 2] + ([] if rotation_only else [3, 4, 5]) + ([6, 7] if with_gain else []))
 
     def linearise(state: Motion) -> DenseModel:
         equations = normal_equations(reference, current, *state, loss, unit_mm)

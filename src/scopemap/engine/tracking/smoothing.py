@@ -13,6 +13,9 @@ from scopemap.engine.config import SmoothingSettings
 from scopemap.engine.geometry.se3 import mean_near
 from scopemap.engine.kept import Kept
 
+WEIGHTS = (0.6, 0.3, 0.1)  # plausible, not searched; the paper gives none: alpha, beta and gamma
+OMEGA = 0.1  # plausible, not searched; the paper gives none: frames count from 0
+
 
 class Wema:
     """Weighted exponential moving average of three poses (equation 13); no effect where `settings.method` is "none"."""
@@ -29,8 +32,8 @@ class Wema:
         settings, past = self.settings, self._past
         smoothed = T_world_camera
         if len(past) == 2 and settings.method != "none":
-            s = 1.0 - np.exp(-self._count * settings.omega) if settings.dynamic else 1.0
-            weights = [s * settings.alpha, s * settings.beta, s * settings.gamma]
+            s = 1.0 - np.exp(-self._count * OMEGA) if settings.dynamic else 1.0
+            weights = [s * weight for weight in WEIGHTS]
             # What is left, 1 - s, is the newest pose's too: it is the base of the tangent space.
             smoothed = mean_near(T_world_camera, [T_world_camera, past[1], past[0]], weights)
         self._past = [*past, T_world_camera][-2:]

@@ -52,7 +52,7 @@ class TextureMonitor:
 
     def too_little(self, frame: Frame) -> TrackingLoss | None:
         """Return that this frame and those before it have too little texture; None: it is worth trying."""
-        is_checked = self._settings.picture_checks and self._settings.pose_checks
+        is_checked = self._settings.picture_checks
         found = texture(frame, self._settings) if is_checked else math.inf
         self._low_texture = self._low_texture + 1 if found < MIN_TEXTURE else 0
         if self._low_texture <= _MOST_LOW_TEXTURE:

@@ -24,7 +24,7 @@ from scopemap.engine.notices import Notice
 from scopemap.input.focal_length.trial import LensTrial, try_lenses
 from scopemap.input.focal_length.window_adjustment import Scene, WindowSolution, adjusted, at_rest
 from scopemap.input.focal_length.windows import MAX_FRAMES, Window, frames_of_windows, window_of
-from scopemap.input.scopes import ANY_LENS, KINDS, SCOPES
+from scopemap.input.scopes import ANY_LENS, FOV_RANGE_DEG, KINDS, SCOPES
 from scopemap.input.sequence import Sequence
 
 _LOG_DEPTH_SIGMA = 1.0
@@ -93,9 +93,6 @@ def _log_focal_deviation(scene: Scene, found: WindowSolution) -> float:
     filled = len(np.unique(number))
     return float(np.sqrt((influences**2).sum() * filled / max(filled - 1, 1)))
 
-
-FOV_RANGE_DEG = (30.0, 150.0)
-"""Horizontal fields of view that endoscopes have."""
 
 MAX_SHARE = 0.05
 """Standard deviation over the focal length above which an estimate from motion is not taken: two are 10 %."""
