@@ -65,8 +65,9 @@ def _follow(tracker: FrameTracker, frames: list[Frame]) -> Iterator[Track]:
     """What the pipeline does with a tracker and frames whose depth stays as it is."""
     for frame in frames:
         track = tracker.track(frame)
-        if track.status != "lost" and tracker.needs_keyframe():
-            assert tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+        if track.decision.kind != "none":
+            tracked = replace(frame, T_world_camera=track.T_world_camera)
+            assert tracker.update(tracked, track.decision, measured=True)
         yield track
 
 
@@ -130,15 +131,16 @@ def test_frames_that_show_nothing_are_lost_and_the_next_one_is_not(method: str) 
 def test_the_reference_has_the_depth_that_was_adopted_last() -> None:
     """Refined depth, where there is any, replaces the raw depth that the frame was tracked with."""
     tracker = Open3dTracker(CLOUDS[1])
-    assert tracker.track(_bowl(0)).status == "initial"
+    first = tracker.track(_bowl(0))
+    assert first.status == "initial"
     refined = replace(_bowl(0, further_mm=1.0), T_world_camera=np.eye(4))
-    assert tracker.insert_keyframe(refined, measured=False)
+    assert tracker.update(refined, first.decision, measured=False)
     np.testing.assert_allclose(tracker.track(_bowl(1, further_mm=1.0)).T_world_camera, np.eye(4), atol=1e-9)
-    assert not tracker.insert_keyframe(
-        replace(refined, depth_mm=np.full_like(refined.depth_mm, np.nan)), measured=False
+    assert not tracker.update(
+        replace(refined, depth_mm=np.full_like(refined.depth_mm, np.nan)), first.decision, measured=False
     )
     with pytest.raises(ValueError, match="needs a pose"):
-        tracker.insert_keyframe(_bowl(2), measured=False)
+        tracker.update(_bowl(2), first.decision, measured=False)
     with pytest.raises(ValueError, match="frames with depth"):
         tracker.track(replace(_bowl(2), depth_mm=None))
 

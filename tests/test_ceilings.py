@@ -44,7 +44,8 @@ CEILINGS = {
         145,
     ),
     "classes of the engine": (_engine_classes, 198),
-    "lines of pipeline.py": (lambda: len((ENGINE / "pipeline.py").read_text().splitlines()), 106),
+    # 192: what follows after the last frame, too.
+    "lines of pipeline.py": (lambda: len((ENGINE / "pipeline.py").read_text().splitlines()), 192),
 }
 
 

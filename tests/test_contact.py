@@ -120,8 +120,8 @@ def _tracked(frames: list[Frame], **changes: object) -> list[Track]:
     for frame in frames:
         track = tracker.track(frame)
         tracks.append(track)
-        if track.status != "lost" and tracker.needs_keyframe():
-            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=False)
+        if track.decision.kind != "none":
+            tracker.update(replace(frame, T_world_camera=track.T_world_camera), track.decision, measured=False)
     return tracks
 
 

@@ -12,6 +12,7 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.engine.tracking.residuals import Loss, View, depth_residuals, normal_equations
+from scopemap.engine.tracking.track import KeyframeDecision
 from scopemap.engine.tracking.tracker import Tracker
 
 CAMERA = PinholeCamera(70.0, 72.0, 39.2, 31.4, 80, 64)
@@ -97,7 +98,7 @@ def _bumpy(T_world_camera: np.ndarray, index: int) -> Frame:
 def _tracked(frames: list[Frame], settings: TrackingSettings, *, measured: bool) -> list[np.ndarray]:
     tracker = Tracker(settings)
     tracker.track(frames[0])
-    tracker.insert_keyframe(replace(frames[0], T_world_camera=np.eye(4)), measured=measured)
+    tracker.update(replace(frames[0], T_world_camera=np.eye(4)), KeyframeDecision("new"), measured=measured)
     return [tracker.track(frame).T_world_camera for frame in frames[1:]]
 
 

@@ -55,7 +55,7 @@ def _lost(out: Path) -> dict[int, str]:
     ("kind", "name", "reason"),
     [
         (Masker, "__call__", "depth failed: it broke"),
-        (Tracker, "needs_keyframe", "tracking failed: it broke"),
+        (Tracker, "track", "tracking failed: it broke"),
     ],
 )
 def test_a_frame_with_which_a_stage_fails_is_lost_with_the_reason(

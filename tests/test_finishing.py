@@ -1,4 +1,4 @@
-"""The engine without the runner: the same poses, depth and surface from a bare loop and the steps of `finishing`."""
+"""The engine without the runner: the same poses, depth and surface from a bare loop and the steps of `Pipeline`."""
 
 from __future__ import annotations
 
@@ -11,35 +11,39 @@ import pytest
 from tiny_phantom import write_tiny
 
 from scopemap import Config, Result, open_sequence, reconstruct
-from scopemap.engine.finishing import SegmentFinishing, SegmentSurface, TrackedFrames
+from scopemap.engine.finishing import Execution, SegmentSurface
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.pipeline import Pipeline
 from scopemap.result.frame_table import FrameTable
 from scopemap.runner.estimators import create_estimators
+from scopemap.runner.submap_frames import tracked_frames
 
 SETTINGS = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 2}
 
 
-def _engine_alone(folder: Path, config: Config) -> tuple[SegmentSurface, list[Frame]]:
-    """The surface and the final frames of a clip that stays in one map."""
-    sequence, final = open_sequence(folder), list[Frame]()
+class _Noting(Execution):
+    """Notes the final frames."""
 
-    def noted(frames: Iterator[Frame]) -> Iterator[Frame]:
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+
+    def final(self, frames: Iterator[Frame]) -> Iterator[Frame]:
         for frame in frames:
-            final.append(frame)
+            self.frames.append(frame)
             yield frame
 
+
+def _engine_alone(folder: Path, config: Config) -> tuple[SegmentSurface, list[Frame]]:
+    """The surface and the final frames of a clip that stays in one map."""
+    sequence, execution = open_sequence(folder), _Noting()
     with closing(FrameStore()) as store:
         pipeline = Pipeline(config, create_estimators(config, sequence), store)
         table = FrameTable.of(pipeline.step(pipeline.preprocess(frame)).row for frame in sequence.frames())
-        tracked = TrackedFrames(*(table[name] for name in ("index", "time_s", "T_world_camera", "median_depth_mm")))
-        (submap,), _ = pipeline.mapper.submaps()
+        tracked = tracked_frames(table)
+        (submap,) = pipeline.adjust(tracked, execution).submaps
         (segment,) = submap.segments
-        with closing(SegmentFinishing(pipeline, submap, segment, tracked, sequence.camera)) as finishing:
-            finishing.carve()
-            fused = finishing.fuse(finishing.as_fused(noted(finishing.frames())))
-        return finishing.check(finishing.finish(fused)), final
+        return pipeline.surface(submap, segment, tracked, sequence.camera, execution), execution.frames
 
 
 def _codes(result: Result) -> list[str]:

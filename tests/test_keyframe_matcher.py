@@ -14,7 +14,7 @@ from scopemap.engine.flow.corners import KeyframeMatcher
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.flow.estimator import FlowEstimator, FlowPair, NoFlow
 from scopemap.engine.geometry.se3 import inverse
-from scopemap.engine.tracking.track import Track
+from scopemap.engine.tracking.track import KeyframeDecision, Track
 from scopemap.engine.tracking.tracker import Tracker
 
 HERE = plane_scene.pose()
@@ -92,7 +92,7 @@ class _Shifted(DisFlow):
 def _tracked(flow: FlowEstimator | None, *, measured: bool = False, **changes: object) -> Track:
     tracker = Tracker(TrackingSettings(finest_level=0, **changes), flow)
     tracker.track(plane_scene.frame(HERE, 0))
-    assert tracker.insert_keyframe(plane_scene.frame(HERE, 0), measured=measured)
+    assert tracker.update(plane_scene.frame(HERE, 0), KeyframeDecision("new"), measured=measured)
     return tracker.track(plane_scene.frame(THERE, 1))
 
 
@@ -129,10 +129,11 @@ def test_a_frame_in_which_few_corners_are_matched_becomes_a_keyframe() -> None:
     narrow[:, 64:] = False
     for valid, wanted in ((plane_scene.EVERYWHERE, False), (narrow, True)):
         tracker = Tracker(TrackingSettings(finest_level=0, min_keyframe_agreement=0.0), DisFlow())
-        tracker.track(plane_scene.frame(HERE, 0))
-        tracker.insert_keyframe(plane_scene.frame(HERE, 0), measured=False)
-        assert tracker.track(replace(plane_scene.frame(THERE, 1), valid=valid)).status == "ok"
-        assert tracker.needs_keyframe() == wanted
+        first = tracker.track(plane_scene.frame(HERE, 0))
+        tracker.update(plane_scene.frame(HERE, 0), first.decision, measured=False)
+        track = tracker.track(replace(plane_scene.frame(THERE, 1), valid=valid))
+        assert track.status == "ok"
+        assert track.decision.kind == ("new" if wanted else "none")
 
 
 def _to_and_fro(tracker: Tracker) -> list[Track]:
@@ -143,10 +144,10 @@ def _to_and_fro(tracker: Tracker) -> list[Track]:
         frame = plane_scene.frame(plane_scene.pose(at_mm=(2.0 * way, 0.3 * way, 0.0)), index)
         track = tracker.track(replace(frame, T_world_camera=None))
         assert track.status != "lost", track.reason
-        if tracker.needs_keyframe():
+        if track.decision.kind != "none":
             wrong_mm = frame.depth_mm * np.float32(1.03**keyframes)
             keyframe = replace(frame, depth_mm=wrong_mm, T_world_camera=track.T_world_camera)
-            assert tracker.insert_keyframe(keyframe, measured=False)
+            assert tracker.update(keyframe, track.decision, measured=False)
             keyframes += 1
         tracks.append(track)
     return tracks
@@ -156,6 +157,9 @@ def test_a_camera_that_comes_back_is_tracked_against_the_keyframes_it_passed(mon
     settings = TrackingSettings(keyframe_every=2)
     again = _to_and_fro(Tracker(settings, DisFlow()))
     assert again[-1].keyframe == 0
+    revisited = [track for track in again if track.decision.kind == "revisited"]
+    assert revisited
+    assert all(track.keyframe < track.index - 1 for track in revisited)
     assert len({track.keyframe for track in again}) <= 6
     assert np.linalg.norm(again[-1].T_world_camera[:3, 3]) < 0.1
     monkeypatch.setattr("scopemap.engine.tracking.tracker.nearer_keyframe", lambda *_: None)

@@ -17,11 +17,12 @@ from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.keyframe_alignment import MIN_SHARPNESS, is_obscured
 from scopemap.engine.tracking.rtdl import Alignment, Motion
-from scopemap.engine.tracking.track import Track
+from scopemap.engine.tracking.track import KeyframeDecision, Track
 from scopemap.engine.tracking.tracker import Tracker
 
 # Each frame some 50 px and 14 degrees from the one before; the first and the fifth have hardly anything in common.
 FAST = [plane_scene.pose(at_mm=(14.0 * n, 6.0 * n, 0.0), turn_rad=(0.0, 0.0, 0.25 * n)) for n in range(5)]
+NO_KEYFRAME = KeyframeDecision()
 SETTINGS = TrackingSettings(finest_level=0, keyframe_every=100, min_keyframe_agreement=0.0)
 
 
@@ -40,9 +41,9 @@ def _tracked(*, remembering: bool) -> list[Track]:
             continue
         tracked = replace(frame, T_world_camera=track.T_world_camera)
         if index == 0:
-            assert tracker.insert_keyframe(tracked, measured=False)
+            assert tracker.update(tracked, track.decision, measured=False)
         elif remembering:
-            tracker.remember(tracked)
+            assert tracker.update(tracked, NO_KEYFRAME, measured=False)
     return tracks
 
 
@@ -52,6 +53,10 @@ def test_fast_motion_is_tracked_from_the_last_frame() -> None:
     # It became the keyframe, and nothing was lost in between.
     assert [track.reason for track in tracks[1:]] == [""] * 4
     assert tracks[-1].keyframe in (2, 3)
+    promoted = [track.index for track in tracks if track.decision.promotes_previous]
+    assert promoted
+    assert all(tracks[index].keyframe == index - 1 for index in promoted)
+    assert {tracks[index].decision.reason for index in promoted} == {"flow fails, features find the frame"}
     for track, T in zip(tracks, FAST, strict=True):
         off = inverse(track.T_world_camera) @ T
         assert rotation_angle_rad(off[:3, :3]) < np.radians(1.0)

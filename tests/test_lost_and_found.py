@@ -46,8 +46,9 @@ def _tracked(frames: list[Frame], settings: TrackingSettings = SETTINGS, tracker
     for frame in frames:
         track = tracker.track(frame)
         tracks.append(track)
-        if track.status != "lost" and tracker.needs_keyframe():
-            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=not by_corners)
+        if track.decision.kind != "none":
+            tracked = replace(frame, T_world_camera=track.T_world_camera)
+            tracker.update(tracked, track.decision, measured=not by_corners)
     return tracks
 
 
@@ -175,7 +176,7 @@ def test_a_bare_wall_is_reported_as_weakly_constrained() -> None:
 
     tracker = Tracker(SETTINGS)
     first = tracker.track(bare(0))
-    tracker.insert_keyframe(replace(bare(0), T_world_camera=first.T_world_camera), measured=False)
+    tracker.update(replace(bare(0), T_world_camera=first.T_world_camera), first.decision, measured=False)
     track = tracker.track(bare(1))
     assert track.status == "lost"
     assert "weakly constrained" in track.reason

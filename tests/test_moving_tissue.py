@@ -190,10 +190,11 @@ def test_a_black_frame_is_lost_and_the_next_is_not() -> None:
     status = []
     for valid in (everywhere, np.zeros_like(everywhere), everywhere):
         frame = _frame(wall, valid)
-        status.append(tracker.track(frame).status)
-        if tracker.needs_keyframe() and status[-1] != "lost":
-            assert tracker.insert_keyframe(frame, measured=False)
+        track = tracker.track(frame)
+        status.append(track.status)
+        if track.decision.kind == "new":
+            assert tracker.update(frame, track.decision, measured=False)
     assert status == ["initial", "lost", "ok"]
     unknown = CameraAtRest(settings, DisFlow())
-    unknown.track(_frame(wall, everywhere))
-    assert not unknown.insert_keyframe(_frame(np.full((240, 320), np.nan), everywhere), measured=False)
+    decision = unknown.track(_frame(wall, everywhere)).decision
+    assert not unknown.update(_frame(np.full((240, 320), np.nan), everywhere), decision, measured=False)

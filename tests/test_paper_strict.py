@@ -92,7 +92,7 @@ def _second(config: Config, rgb: np.ndarray, valid_rows: int = CAMERA.height) ->
     view, tracker = see(np.eye(4)), Tracker(config.tracking)
     first = _frame(view.rgb, view.depth_mm)
     track = tracker.track(first)
-    tracker.insert_keyframe(replace(first, T_world_camera=track.T_world_camera), measured=False)
+    tracker.update(replace(first, T_world_camera=track.T_world_camera), track.decision, measured=False)
     valid = EVERYWHERE.copy()
     valid[valid_rows:] = False
     return tracker.track(replace(_frame(rgb), index=1, valid=valid))

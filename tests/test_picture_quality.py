@@ -116,6 +116,6 @@ def keyframes(qualities: list[float], step_mm: float = 0.5, **settings: bool) ->
         track = tracker.track(frame)
         assert track.status != "lost"
         frame = replace(frame, T_world_camera=track.T_world_camera)
-        if tracker.needs_keyframe() and tracker.insert_keyframe(frame, measured=True):
+        if track.decision.kind == "new" and tracker.update(frame, track.decision, measured=True):
             found.append(n)
     return found

@@ -22,7 +22,7 @@ from scopemap.engine.errors import WeightsError
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
 from scopemap.engine.odometry import Step
-from scopemap.engine.tracking.track import Track
+from scopemap.engine.tracking.track import KeyframeDecision, Track
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.estimators import create_estimators
 
@@ -106,12 +106,10 @@ def test_another_odometry_takes_the_place_of_ours(folder: Path) -> None:
             assert frame.depth_mm is not None
             assert np.isfinite(frame.depth_mm).any()
             status = "initial" if frame.index == 0 else "lost" if frame.index % 3 == 2 else "ok"
-            return Track(frame.index, status, "", np.eye(4), 0)
+            return Track(frame.index, status, "", np.eye(4), 0, decision=KeyframeDecision("new"))
 
-        def needs_keyframe(self) -> bool:
-            return True
-
-        def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
+        def update(self, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
+            assert decision.kind == "new"
             self.inserted.append(frame.index)
             return measured
 

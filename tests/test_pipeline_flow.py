@@ -10,6 +10,7 @@ from tiny_phantom import true_poses, with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.frame import Frame
+from scopemap.engine.tracking.track import KeyframeDecision
 from scopemap.engine.tracking.tracker import Tracker
 
 LOST, FRAMES = 4, 9
@@ -40,13 +41,14 @@ def test_depth_that_mapis_changed_is_not_compared_with_what_is_measured(
     phantom: Path, monkeypatch: pytest.MonkeyPatch, scaled: str, speaks: bool
 ) -> None:
     inserted: list[bool] = []
-    real = Tracker.insert_keyframe
+    real = Tracker.update
 
-    def insert_keyframe(self: Tracker, frame: Frame, *, measured: bool) -> bool:
-        inserted.append(measured)
-        return real(self, frame, measured=measured)
+    def update(self: Tracker, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
+        if decision.kind == "new":
+            inserted.append(measured)
+        return real(self, frame, decision, measured=measured)
 
-    monkeypatch.setattr(Tracker, "insert_keyframe", insert_keyframe)
+    monkeypatch.setattr(Tracker, "update", update)
     changes = {"depth__files_kind": "measured", "mapis__frame_scale": scaled}
     reconstruct(open_sequence(phantom), with_true_depth(phantom, **SETTINGS | changes))
     assert inserted

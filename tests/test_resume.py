@@ -18,7 +18,7 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
 from scopemap.engine.kept import Kept
 from scopemap.engine.odometry import Step
-from scopemap.engine.tracking.track import FrameTracker, Track
+from scopemap.engine.tracking.track import FrameTracker, KeyframeDecision, Track
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.result.checkpoint import CHECKPOINT, SavedState
 from scopemap.result.result_folder import LOCK, UNFINISHED
@@ -287,12 +287,10 @@ class _Counting(FrameTracker):
         self.seen += 1
         T_world_camera = np.eye(4)
         T_world_camera[0, 3] = self.seen
-        return Track(frame.index, "initial" if self.seen == 1 else "ok", "", T_world_camera, 0)
+        decision = KeyframeDecision("new" if self.seen % 3 == 1 else "none")
+        return Track(frame.index, "initial" if self.seen == 1 else "ok", "", T_world_camera, 0, decision=decision)
 
-    def needs_keyframe(self) -> bool:
-        return self.seen % 3 == 1
-
-    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
+    def update(self, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
         return True
 
 

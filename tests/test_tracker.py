@@ -12,8 +12,9 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.tracking.pyramid import build_pyramid
-from scopemap.engine.tracking.rtdl import Alignment, Motion, align
-from scopemap.engine.tracking.tracker import KeyframeChoice, Tracker
+from scopemap.engine.tracking.rtdl import align
+from scopemap.engine.tracking.track import KeyframeDecision
+from scopemap.engine.tracking.tracker import Tracker
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
 
@@ -21,6 +22,7 @@ SPEC = PhantomSpec(scene="colon", frames=12, width=160, height=128, seed=4)
 # By what is seen alone: measured depth of the frames would hide what these tests look at.
 PLAIN = {"finest_level": 0}
 SETTINGS = TrackingSettings(**PLAIN)
+NEW = KeyframeDecision("new")
 
 
 @cache
@@ -47,8 +49,8 @@ def _track_all(settings: TrackingSettings, frames: list[Frame]) -> list[np.ndarr
     for frame in frames:
         track = tracker.track(replace(frame, depth_mm=None))
         poses.append(track.T_world_camera)
-        if track.status != "lost" and tracker.needs_keyframe():
-            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+        if track.decision.kind != "none":
+            tracker.update(replace(frame, T_world_camera=track.T_world_camera), track.decision, measured=True)
     return poses
 
 
@@ -95,7 +97,7 @@ def test_lost_frames_are_kept_and_tracking_goes_on() -> None:
         track = tracker.track(frame)
         tracks.append(track)
         if track.status == "initial":
-            tracker.insert_keyframe(replace(frame, T_world_camera=track.T_world_camera), measured=True)
+            tracker.update(replace(frame, T_world_camera=track.T_world_camera), track.decision, measured=True)
     assert [track.status for track in tracks] == ["initial"] + ["ok"] * 4 + ["lost"] * 2 + ["ok"] * 5
     assert tracks[5].reason == "only 0% of the image is usable"
     assert "inlier share" in tracks[6].reason
@@ -112,7 +114,7 @@ def test_a_jump_is_believed_only_where_many_features_confirm_it(monkeypatch: pyt
     for searched in (0, 10):
         tracker = Tracker(TrackingSettings(**PLAIN, relocalisation_keyframes=searched))
         first = tracker.track(frames[0])
-        tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
+        tracker.update(replace(frames[0], T_world_camera=first.T_world_camera), first.decision, measured=True)
         tracks.append(tracker.track(frames[4]))
     assert tracks[0].status == "lost"
     assert "jump" in tracks[0].reason
@@ -125,40 +127,27 @@ def test_a_fading_keyframe_is_replaced_before_its_turn(share: float, wanted: boo
     frames, _ = _sequence()
     tracker = Tracker(TrackingSettings(**PLAIN, min_keyframe_agreement=share))
     first = tracker.track(frames[0])
-    tracker.insert_keyframe(replace(frames[0], T_world_camera=first.T_world_camera), measured=True)
-    tracker.track(frames[1])
-    assert not tracker.needs_keyframe()
+    tracker.update(replace(frames[0], T_world_camera=first.T_world_camera), first.decision, measured=True)
+    assert tracker.track(frames[1]).decision.kind == "none"
     half = frames[2].valid.copy()
     half[:, half.shape[1] // 2 :] = False
     track = tracker.track(replace(frames[2], valid=half))
     assert track.status == "ok"
-    assert tracker.needs_keyframe() == wanted
+    assert track.decision.reason == ("the keyframe fits less well than at first" if wanted else "")
     # A new keyframe starts without a past.
     known = replace(frames[2], T_world_camera=track.T_world_camera)
-    assert tracker.insert_keyframe(known, measured=True)
-    assert not tracker.needs_keyframe()
-
-
-def test_a_keyframe_is_due_after_a_frame_that_features_alone_have_found() -> None:
-    frames, _ = _sequence()
-    choice = KeyframeChoice(SETTINGS)
-    choice.see(frames[1])
-    well = Alignment(Motion(np.eye(4), np.array([1.0, 0.0])), 0.1, 1.0, 1.0, 1.0, 1.0, 1)
-    choice.accept(well, flow_failed=True)
-    assert choice.is_due()
-    assert not choice.is_due(well), "how well a frame fits is not changed by how the one before was found"
-    choice.accept(well)
-    assert not choice.is_due()
+    assert tracker.update(known, NEW, measured=True)
+    assert tracker.track(frames[3]).decision.kind == "none"
 
 
 def test_a_keyframe_without_depth_is_refused() -> None:
     frames, _ = _sequence()
     tracker = Tracker(SETTINGS)
     blind = replace(frames[0], depth_mm=np.full_like(frames[0].depth_mm, np.nan), T_world_camera=np.eye(4))
-    assert not tracker.insert_keyframe(blind, measured=True)
+    assert not tracker.update(blind, NEW, measured=True)
     assert tracker.track(frames[1]).status == "initial"
     with pytest.raises(ValueError, match="needs a depth and a pose"):
-        tracker.insert_keyframe(frames[0], measured=True)
+        tracker.update(frames[0], NEW, measured=True)
 
 
 def test_masked_pixels_do_not_bleed_into_coarser_levels() -> None:

@@ -1,25 +1,17 @@
-"""After the last frame: the frames of each segment become a surface. Files, clock and threads: see `runner/run.py`.
-
-    carve       find what other frames look through: it is no tissue
-    frames      correct poses and depth -> triangulate the depth of keyframes, which the others take over -> carve
-    as_fused    choose the frames that show tissue anew
-    fuse        TSDF -> mesh
-    finish      close holes, smooth, simplify
-    check       render the mesh at the poses of some frames, and compare
-
-The submaps, with their segments and the correction of each, come from `Mapper.submaps`.
-"""
+"""The steps by which the frames of a segment become a surface; `Pipeline.surface` says in which order."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import trimesh
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import FusionSettings
+from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.agreement import surface_agreement, surface_views, vertex_sigmas
 from scopemap.engine.fusion.finish import finished, with_normals_alone
@@ -27,36 +19,33 @@ from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.fusion.free_space import FreeSpace, views_among
 from scopemap.engine.fusion.moving_tissue import MovingTissue, block_edge_mm
 from scopemap.engine.fusion.new_views import NewViews
-from scopemap.engine.fusion.surface_fusion import FusedSurface, depth_notices
+from scopemap.engine.fusion.surface_fusion import FusedSurface, SurfaceFusion, depth_notices
 from scopemap.engine.mapping.multiview_depth import KeyframeDepths
 from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.mapping.submaps import FinalFrames, Submap
 from scopemap.engine.notices import Notice
-from scopemap.engine.pipeline import Pipeline
+from scopemap.engine.tracking.track import TrackedFrames
 
 
-@dataclass(frozen=True)
-class TrackedFrames:
-    """All frames of a run as tracked, in order.
+class Execution:
+    """How the steps after the last frame are carried out: here one after the other, in the thread of the caller.
 
-    index : (F,) int, their numbers. time_s : (F,). T_world_camera : (F, 4, 4), NaN where a frame is lost.
-    median_depth_mm : (F,), NaN where unknown.
+    keeps_depth : whether the final depth of frames is kept, and not only fused.
     """
 
-    index: np.ndarray
-    time_s: np.ndarray
-    T_world_camera: np.ndarray
-    median_depth_mm: np.ndarray
+    keeps_depth = True
 
-    def of(self, segment: Segment) -> TrackedFrames:
-        """Return the frames of a segment."""
-        own = np.isin(self.index, list(segment.frames))
-        return TrackedFrames(self.index[own], self.time_s[own], self.T_world_camera[own], self.median_depth_mm[own])
+    def timed(self, part: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what a call returns, which is a part of the run."""
+        return call(*arguments)
 
-    @property
-    def poses(self) -> dict[int, np.ndarray]:
-        """The poses (4, 4) by number."""
-        return dict(zip(self.index.tolist(), self.T_world_camera, strict=True))
+    def in_thread(self, frames: Iterator[Frame], thread: str) -> Generator[Frame, None, None]:
+        """Yield frames in order; a thread of this name may compute them."""
+        yield from frames
+
+    def final(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        """Yield frames whose pose and depth are final; they may be written."""
+        return frames
 
 
 @dataclass(frozen=True)
@@ -76,34 +65,37 @@ class SegmentSurface:
 
 
 class SegmentFinishing:
-    """Finishes a segment of a submap; the methods are called in the order above, each once, and `close` after `fuse`.
+    """Finishes a segment of a submap: each step once, and `close` after `fuse`.
 
-    tracked : all frames of the run. camera : of all frames. keeps_depth : whether final depth is kept, and not only
-    fused. checked : frames at which a surface that was fused at once is checked; those of stored frames are added.
+    fusion : stores, or has fused, the frames. tracked : all frames of the run. checked : frames at which a surface that
+    was fused at once is checked; those of stored frames are added.
     """
 
     def __init__(
         self,
-        pipeline: Pipeline,
+        fusion: SurfaceFusion,
+        estimators: Estimators,
         submap: Submap,
         segment: Segment,
         tracked: TrackedFrames,
-        camera: PinholeCamera,
-        *,
-        keeps_depth: bool = True,
         checked: SpreadFrames | None = None,
     ) -> None:
-        self._pipeline, self._fusion, self._submap = pipeline, pipeline.fusion, submap
-        self._correction = segment.correction
-        self._run, self._checked = tracked, SpreadFrames() if checked is None else checked
-        own, at_end = tracked.of(segment), self._fusion.at_end
-        self._final = FinalFrames(segment.correction, own.poses if at_end else {}, self._fusion.store.frame)
+        self._fusion, self._estimators, self._submap, self._tracked = fusion, estimators, submap, tracked
+        self._checked = SpreadFrames() if checked is None else checked
+        poses = tracked.poses_of(segment.frames) if fusion.at_end else {}
+        self._final = FinalFrames(segment.correction, poses, fusion.store.frame)
         # Of the frames that the largest depth was chosen from, so that it cannot contradict itself.
-        main = submap.main_frames if at_end else ()
-        self._median_mm = self._fusion.store.median_depth_mm(main, submap.depth_factor)
+        main = submap.main_frames if fusion.at_end else ()
+        self._median_mm = fusion.store.median_depth_mm(main, submap.depth_factor)
         self._moving = MovingTissue(block_edge_mm(self._median_mm))
         self._free_space = FreeSpace([])
-        self._depths = self._triangulation(camera) if keeps_depth or self._fusion.settings.enabled else None
+        self._depths: KeyframeDepths | None = None
+
+    def triangulate(self, camera: PinholeCamera) -> None:
+        """Have the depth of keyframes triangulated, which the other frames take over, where a flow matches them."""
+        final, flow = self._final, self._estimators.keyframe_flow
+        if final.keyframes and flow.name != "none":
+            self._depths = KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow)
 
     def carve(self) -> None:
         """Find what frames look through; the pixels that show it are left out."""
@@ -111,13 +103,13 @@ class SegmentFinishing:
             some = views_among(list(self._final.T_world_camera))
             self._free_space = FreeSpace(self._final.frames(None, among=some))
 
-    def frames(self) -> Iterator[Frame]:
-        """Yield the final frames, those that were stored: pose and depth corrected, carved."""
+    def corrected(self) -> Iterator[Frame]:
+        """Yield the final frames, those that were stored: pose and depth corrected, triangulated, carved."""
         triangulated = None if self._depths is None else self._depths.depth
         return self._final.frames(triangulated, self._free_space.without)
 
-    def as_fused(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Yield final frames that are fused; note where tissue moves in all, and some for `check`."""
+    def chosen(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Yield the final frames that show tissue anew; note where tissue moves in all, and some for `check`."""
         views = NewViews(self._fusion.settings.every)
         for frame in frames:
             if frame.nonrigidity is not None and frame.T_world_camera is not None:
@@ -128,7 +120,7 @@ class SegmentFinishing:
                 yield chosen
 
     def fuse(self, frames: Iterable[Frame]) -> FusedSurface:
-        """Return the surface of the frames that `as_fused` yields, or of those that were fused at once."""
+        """Return the surface of the frames that `chosen` yields, or of those that were fused at once."""
         return self._fusion.fuse(frames, self._median_mm, self._submap.main)
 
     def close(self) -> None:
@@ -142,29 +134,18 @@ class SegmentFinishing:
         mesh.vertex_attributes["moving"] = self._moving.shares(mesh.vertices).astype(np.float32)
         return replace(fused, mesh=mesh)
 
-    def check(self, fused: FusedSurface) -> SegmentSurface:
-        """Return the finished surface with its agreement with some frames, and what there is to say about it."""
+    def check(self, fused: FusedSurface, adjusted: list[Notice]) -> SegmentSurface:
+        """Return the finished surface with its agreement with some frames, and what there is to say about it.
+
+        adjusted : what is known of the adjustment of its keyframes; [] where they are as tracked.
+        """
         mesh = fused.mesh
         views = surface_views(mesh, self._checked.frames(self._fusion.store))
         agreement = surface_agreement(views, fused.settings)
         mesh.vertex_attributes["sigma_mm"] = vertex_sigmas(len(mesh.vertices), views)
-        adjusted = self._adjustment_notices()
-        confirmed = bool(adjusted) or self._pipeline.estimators.anchor.is_measured
+        confirmed = bool(adjusted) or self._estimators.anchor.is_measured
         notices = adjusted + self._fusion_notices(fused)
         return SegmentSurface(with_normals_alone(mesh), fused.settings, agreement, confirmed, notices)
-
-    def _triangulation(self, camera: PinholeCamera) -> KeyframeDepths | None:
-        """Return what triangulates the depth of keyframes; None where nothing can."""
-        final, flow = self._final, self._pipeline.estimators.keyframe_flow
-        wanted = self._pipeline.config.mapping.triangulate_depth
-        if not (wanted and final.keyframes) or flow.name == "none":
-            return None
-        return KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow)
-
-    def _adjustment_notices(self) -> list[Notice]:
-        """Return what was adjusted: at the end, or as keyframes came."""
-        correction = self._correction
-        return self._pipeline.odometry.notices(self._submap.main) if correction is None else correction.notices
 
     def _fusion_notices(self, fused: FusedSurface) -> list[Notice]:
         """Return what depth and surface rest on, and what is not in the surface."""
@@ -172,8 +153,8 @@ class SegmentFinishing:
         found += fused.notices
         if self._free_space.notice is not None:
             found.append(self._free_space.notice)
-        if (masks := self._pipeline.estimators.masks) is not None:
+        if (masks := self._estimators.masks) is not None:
             found += masks.notices
-        known_mm = self._run.median_depth_mm[np.isfinite(self._run.median_depth_mm)]
+        known_mm = self._tracked.median_depth_mm[np.isfinite(self._tracked.median_depth_mm)]
         medians_mm = known_mm.tolist() if self._median_mm is None else [self._median_mm]
         return found + depth_notices(medians_mm, fused.settings)

@@ -60,7 +60,7 @@ class Odometry:
     _smooth: Kept[Wema]
     _rotation: Kept[RotationFollower]
     _last_track: Kept[Track | None] = None
-    _last_frame: Kept[tuple[Frame, Track] | None] = None
+    _previous: Kept[tuple[Frame, Track] | None] = None  # tracked, no keyframe; the tracker may still promote it
 
     def __init__(
         self, config: Config, tracker: FrameTracker, mapper: Mapper, local: LocalAdjustment | None = None
@@ -91,6 +91,8 @@ class Odometry:
     def _track(self, preprocessed: PreprocessedFrame) -> Step:
         refined = self._refine(preprocessed, None) if self._config.mapis.order == "refine-first" else None
         track, last = self._tracker.track(preprocessed.frame), self._last_track
+        if track.decision.promotes_previous:
+            self._promote_previous()
         if preprocessed.skipped and track.status == "lost":
             return self._without_pose(preprocessed, track)
         if track.status == "lost" or (last is not None and last.map != track.map):
@@ -104,8 +106,8 @@ class Odometry:
         frame = replace(frame, nonrigidity=track.nonrigidity)
         if preprocessed.kind == "depth":  # disparity has a scale of its own in every frame
             frame = replace(frame, depth_scale=refined.scale)
-        self._add_last_keyframe(track)
-        track, frame = self._with_keyframe(track, frame, preprocessed)
+        if track.status != "lost":
+            track, frame = self._handed_on(track, frame, preprocessed)
         if track.status == "lost":
             self._reset()
         else:
@@ -133,10 +135,6 @@ class Odometry:
         """Return what was adjusted of a map as it came; [] where nothing was."""
         return [] if self._local is None else self._local.notices(map_number)
 
-    def new_tracker(self) -> FrameTracker | None:
-        """Return a tracker that has seen no frame, to track lost frames anew; None where the tracker cannot."""
-        return self._tracker.another()
-
     def _refine(self, preprocessed: PreprocessedFrame, T_current_previous: np.ndarray | None) -> RefinedDepth:
         raw = preprocessed.small
         if preprocessed.anchored:
@@ -155,46 +153,58 @@ class Odometry:
         self._mapis.reset()
         self._smooth.reset()
 
-    def _add_last_keyframe(self, track: Track) -> None:
-        """Hand on the frame that was tracked last where the tracker made it the keyframe of this one."""
-        if track.status == "ok" and self._last_frame is not None and self._last_frame[1].index == track.keyframe:
-            self.mapper.add_keyframe(*self._last_frame)
+    def _promote_previous(self) -> None:
+        """Hand on the frame that was tracked before: it has become a keyframe since."""
+        if self._previous is not None:
+            frame, track = self._previous
+            self.mapper.add_keyframe(frame, track)
             if self._local is not None:
-                self._local.take_over(track.keyframe, self._last_frame[1].keyframe)
-            self._last_frame = None
+                self._local.take_over(frame.index, track.keyframe)
+            self._previous = None
 
-    def _with_keyframe(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> tuple[Track, Frame]:
-        """Make a frame the keyframe where one is due; return both, adjusted where keyframes are, as they come.
+    def _handed_on(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> tuple[Track, Frame]:
+        """Hand a tracked frame on as its track decided; return both, adjusted where keyframes are as they come.
 
-        The first frame of a map that cannot be a keyframe is lost.
+        The first frame of a map that is refused as a keyframe is lost.
         """
-        if track.status == "lost":
-            return track, frame
-        kind, due, number = preprocessed.kind, self._tracker.needs_keyframe(), track.keyframe
-        keyframe, matches, step = replace(frame, T_world_camera=track.T_world_camera), None, None
-        if self._local is not None and kind != "measured":
-            if due:
-                keyframe, matches, step = self._local.adjusted(keyframe, number, track.map)
-            else:
-                keyframe = self._local.corrected(keyframe, number)
-        frame, track = replace(keyframe, T_world_camera=None), replace(track, T_world_camera=_pose(keyframe))
-        if not due:
-            if kind != "measured" and self._tracker.remember(keyframe):
-                self._last_frame = keyframe, track
-            return track, frame
-        measured = kind == "measured" and not self._mapis.needs_previous(kind)  # not after MAPIS changed it
-        inserted = self._tracker.insert_keyframe(keyframe, measured=measured)
-        if inserted and kind != "measured":  # with measured depth tracking alone is better
-            self.mapper.add_keyframe(keyframe, track, matches, step)
-        if track.status == "initial" and not inserted:
+        posed = replace(frame, T_world_camera=track.T_world_camera)
+        hand_on = self._hand_on_measured if preprocessed.kind == "measured" else self._hand_on_predicted
+        posed, is_refused = hand_on(track, posed)
+        track, frame = replace(track, T_world_camera=_pose(posed)), replace(posed, T_world_camera=None)
+        if track.status == "initial" and is_refused:
             unknown = preprocessed.depth_note or "too little of its depth is known to start from (black or constant?)"
-            return replace(track, status="lost", reason=unknown, cause=LossCause.OTHER), frame
+            track = replace(track, status="lost", reason=unknown, cause=LossCause.OTHER)
         return track, frame
 
+    def _hand_on_measured(self, track: Track, posed: Frame) -> tuple[Frame, bool]:
+        """Hand on a frame of measured depth, and return whether it is refused as a keyframe.
 
-def _pose(keyframe: Frame) -> np.ndarray:
-    assert keyframe.T_world_camera is not None
-    return keyframe.T_world_camera
+        Only the tracker takes it, and only keyframes: with measured depth tracking alone is better.
+        """
+        if track.decision.kind == "none":
+            return posed, False
+        is_measured = not self._mapis.needs_previous("measured")  # else MAPIS has changed it
+        return posed, not self._tracker.update(posed, track.decision, measured=is_measured)
+
+    def _hand_on_predicted(self, track: Track, posed: Frame) -> tuple[Frame, bool]:
+        """Hand on a frame of predicted depth; return it, adjusted, and whether it is refused as a keyframe."""
+        decision, local, matches, step = track.decision, self._local, None, None
+        if decision.kind == "none":
+            posed = posed if local is None else local.corrected(posed, track.keyframe)
+            if self._tracker.update(posed, decision, measured=False):
+                self._previous = posed, track
+            return posed, False
+        if local is not None:
+            posed, matches, step = local.adjusted(posed, track.keyframe, track.map)
+        if not self._tracker.update(posed, decision, measured=False):
+            return posed, True
+        self.mapper.add_keyframe(posed, replace(track, T_world_camera=_pose(posed)), matches, step)
+        return posed, False
+
+
+def _pose(frame: Frame) -> np.ndarray:
+    assert frame.T_world_camera is not None
+    return frame.T_world_camera
 
 
 def _motion(correspondence: DenseCorrespondence | None) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -106,10 +107,10 @@ class Reconstructor:
         `track.reason` say what happened. Raises `ValueError` for another shape or dtype, a number that does not
         increase, and after `result` or `close`.
         """
-        frame, clock, pipeline = self._frame(picture, time_s, index), self._run.clock, self._pipeline
-        estimated = clock.timed("preprocess", pipeline.estimate, frame)
-        step: Step = clock.timed("track", pipeline.track, clock.timed("match", pipeline.match, estimated))
-        clock.timed("store or fuse", pipeline.fuse, step)
+        step: Any = self._frame(picture, time_s, index)
+        for part, call in self._pipeline.steps.items():
+            step = self._run.clock.timed(part, call, step)
+        self._run.clock.timed("store or fuse", self._pipeline.fuse, step)
         self._run.take(step)
         return step
 

@@ -14,16 +14,14 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from numba.core.event import TimingListener, register
 
-from scopemap.engine.finishing import SegmentFinishing, SegmentSurface, TrackedFrames
+from scopemap.engine.finishing import Execution
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.lens_test import LensTest
-from scopemap.engine.mapping.segments import Segment
-from scopemap.engine.mapping.submaps import Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
-from scopemap.engine.pipeline import Pipeline
+from scopemap.engine.pipeline import Adjusted, Pipeline
 from scopemap.engine.tracking.track import Track
 from scopemap.input.sequence import Sequence
 from scopemap.result.frame_table import FrameTable, GrowingFrameTable
@@ -31,10 +29,9 @@ from scopemap.result.result import Result
 from scopemap.result.surface_segments import main_segment
 from scopemap.result.verdict import graded
 from scopemap.result.wording import facts_of_notices
-from scopemap.runner.backwards import track_backwards
 from scopemap.runner.memory import MemoryPlan, trim_memory
 from scopemap.runner.provenance import Limits, facts_of_segment, motion_notices, notices_of_end, provenance_of
-from scopemap.runner.submap_frames import check_tracked, frames_of_submap
+from scopemap.runner.submap_frames import check_tracked, frames_of_submap, put_backwards, tracked_frames
 
 Observer = Callable[[Step], bool | None]
 """Called with each step; True: no further frame is read, and the result is of the frames until then."""
@@ -198,24 +195,24 @@ class Run:
 
     @cached_property
     def table(self) -> FrameTable:
-        """The table of all frames, as tracked, after the last one."""
+        """The table of all frames, as tracked, after the last one; `adjusted` puts in what is tracked backwards."""
         return self.frames.read()
 
     @cached_property
-    def submaps(self) -> tuple[list[Submap], list[Notice]]:
-        """The adjusted submaps, most frames first, and notices. Raises `InputError` without one."""
+    def adjusted(self) -> Adjusted:
+        """The adjusted submaps, and what was tracked backwards. Raises `InputError` where no frame was tracked."""
         check_tracked(self.table, self.sequence.path)
-        self.clock.timed("track backwards", track_backwards, self.pipeline, self.table)
         if self.pipeline.config.mapping.at_end:
             self.progress("adjusting keyframes", 0, 0)
         trim_memory()
-        found: tuple[list[Submap], list[Notice]] = self.clock.timed("back end", self.pipeline.mapper.submaps)
+        found = self.pipeline.adjust(tracked_frames(self.table), _InThreads(self))
+        put_backwards(self.table, found.backwards)
         return found
 
     @property
     def lens(self) -> LensTest:
         """What left-out tracks of the largest submap tell of the focal length."""
-        correction = self.submaps[0][0].segments[0].correction
+        correction = self.adjusted.submaps[0].segments[0].correction
         return LensTest() if correction is None else correction.lens
 
     def result(self, prepared: list[Notice]) -> Result:
@@ -236,26 +233,29 @@ class _Finishing:
     run: Run
     frames: FrameTable
     notices: list[Notice]
-    _done: int = field(default=0, init=False)
 
     def result(self) -> Result:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
-        frames, pipeline, (submaps, notices) = self.frames, self.run.pipeline, self.run.submaps
-        results = [self._submap_result(number, submaps) for number in range(len(submaps))]
-        submapped = {index for submap in submaps for index in submap.frames}
-        apart = set(frames["index"].tolist()) - submapped if pipeline.fusion.at_end else set()
+        pipeline, adjusted = self.run.pipeline, self.run.adjusted
+        submapped = {index for submap in adjusted.submaps for index in submap.frames}
+        execution = _InThreads(self.run, len(submapped))
+        results = [self._submap_result(number, execution) for number in range(len(adjusted.submaps))]
+        apart = set(self.frames["index"].tolist()) - submapped if pipeline.fusion.at_end else set()
         for frame in pipeline.fusion.store.frames(apart):
-            self._write(frame)  # as tracked
-        results[0].provenance["notices"] += facts_of_notices(pipeline.notices + notices)
+            execution.write(frame)  # as tracked
+        results[0].provenance["notices"] += facts_of_notices(pipeline.notices + adjusted.notices)
         results[0].others = results[1:]
         return results[0]
 
-    def _submap_result(self, number: int, submaps: list[Submap]) -> Result:
+    def _submap_result(self, number: int, execution: _InThreads) -> Result:
         """Finish a submap, one segment after the other; its final frames are written meanwhile."""
         trim_memory()
-        sequence, submap, config = self.run.sequence, submaps[number], self.run.pipeline.config
-        count = sum(len(submap.frames) for submap in submaps)
-        surfaces = [self._surface(submap, segment, count) for segment in submap.segments]
+        sequence, pipeline, submaps = self.run.sequence, self.run.pipeline, self.run.adjusted.submaps
+        submap, config, tracked = submaps[number], pipeline.config, tracked_frames(self.frames)
+        surfaces = []
+        for segment in submap.segments:
+            checked = None if pipeline.fusion.at_end else self.run.checked.pop(submap.main, None)
+            surfaces.append(pipeline.surface(submap, segment, tracked, sequence.camera, execution, checked))
         frames = frames_of_submap(number, submaps, self.frames)
         segments = graded(
             facts := [facts_of_segment(*each, frames) for each in zip(submap.segments, surfaces, strict=True)]
@@ -263,7 +263,7 @@ class _Finishing:
         main = main_segment(segments)
         surface = surfaces[main]
         moving = motion_notices(frames, config, confirmed=surface.is_confirmed)
-        provenance = provenance_of(sequence, self.run.pipeline.estimators, self.run.clock.seconds, frames)
+        provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
         provenance["notices"] += facts_of_notices(self.notices + moving + surface.notices)
         provenance["surface"] = surface.agreement
         provenance["segments"], provenance["main_segment"] = facts, main
@@ -278,37 +278,36 @@ class _Finishing:
             source_camera=sequence.rectifier.source,
         ).with_segments(segments, [one.mesh for one in surfaces])
 
-    def _surface(self, submap: Submap, segment: Segment, count: int) -> SegmentSurface:
-        """Return the surface of a segment of a submap; count : frames of all submaps."""
-        frames, timed = self.frames, self.run.clock.timed
-        finishing = SegmentFinishing(
-            self.run.pipeline,
-            submap,
-            segment,
-            TrackedFrames(frames["index"], frames["time_s"], frames["T_world_camera"], frames["median_depth_mm"]),
-            self.run.sequence.camera,
-            keeps_depth=bool(self.run.writers),
-            checked=None if self.run.pipeline.fusion.at_end else self.run.checked.pop(submap.main, None),
-        )
-        with closing(finishing):
-            timed("free space", finishing.carve)
-            corrected = in_thread(finishing.frames(), "correct")
-            seen = in_thread(finishing.as_fused(self._written(corrected, count)), "write")
-            with closing(seen):
-                fused = timed("fuse", finishing.fuse, seen)
-        fused = timed("finish mesh", finishing.finish, fused)
-        surface: SegmentSurface = timed("check surface", finishing.check, fused)
-        return surface
 
-    def _written(self, frames: Iterator[Frame], count: int) -> Iterator[Frame]:
-        """Yield the final frames of a submap, written; count : of all submaps."""
+@dataclass
+class _InThreads(Execution):
+    """Carries out the steps after the last frame: timed, some in threads; writes final frames, `count` of them."""
+
+    run: Run
+    count: int = 0
+    _done: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self.keeps_depth = bool(self.run.writers)
+
+    def timed(self, part: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Return what a call returns, and count its seconds."""
+        return self.run.clock.timed(part, call, *arguments)
+
+    def in_thread(self, frames: Iterator[Frame], thread: str) -> Generator[Frame, None, None]:
+        """Yield frames in order, computed in a thread of their own."""
+        return in_thread(frames, thread)
+
+    def final(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        """Yield final frames, written."""
         for frame in frames:
-            self._write(frame)
+            self.write(frame)
             yield frame
             self._done += 1
-            self.run.progress("fusing", self._done, count)
+            self.run.progress("fusing", self._done, self.count)
 
-    def _write(self, frame: Frame) -> None:
+    def write(self, frame: Frame) -> None:
+        """Write a frame whose depth is final."""
         for write in self.run.writers:
             write(frame)
 
@@ -387,11 +386,11 @@ def overlapped(
 
     read = iter(partial(clock.timed, "read", next, frames, None), None)
     marked = ((frame, states is not None and states.due()) for frame in read)
-    steps = stage(
-        "track", pipeline.track, stage("match", pipeline.match, stage("preprocess", pipeline.estimate, marked))
-    )
-    with closing(steps):
-        for step, due in steps:
+    items: Any = marked
+    for part, call in pipeline.steps.items():
+        items = stage(part, call, items)
+    with closing(items):
+        for step, due in items:
             clock.timed("store or fuse", pipeline.fuse, step)
             yield step
             if due and states is not None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
+from scopemap.engine.backwards import MapMerge
 from scopemap.engine.errors import InputError
 from scopemap.engine.mapping.submaps import Submap
 from scopemap.engine.tracking.causes import LossCause, causes_of_loss
+from scopemap.engine.tracking.track import Track, TrackedFrames
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY
 from scopemap.result.frame_table import FrameTable
 
@@ -19,6 +22,25 @@ def check_tracked(frames: FrameTable, path: Path) -> None:
     if not frames.tracked.any():
         reason = frames["reason"][0] if len(frames) else "interrupted before the first"
         raise InputError(f"no frame of {path} could be used: {reason}")
+
+
+def tracked_frames(frames: FrameTable) -> TrackedFrames:
+    """Return the table of all frames, as tracked, as the engine takes it."""
+    same = (frames[name] for name in ("map", "T_world_camera", "median_depth_mm", "motion", "quality"))
+    return TrackedFrames(frames["index"], frames["status"] == "lost", *same)
+
+
+def put_backwards(frames: FrameTable, found: Iterable[Track | MapMerge]) -> None:
+    """Put what was tracked backwards into the table of all frames, as tracked; found : in order."""
+    row_of = {index: row for row, index in enumerate(frames["index"].tolist())}
+    for one in found:
+        if isinstance(one, Track):
+            frames.put(row_of[one.index], one.row)
+            continue
+        for row in np.flatnonzero(frames.tracked & (frames["map"] == one.map)):
+            T_world_camera = one.T_earlier_own @ frames["T_world_camera"][row]
+            frames.put(int(row), {"map": one.earlier_map, "T_world_camera": T_world_camera})
+        frames.put(row_of[one.start], {"status": "ok", "reason": "relocalised", "relocalised": True})
 
 
 def frames_of_submap(number: int, submaps: list[Submap], frames: FrameTable) -> FrameTable:

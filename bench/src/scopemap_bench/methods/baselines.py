@@ -24,7 +24,7 @@ import numpy as np
 from scopemap.engine.config.tracking import TrackingSettings
 from scopemap.engine.errors import SettingsError
 from scopemap.engine.frame import Frame
-from scopemap.engine.tracking.track import FrameTracker, Track
+from scopemap.engine.tracking.track import FrameTracker, KeyframeDecision, Track
 from scopemap.engine.tracking.tracker import Tracker
 
 UNIT_MM = 100.0
@@ -59,6 +59,7 @@ SETTINGS = TrackingSettings(
 )
 """Settings of our tracker for this method; all others have no effect or only detect empty images."""
 _MIN_USABLE_SHARE = 0.1  # of the image, the default of our own tracker
+_EVERY_FRAME = KeyframeDecision("new", "every frame is the reference of the next one")
 
 
 class _NoMotion(Exception):
@@ -93,20 +94,16 @@ class Open3dTracker(FrameTracker):
             return Track(frame.index, "lost", f"only {known:.0%} of the image is usable", self._T_world_last, index)
         self._current = self._prepared(frame)
         if reference is None:
-            return Track(frame.index, "initial", "fixes the world", np.eye(4), index)
+            return Track(frame.index, "initial", "fixes the world", np.eye(4), index, decision=_EVERY_FRAME)
         try:
             T_reference_current = self._motion(self._current, reference)
         except _NoMotion as reason:
             return Track(frame.index, "lost", str(reason), self._T_world_last, index)
         assert reference.frame.T_world_camera is not None
         self._T_world_last = reference.frame.T_world_camera @ T_reference_current
-        return Track(frame.index, "ok", "", self._T_world_last, index)
+        return Track(frame.index, "ok", "", self._T_world_last, index, decision=_EVERY_FRAME)
 
-    def needs_keyframe(self) -> bool:
-        """Return True: every tracked frame is the reference of the next one."""
-        return True
-
-    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
+    def update(self, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
         """Make a tracked frame the reference; False where too little depth is known, `ValueError` without a pose."""
         if frame.T_world_camera is None:
             raise ValueError("a reference needs a pose")
@@ -227,10 +224,6 @@ class StandingStill(FrameTracker):
             return Track(frame.index, "initial", "fixes the world", np.eye(4), frame.index)
         return Track(frame.index, "ok", "", np.eye(4), reference)
 
-    def needs_keyframe(self) -> bool:
-        """Return False: it uses no keyframes."""
-        return False
-
-    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
-        """Return False: it uses no keyframes."""
+    def update(self, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
+        """Return False: it uses no frames."""
         return False

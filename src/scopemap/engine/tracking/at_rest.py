@@ -10,7 +10,7 @@ from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.corner_pose import nonrigidity
-from scopemap.engine.tracking.track import FrameTracker, Track
+from scopemap.engine.tracking.track import FrameTracker, KeyframeDecision, Track
 
 
 class CameraAtRest(FrameTracker):
@@ -36,18 +36,19 @@ class CameraAtRest(FrameTracker):
             reference = frame.index if self._keyframe is None else self._keyframe
             return Track(frame.index, "lost", f"only {share:.0%} of the image is usable", here, reference)
         if self._keyframe is None:
-            return Track(frame.index, "initial", "first frame of the map", here, frame.index)
+            first = "first frame of the map"
+            return Track(frame.index, "initial", first, here, frame.index, decision=KeyframeDecision("new", first))
         found = None if self._matcher is None else self._matcher.match(frame)
         # Depth does not matter: nothing but tissue moves.
         moving = None if found is None else nonrigidity(found, frame.camera, here, 0.0)
-        return Track(frame.index, "ok", "", here, self._keyframe, nonrigidity=moving)
+        is_due = self._frames_since_keyframe >= self._settings.keyframe_every
+        decision = KeyframeDecision("new", "its corners are found anew") if is_due else KeyframeDecision()
+        return Track(frame.index, "ok", "", here, self._keyframe, nonrigidity=moving, decision=decision)
 
-    def needs_keyframe(self) -> bool:
-        """Return whether corners should be found anew in the frame that was tracked last."""
-        return self._keyframe is None or self._frames_since_keyframe >= self._settings.keyframe_every
-
-    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
-        """Follow the corners of this frame from now on; False where too little of its depth is known."""
+    def update(self, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
+        """Follow the corners of a new keyframe from now on; False for others, or with too little known depth."""
+        if decision.kind == "none":
+            return False
         known = frame.valid & np.isfinite(np.asarray(frame.depth_mm))
         if known.mean() < self._settings.min_valid_share:
             return False

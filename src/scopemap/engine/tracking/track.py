@@ -1,7 +1,8 @@
-"""Track: the tracking result of one frame; FrameTracker: the protocol of trackers."""
+"""Track: the tracking result of one frame, with the decision on keyframes; FrameTracker: the protocol of trackers."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -12,6 +13,7 @@ from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.tracking.causes import LossCause
 
 Status = Literal["initial", "ok", "lost"]
+KeyframeKind = Literal["none", "new", "revisited"]
 
 MOVING_SIGMAS = 2.0
 """Standard deviations of noise beyond which tissue moves on its own."""
@@ -22,6 +24,21 @@ class TrackingLoss(NamedTuple):
 
     cause: LossCause
     reason: str
+
+
+@dataclass(frozen=True)
+class KeyframeDecision:
+    """Whether a tracked frame becomes a keyframe, and why.
+
+    kind : "new": later frames are tracked against it; "revisited": they are tracked against an earlier keyframe again,
+    and the frame is a keyframe in mapping alone; "none": it is no keyframe.
+    reason : one phrase; "" where it is no keyframe.
+    promotes_previous : whether the frame tracked before it has become the keyframe that it is tracked against.
+    """
+
+    kind: KeyframeKind = "none"
+    reason: str = ""
+    promotes_previous: bool = False
 
 
 @dataclass(frozen=True)
@@ -40,6 +57,7 @@ class Track:
         optical flow since the frame before, share of the width. quality : see `Frame`. NaN where they are not known.
     nonrigidity : `REGIONS` float32, by how many standard deviations the tissue in each region of the picture moves
         against the rigid scene, NaN where too few corners are matched; None: not measured.
+    decision : whether the frame becomes a keyframe.
     """
 
     index: int
@@ -62,6 +80,7 @@ class Track:
     rotation: np.ndarray | None = None
     cause: LossCause = LossCause.NONE
     relocalised: bool = False
+    decision: KeyframeDecision = KeyframeDecision()
 
     @property
     def row(self) -> dict[str, Any]:
@@ -81,25 +100,44 @@ class Track:
         return share, float(x), float(y)
 
 
+@dataclass(frozen=True)
+class TrackedFrames:
+    """All frames of a run as tracked, in order.
+
+    index : (F,) int, their numbers. lost : (F,) bool. map : (F,) int, number of the map that a tracked frame is in.
+    T_world_camera : (F, 4, 4), in the world of the map, NaN where a frame is lost. median_depth_mm, motion, quality :
+    (F,), the latter two as in `Track`, NaN where unknown.
+    """
+
+    index: np.ndarray
+    lost: np.ndarray
+    map: np.ndarray
+    T_world_camera: np.ndarray
+    median_depth_mm: np.ndarray
+    motion: np.ndarray
+    quality: np.ndarray
+
+    def poses_of(self, frames: Collection[int]) -> dict[int, np.ndarray]:
+        """Return T_world_camera (4, 4) by number of the frames with these numbers."""
+        chosen = np.isin(self.index, list(frames))
+        return dict(zip(self.index[chosen].tolist(), self.T_world_camera[chosen], strict=True))
+
+
 class FrameTracker(Protocol):
-    """Protocol of trackers, which take frames in order: `Tracker`, and those that derive from it, as baselines do."""
+    """Protocol of trackers, which take frames in order: `track` each, then `update` with it unless it is lost."""
 
     def track(self, frame: Frame) -> Track:
-        """Return a frame's pose by its raw `depth_mm`, or why it is lost; the first usable one is "initial"."""
+        """Return a frame's pose by its raw `depth_mm`, or why it is lost; the first usable one is "initial".
 
-    def needs_keyframe(self) -> bool:
-        """Return whether the frame that was tracked last should become a reference for those to come."""
+        The track says whether the frame becomes a keyframe.
+        """
 
-    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
-        """Make a tracked frame, with its refined depth and its pose, the reference; False where it cannot be one."""
+    def update(self, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
+        """Take the frame that was tracked last, with its refined depth and its pose, as its track decided.
 
-    def remember(self, frame: Frame) -> bool:
-        """Take the last tracked frame, which is no keyframe; return whether later ones may be tracked against it."""
-        return False
-
-    def another(self) -> FrameTracker | None:
-        """Return a tracker that has seen no frame, to track lost frames anew; None where that is not possible."""
-        return None
+        measured : whether the depth is measured, not predicted; then only keyframes are given. Return whether the frame
+        can be used so: a new keyframe needs depth, and not every tracker uses frames that are none.
+        """
 
 
 def motion_between(previous: Track | None, current: Track) -> np.ndarray | None:

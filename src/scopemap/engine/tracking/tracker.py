@@ -29,7 +29,7 @@ from scopemap.engine.tracking.relocalisation import Relocaliser, depth_ratio, is
 from scopemap.engine.tracking.residuals import View
 from scopemap.engine.tracking.rtdl import Alignment
 from scopemap.engine.tracking.sharpness import SharpnessMonitor
-from scopemap.engine.tracking.track import FrameTracker, Track, TrackingLoss
+from scopemap.engine.tracking.track import FrameTracker, KeyframeDecision, Track, TrackingLoss
 from scopemap.engine.tracking.usable import too_few_pixels
 
 _EARLIER_KEYFRAMES = 64  # by hand: of the current map, that are searched for one nearer than the current one
@@ -62,8 +62,6 @@ class KeyframeChoice:
     _quality: Kept[float] = 0.0
     _best_quality: Kept[float] = 0.0
     _first_agreement: Kept[float | None] = None
-    _last: Kept[Alignment | None] = None
-    _flow_failed: Kept[bool] = False
     _depth_mm: Kept[float] = 1.0
 
     def __init__(self, settings: TrackingSettings) -> None:
@@ -74,12 +72,8 @@ class KeyframeChoice:
         self.frames_since += 1
         self._quality, self._best_quality = frame.quality, max(frame.quality, self._best_quality)
 
-    def accept(self, alignment: Alignment, *, flow_failed: bool = False) -> None:
-        """Take the alignment of a tracked frame with the current keyframe.
-
-        flow_failed : whether only features found the frame; the next keyframe is then due.
-        """
-        self._last, self._flow_failed = alignment, flow_failed
+    def accept(self, alignment: Alignment) -> None:
+        """Take the alignment of a tracked frame with the current keyframe."""
         if self._first_agreement is None:
             self._first_agreement = alignment.agreement
 
@@ -91,20 +85,18 @@ class KeyframeChoice:
         """Begin with a new keyframe."""
         self.frames_since, self._best_quality = 0, 0.0
 
-    def is_due(self, alignment: Alignment | None = None) -> bool:
-        """Return whether a frame with this alignment should become a keyframe; None: the one that was accepted last."""
-        if alignment is None and self._flow_failed:
-            return True
-        alignment = alignment or self._last
+    def reason(self, alignment: Alignment) -> str:
+        """Return why a frame with this alignment should become a keyframe; "" where it need not."""
         settings = self._settings
         waits = settings.keyframes_wait and self._quality < _CLEAR * self._best_quality
         if self.frames_since >= settings.keyframe_every + (_PATIENCE if waits else 0) and self._has_moved(alignment):
-            return True
-        least = settings.min_keyframe_agreement * (self._first_agreement or 0.0)
-        return alignment is not None and (alignment.agreement < least or alignment.coverage < _KEYFRAME_COVERAGE)
+            return f"{self.frames_since} frames after the last keyframe"
+        if alignment.agreement < settings.min_keyframe_agreement * (self._first_agreement or 0.0):
+            return "the keyframe fits less well than at first"
+        return "few corners of the keyframe are matched" if alignment.coverage < _KEYFRAME_COVERAGE else ""
 
-    def _has_moved(self, alignment: Alignment | None) -> bool:
-        if alignment is None or not self._settings.keyframes_wait:
+    def _has_moved(self, alignment: Alignment) -> bool:
+        if not self._settings.keyframes_wait:
             return True
         T = alignment.motion.T_current_reference
         moved = rotation_angle_rad(T[:3, :3]) + np.linalg.norm(T[:3, 3]) / self._depth_mm
@@ -120,6 +112,12 @@ class Tracker(FrameTracker):
     photometric alignment (`rtdl.py`). A lost frame is recorded with the reason; the next one is aligned
     from the last pose, from the extrapolated one, and relocalised in recent keyframes. After several sharp frames lost
     in a row a new map begins, with its own world; later relocalisation may lead back to an older map.
+
+    `Track.decision` says whether a frame becomes a keyframe:
+
+    - "new" where the last one is old or fits badly (`KeyframeChoice`), and where flow fails and features find the frame
+    - "revisited" where an earlier keyframe is nearer; `_is_revisited` until a sharp frame is a keyframe in mapping
+    - after it was tracked, where features match the next frame with it alone: that one's track promotes it
     """
 
     _motion: Kept[MotionModel]
@@ -169,7 +167,7 @@ class Tracker(FrameTracker):
             skipped = f"not searched: one of {self._searched_every} lost frames is"
             return self._lost(frame, TrackingLoss(LossCause.OTHER, skipped))
         alignment, pyramid = self._aligner.align(keyframe, frame)
-        if self._choice.is_due(alignment) and not was_lost and not self._rejection(alignment):
+        if self._choice.reason(alignment) and not was_lost and not self._rejection(alignment):
             alignment = self._against_earlier_keyframe(frame, alignment)
         failure = self._failure(frame, alignment, sharpness)
         if failure is not None or was_lost or alignment.coverage < _WEAK_COVERAGE:
@@ -215,31 +213,18 @@ class Tracker(FrameTracker):
             return self._new_map(frame)
         return self._lost(frame, failure.loss._replace(reason=f"rejected: {failure.loss.reason}"), alignment)
 
-    def remember(self, frame: Frame) -> bool:
-        """Take the frame that was tracked last, with its refined depth and its pose: the next may be matched with it.
+    def update(self, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
+        """Take a tracked frame as decided; a new keyframe has planes if `measured`, and is refused without depth.
 
-        Where tissue moves further than flow follows, features still match successive frames. `Track.keyframe` is then
-        the number of this frame, which is a keyframe from there on.
+        A frame that is no keyframe is kept until the next one. Where tissue moves further than flow follows, features
+        still match successive frames: the next track may promote it to a keyframe.
         """
-        self._last = None if self._is_unsharp else frame
-        return True
-
-    def another(self) -> Tracker:
-        """Return a tracker with the same parts that has seen no frame."""
-        return Tracker(self.settings, self._aligner.flow, self._relocaliser.detector)
-
-    def needs_keyframe(self) -> bool:
-        """Return whether the frame that was tracked last should become a keyframe."""
-        if self._keyframe is None:
-            return True
-        # The depth of an unsharp frame is no better than its image.
-        return (self._is_revisited or self._choice.is_due()) and not self._is_unsharp
-
-    def insert_keyframe(self, frame: Frame, *, measured: bool) -> bool:
-        """Make a tracked frame the keyframe, with planes if `measured`; False, changing nothing, without depth."""
         if frame.depth_mm is None or frame.T_world_camera is None:
-            raise ValueError("a keyframe needs a depth and a pose")
-        if self._is_revisited:
+            raise ValueError("a tracked frame needs a depth and a pose")
+        if decision.kind == "none":
+            self._last = None if self._is_unsharp else frame
+            return self._last is not None
+        if decision.kind == "revisited":
             self._is_revisited, self._choice.frames_since = False, 0
             return True
         keyframe = self._keyframe_of(frame, measured)
@@ -319,11 +304,15 @@ class Tracker(FrameTracker):
     def _accept_found(self, frame: Frame, keyframe: Keyframe, alignment: Alignment) -> Track:
         """Return the track of a frame that features found in a keyframe, which becomes the current one."""
         relocalised = keyframe.map != self._motion.map or self._motion.frames_lost > 0
-        if self._last is not None and keyframe.frame.index == self._last.index:
+        promotes_previous = self._last is not None and keyframe.frame.index == self._last.index
+        if promotes_previous:
             self._relocaliser.add(keyframe)
             self._choice.frames_since = 1
         self._use_keyframe(keyframe)
-        return self._accept(frame, alignment, flow_failed=True, relocalised=relocalised)
+        track = self._accept(frame, alignment, found_by_features=True)
+        decision = replace(track.decision, promotes_previous=promotes_previous)
+        reason = "relocalised" if relocalised else ""
+        return replace(track, reason=reason, relocalised=relocalised, decision=decision)
 
     def _use_keyframe(self, keyframe: Keyframe) -> None:
         self._keyframe, self._last = keyframe, None
@@ -335,9 +324,7 @@ class Tracker(FrameTracker):
         assert self._keyframe is not None
         return self._aligner.rejection(self._keyframe, alignment)
 
-    def _accept(
-        self, frame: Frame, alignment: Alignment, *, flow_failed: bool = False, relocalised: bool = False
-    ) -> Track:
+    def _accept(self, frame: Frame, alignment: Alignment, *, found_by_features: bool = False) -> Track:
         """Return the track of a frame with the pose of its alignment with the current keyframe."""
         keyframe = self._keyframe
         assert keyframe is not None
@@ -349,9 +336,19 @@ class Tracker(FrameTracker):
         self._after_close_up, self._sharp_frames_lost = False, 0
         self._motion.follow(T_world_camera)
         self._relocaliser.count(keyframe.map)
-        self._choice.accept(alignment, flow_failed=flow_failed)
-        track = Track(frame.index, "ok", "relocalised" if relocalised else "", T_world_camera, keyframe.frame.index)
-        return replace(_fitted(track, keyframe, alignment), depth_ratio=ratio, relocalised=relocalised)
+        self._choice.accept(alignment)
+        decision = self._decide(alignment, found_by_features=found_by_features)
+        track = Track(frame.index, "ok", "", T_world_camera, keyframe.frame.index, decision=decision)
+        return replace(_fitted(track, keyframe, alignment), depth_ratio=ratio)
+
+    def _decide(self, alignment: Alignment, *, found_by_features: bool) -> KeyframeDecision:
+        """Return whether a frame with this accepted alignment becomes a keyframe."""
+        if self._is_unsharp:  # its depth is no better than its image
+            return KeyframeDecision()
+        if self._is_revisited:
+            return KeyframeDecision("revisited", "an earlier keyframe is nearer than the last one")
+        reason = "flow fails, features find the frame" if found_by_features else self._choice.reason(alignment)
+        return KeyframeDecision("new", reason) if reason else KeyframeDecision()
 
     def _lost(self, frame: Frame, loss: TrackingLoss, alignment: Alignment | None = None) -> Track:
         self._motion.frames_lost += 1
@@ -365,10 +362,12 @@ class Tracker(FrameTracker):
         self._motion.begin_map()
         self._forget_map()
         self._keyframe, self._after_close_up, self._sharp_frames_lost = None, False, 0
+        self._is_revisited = False
         return self._first(frame, "new map")
 
     def _first(self, frame: Frame, reason: str = "first frame of the map") -> Track:
-        return Track(frame.index, "initial", reason, np.eye(4), frame.index, map=self._motion.map)
+        decision = KeyframeDecision("new", "first frame of the map")
+        return Track(frame.index, "initial", reason, np.eye(4), frame.index, map=self._motion.map, decision=decision)
 
     def _forget_map(self) -> None:
         self._earlier_keyframes.clear()
