@@ -16,12 +16,11 @@ from scopemap.engine.flow.corners import detect_corners, sample_flow
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp, se3_log
-from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose, adjusted_maps, backend, other_starts
+from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose, adjusted_maps, backend, judge
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
 from scopemap.engine.mapping.frame_correction import KeyframeStep
-from scopemap.engine.mapping.lens_test import LensTest
-from scopemap.engine.mapping.other_starts import ShapeTest
+from scopemap.engine.mapping.judge import LensTest, ShapeTest
 
 POSES = [
     plane_scene.pose(at_mm=(2.0 * n, 0.6 * n, 0.5 * n), turn_rad=(0.01 * n, -0.01 * n, 0.02 * n)) for n in range(6)
@@ -222,7 +221,7 @@ def test_poses_stay_as_tracked_where_the_starts_end_in_different_shapes(monkeypa
     monkeypatch.setattr(adjusted_maps, "with_other_starts", lambda problem, found, is_rigid: (found, undetermined))
     kept = plane_scene.adjusted(map(_frame, range(5)))  # one rigid scene fits: the poses are the better ones
     assert [notice.code for notice in kept.notices][:2] == ["mapping-adjusted", "shape-not-determined"]
-    monkeypatch.setattr(other_starts, "RIGID_SIGMA_PX", 0.01)
+    monkeypatch.setattr(judge, "RIGID_SIGMA_PX", 0.01)
     correction = plane_scene.adjusted(map(_frame, range(5)))
     assert [notice.code for notice in correction.notices] == ["mapping-not-determined"]
     assert "depth network alone" in correction.notice.text

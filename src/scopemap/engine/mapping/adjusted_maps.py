@@ -26,23 +26,11 @@ from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Points, State
-from scopemap.engine.mapping.depth_correction import (
-    DepthCorrectionField,
-    fit_depth_corrections,
-    growth_of_disagreement,
-)
-from scopemap.engine.mapping.feature_tracks import NEAR_GAPS
+from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
-from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
+from scopemap.engine.mapping.judge import MapErrors, ShapeTest, refusal_by_depth, refusal_by_views
+from scopemap.engine.mapping.other_starts import with_other_starts
 from scopemap.engine.notices import Notice
-
-# Merged maps may increase the reprojection errors within the main map by this factor, plus noise.
-_MAX_ERROR_FACTOR = 1.5  # by hand
-_NOISE_PX = 0.05  # by hand
-# Keyframes of either map with loops to the other, where errors between maps are larger than within or untested.
-_MIN_LOOPED = 4  # by hand
-# Learned features are matched to about a pixel: errors between maps of one place were up to 0.96 px, of two from 1.38.
-_MAX_FEATURE_PX = 1.2
 
 
 @dataclass(frozen=True)
@@ -126,85 +114,55 @@ class MapKeyframes:
             after = [factor * grid for factor, grid in zip(factors, after, strict=True)]
         return inverse(found.state.T_camera_world), after
 
-    def depth_contradiction(
-        self, found: BundleSolution, fields: tuple[DepthCorrectionField, ...] = ()
-    ) -> Notice | None:
+    def refusal_by_depth(self, found: BundleSolution, fields: tuple[DepthCorrectionField, ...] = ()) -> Notice | None:
         """Return that the depths of keyframes agree less than as tracked; None: they agree about as well."""
-        T_world_camera, after = self.adjusted_depths(found, fields)
         before = self.T_world_camera, self.tracked_depths
-        grown = growth_of_disagreement(self.camera, before, (T_world_camera, after), NEAR_GAPS)
-        if grown is None:
-            return None
-        return Notice("mapping-depth-disagrees", {"tracked": grown[0], "adjusted": grown[1], "merged": ""})
+        return refusal_by_depth(self.camera, before, self.adjusted_depths(found, fields))
 
     def _with_steps(self, correction: FrameCorrection) -> FrameCorrection:
         return correction.with_steps(self.poses, self.steps, self.S_common_map)
 
 
 class AdjustedMaps(NamedTuple):
-    """A correction, and robust standard deviations of the reprojection errors, px; NaN without observations.
-
-    main_px : within the main map. largest_px : the largest within one map; graph_px : the same from the pose graph,
-    infinite where the depths of keyframes agree less there than as tracked. between_px : the largest between another
-    map and all others. support : keyframes on either side of the accepted loops of the least supported map. problem,
-    solution : what was solved, and where that ended, refused or not.
-    """
+    """A correction, what merged maps are judged by, what was solved, and where that ended, refused or not."""
 
     correction: FrameCorrection
+    errors: MapErrors
     problem: BundleProblem
     solution: State
-    main_px: float
-    largest_px: float
-    between_px: float
-    graph_px: float
-    support: int
-
-    def accepted(self, alone: AdjustedMaps, max_sigma_px: float) -> bool:
-        """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone.
-
-        Where tissue moves, so that not even the main map is adjusted, the pose graph merges them: loops of several
-        keyframes agree with each other and with both maps as tracked, which fit as well as alone.
-        """
-        if alone.correction.refused and self.correction.refused:
-            fits = self.graph_px <= _MAX_ERROR_FACTOR * alone.graph_px + _NOISE_PX
-            return fits and self.support >= _MIN_LOOPED
-        rigid = not self.correction.refused and self.largest_px <= max_sigma_px
-        by_features = self.support >= _MIN_LOOPED and self.between_px <= _MAX_FEATURE_PX
-        connected = self.correction.loops > 0 and (self.between_px <= max_sigma_px or by_features)
-        return rigid and connected and self.main_px <= _MAX_ERROR_FACTOR * alone.main_px + _NOISE_PX
 
 
 def adjust_maps(keyframes: MapKeyframes, problem: BundleProblem, loops: np.ndarray, main: int) -> AdjustedMaps:
     """Return the bundle adjustment of keyframes, judged; loops : (A, 2) int, those of the accepted loop closures."""
     found, shape = _solution(keyframes, problem)
     fields: tuple[DepthCorrectionField, ...] = ()
-    refused = _refusal_by_views(keyframes, found, shape)
+    refused = refusal_by_views(found.sigma_px, keyframes.settings.max_sigma_px, shape)
     if refused is None:
         fields = keyframes.depth_fields(problem.points, found)
         # Other starts have judged the shape, where they could; else the depths do.
-        refused = None if shape.is_tested else keyframes.depth_contradiction(found, fields)
+        refused = None if shape.is_tested else keyframes.refusal_by_depth(found, fields)
     graph_contradicts = False
     if refused is None:
         correction = replace(keyframes.correction(found), depth_fields=fields, shape=shape, loops=len(loops))
     elif len(keyframes.S_common_map) > 1 and problem.start is not None:
         by_graph = found._replace(state=problem.start._replace(sigma_px=found.sigma_px))
         correction = replace(keyframes.correction(by_graph), refused=refused, loops=len(loops))
-        graph_contradicts = keyframes.depth_contradiction(by_graph) is not None
+        graph_contradicts = keyframes.refusal_by_depth(by_graph) is not None
     else:
         correction = replace(keyframes.uncorrected(found.sigma_px), refused=refused, shape=shape)
     correction = replace(correction, loop_frames=keyframes.index[loops].tolist() if correction.loops else [])
     within_px, between_px = _errors_of_maps(keyframes, problem, found.state, main)
     before_px, _ = _errors_of_maps(keyframes, problem, problem.begin, main)
-    return AdjustedMaps(
-        correction,
-        problem,
-        found.state,
+    errors = MapErrors(
+        is_adjusted=refused is None,
         main_px=within_px[main],
         largest_px=_largest(within_px),
-        between_px=between_px,
         graph_px=math.inf if graph_contradicts else _largest(before_px),
+        between_px=between_px,
+        loops=correction.loops,
         support=_loop_support(loops, keyframes.map_of, main),
     )
+    return AdjustedMaps(correction, errors, problem, found.state)
 
 
 def _solution(keyframes: MapKeyframes, problem: BundleProblem) -> tuple[BundleSolution, ShapeTest]:
@@ -213,16 +171,6 @@ def _solution(keyframes: MapKeyframes, problem: BundleProblem) -> tuple[BundleSo
     if len(keyframes.S_common_map) > 1 or not settings.other_starts:
         return found, ShapeTest()
     return with_other_starts(problem, found, is_rigid=found.sigma_px <= settings.max_sigma_px)
-
-
-def _refusal_by_views(keyframes: MapKeyframes, found: BundleSolution, shape: ShapeTest) -> Notice | None:
-    """Return why the views refuse a solution; None where they do not."""
-    if not found.sigma_px <= keyframes.settings.max_sigma_px:  # NaN: nothing was observed
-        return Notice("mapping-not-rigid", {"sigma_px": found.sigma_px, "merged": ""})
-    if shape.refuses(found.sigma_px):
-        errors = {"error_px": shape.error_px, "other_px": shape.other_px}
-        return Notice("mapping-not-determined", {**errors, "merged": ""})
-    return None
 
 
 def _errors_of_maps(

@@ -23,8 +23,8 @@ from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundlePr
 from scopemap.engine.mapping.depth_correction import depth_grid
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
-from scopemap.engine.mapping.lens_kinds import LensKinds
-from scopemap.engine.mapping.lens_test import lens_test
+from scopemap.engine.mapping.judge import refusal_by_lens
+from scopemap.engine.mapping.lens import LensKinds, lens_test
 from scopemap.engine.mapping.loop_closure import LOOP, Loop, LoopFinder
 from scopemap.engine.mapping.map_merging import Part, merge_maps, split_maps
 from scopemap.engine.mapping.pose_graph import (
@@ -35,7 +35,6 @@ from scopemap.engine.mapping.pose_graph import (
     tracked_pairs,
 )
 from scopemap.engine.mapping.segments import Segment, adjust_interval, choose_segments, joined
-from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.features import FeatureDetector
 
 # Reprojection error, rad, of observations that support a motion across a loss: drift is less, false matches are more.
@@ -222,8 +221,8 @@ class Backend:
         tested = found if alone.correction.refused else alone
         lens = lens_test(tested.problem, tested.solution)
         lens = self.lenses.better_than(lens, tested.problem, tested.solution)
-        if lens.is_worse and tested is found and not found.correction.refused:
-            worse = Notice("mapping-worse", {"error_px": lens.held_px, "tracked_px": lens.tracked_px, "merged": ""})
+        worse = refusal_by_lens(lens)
+        if worse is not None and tested is found and not found.correction.refused:
             return replace(self._keyframes_of(worlds).uncorrected(lens.held_px), refused=worse, lens=lens)
         if len(worlds) == 1 and found.correction.refused and not lens.contradicts:
             return found.correction
@@ -244,7 +243,7 @@ class Backend:
             if refused > len(merged) or number not in (S := self._merged(main, few)):
                 continue
             together = self._adjusted(S, main)
-            if not together.accepted(alone, self._settings.max_sigma_px):
+            if not together.errors.fit(alone.errors, self._settings.max_sigma_px):
                 refused += 1
                 continue
             merged.add(number)
@@ -253,7 +252,7 @@ class Backend:
         if len(worlds) < len(merged):
             S = self._merged(main, merged)
             together = self._adjusted(S, main)
-            if together.accepted(alone, self._settings.max_sigma_px):
+            if together.errors.fit(alone.errors, self._settings.max_sigma_px):
                 return together, S
         return found, worlds
 

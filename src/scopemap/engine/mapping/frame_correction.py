@@ -11,8 +11,7 @@ import numpy as np
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, mean_near, rotation_angle_rad
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField
-from scopemap.engine.mapping.lens_test import LensTest
-from scopemap.engine.mapping.other_starts import ShapeTest
+from scopemap.engine.mapping.judge import LensTest, ShapeTest
 from scopemap.engine.notices import Notice
 
 _AT_REST = 1e-6  # guard: rad

@@ -18,7 +18,7 @@ from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.backend import Backend
 from scopemap.engine.mapping.feature_tracks import KeyframeMatches
 from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
-from scopemap.engine.mapping.lens_kinds import LensKinds
+from scopemap.engine.mapping.lens import LensKinds
 from scopemap.engine.mapping.map_merging import Part
 from scopemap.engine.mapping.segments import Segment
 from scopemap.engine.notices import Notice
