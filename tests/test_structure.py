@@ -182,7 +182,8 @@ CEILINGS = {
     # 135: how kernels are compiled, in one place.
     # 142: segments, and the verdict on each, by which the main one is chosen.
     # 136: without tissue that moves by one curve.
-    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 136),
+    # 135: mapping in fewer files.
+    "modules that a run imports": (lambda: len(import_closure("scopemap.runner.run")), 135),
     "lines of pipeline.py": (lambda: _read(SOURCE / "engine" / "pipeline.py").lines, 106),
     # 47: a result that does not say which frames it is of cannot be repeated.
     "settings but the advanced ones": (lambda: len(setting_names()) - _advanced_settings(), 47),
@@ -262,11 +263,11 @@ def import_closure(start: str) -> set[str]:
 
 def test_the_pipeline_imports_few_modules() -> None:
     closure = import_closure("scopemap.engine.pipeline")
-    assert "scopemap.engine.mapping.backend" in closure
+    assert "scopemap.engine.mapping.hypotheses" in closure
     # With notices, causes of losses, local adjustment, its lens, other starts, where tissue moves, the judging of an
     # adjustment, segments, the parts of all stages, which frames can be tracked and are fused, what stages keep, and
     # how kernels are compiled.
-    assert len(closure) <= 78, "\n".join(sorted(closure))
+    assert len(closure) <= 77, "\n".join(sorted(closure))
 
 
 def test_no_import_circles() -> None:

@@ -20,7 +20,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion
 from scopemap.engine.mapping.local_adjustment import LocalAdjustment
-from scopemap.engine.mapping.submaps import Mapper
+from scopemap.engine.mapping.mapper import Mapper
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Odometry, Step
 from scopemap.engine.preprocessing import Matching, PreprocessedFrame, Preprocessing

@@ -19,8 +19,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.judge import LensTest
-from scopemap.engine.mapping.segments import Segment
-from scopemap.engine.mapping.submaps import Submap
+from scopemap.engine.mapping.segments import Segment, Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.engine.pipeline import Pipeline

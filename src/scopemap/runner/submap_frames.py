@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.engine.errors import InputError
-from scopemap.engine.mapping.submaps import Submap
+from scopemap.engine.mapping.segments import Submap
 from scopemap.engine.tracking.causes import LossCause, causes_of_loss
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY
 from scopemap.result.frame_table import FrameTable

@@ -1,4 +1,4 @@
-"""Judge: whether an adjustment is kept. All limits are here, and all that decides by them.
+"""Judge: whether an adjustment is kept. All limits on that are here, and all that applies them.
 
 | what is adjusted | it is kept where | else |
 |---|---|---|
@@ -7,6 +7,8 @@
 | several maps together | `MapErrors.fit` | they stay apart |
 | successive keyframes that one scene explains | there is no `refusal_of_interval` | they are as tracked |
 | two such intervals together | `union_rank` | they stay two segments |
+| the same from another start | `is_clearly_less`, `is_same_shape` | the shape stays, or is not determined |
+| the same with another lens | `LensTest.contradicts`, `LensKinds.better_than` | the lens stays |
 
 What an adjustment has used cannot judge it. So it is judged by what it has not used:
 
@@ -14,6 +16,9 @@ What an adjustment has used cannot judge it. So it is judged by what it has not 
   (`halves`, `placed`). Their errors are compared (`left_out_px`) with those of another hypothesis, or as tracked
 - other starts: none of them may explain the left-out tracks as well by another shape (`ShapeTest`)
 - predicted depth away from the corners: keyframes that see the same surface must agree on it
+
+Which loop closures are accepted is another question (`loop_closure.py`, `pose_graph.py`), and so is triangulated depth
+(`multiview_depth.py`).
 """
 
 from __future__ import annotations
@@ -64,9 +69,9 @@ KNOWN_SIGMA = 0.2  # by hand
 # wrong, since tissue moves, .93 to 1.1.
 _CLEARLY_LESS = 0.85
 
-# Is it the lens? Between right lenses and one 15 % too short: a right lens leaves the same errors with the focal length
-# held and free: the ratio of both was 0.998 to 1.002 on three real clips with their calibration (C3VD cecum_t1_a and
-# trans_t2_a, Hamlyn); with a lens 15 % too short 0.94 on cecum_t1_a. Of another kind of lens, too.
+# Is it the lens? A right one leaves the same errors with the focal length held and free: the ratio of both was 0.998 to
+# 1.002 on three real clips with their calibration (C3VD cecum_t1_a and trans_t2_a, Hamlyn), and 0.94 with a lens 15 %
+# too short on cecum_t1_a. The limit is between; for another kind of lens it is the same.
 MOST_LENS_RATIO = 0.97
 """Of left-out errors through another lens over those through this one."""
 _SIGNIFICANT = 3.0  # standard deviations that the focal length must change by

@@ -21,9 +21,9 @@ from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_adjustment import HELD_SIGMA, BundleSolution, adjust
 from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundleProblem, Observations, Points, State
-from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
+from scopemap.engine.mapping.correction import KeyframeCorrection, KeyframeStep
+from scopemap.engine.mapping.depth_correction import fit_depth_corrections
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
-from scopemap.engine.mapping.frame_correction import KeyframeStep
 from scopemap.engine.mapping.judge import RIGID_SIGMA_PX, ShapeTest, keeps_window, observes_enough, tissue_moves
 from scopemap.engine.mapping.other_starts import with_other_starts
 from scopemap.engine.notices import Notice
@@ -32,22 +32,6 @@ _GAPS = (1, 2)  # by hand: a keyframe's corners are matched in those so many bef
 _FREE = 3  # by hand: last keyframes of the window that move
 _ITERATIONS = 10  # by hand: steps of a window's adjustment
 _REMEMBERED = 1000  # by hand: keyframes whose correction is kept: the tracker returns to fewer
-
-
-class KeyframeCorrection(NamedTuple):
-    """Correction of a keyframe's depth: ln of the factor of all of it, and of that of each pixel (None: 1)."""
-
-    log_scale: float = 0.0
-    field: DepthCorrectionField | None = None
-
-    def corrected(self, frame: Frame) -> Frame:
-        """Return a frame with its depth, and the standard deviation of that, corrected."""
-        depth_mm, sigma_mm = np.asarray(frame.depth_mm), frame.depth_sigma_mm
-        log = 0.0 if self.field is None else self.field.log_factor(depth_mm)
-        factor = np.exp(np.float32(self.log_scale) + log, dtype=np.float32)
-        return replace(
-            frame, depth_mm=depth_mm * factor, depth_sigma_mm=None if sigma_mm is None else sigma_mm * factor
-        )
 
 
 class AdjustedKeyframe(NamedTuple):

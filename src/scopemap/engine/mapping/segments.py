@@ -12,19 +12,20 @@ Neighbours share a keyframe, which joins them by Sim(3): the path has no steps.
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.align import Similarity
-from scopemap.engine.mapping.adjusted_maps import MapKeyframes, adjust_maps
 from scopemap.engine.mapping.bundle_adjustment import adjust
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, successive
+from scopemap.engine.mapping.correction import FrameCorrection
 from scopemap.engine.mapping.depth_correction import depth_log_ratios
 from scopemap.engine.mapping.feature_tracks import NEAR_GAPS
-from scopemap.engine.mapping.frame_correction import FrameCorrection
 from scopemap.engine.mapping.judge import (
     LEAST_COMPARED,
     Interval,
@@ -32,9 +33,9 @@ from scopemap.engine.mapping.judge import (
     left_out_px,
     mean_of_known,
     placed,
-    refusal_of_interval,
     union_rank,
 )
+from scopemap.engine.mapping.keyframes import MapKeyframes
 
 PIECE = 4
 """Steps between the keyframes of a piece, about a second: five keyframes, as many as are adjusted together as they
@@ -61,8 +62,43 @@ class Segment:
     frames: frozenset[int] = frozenset()
 
 
-class IntervalJudge:
-    """Says how well one scene explains successive keyframes, each pair of keyframes being compared once."""
+@dataclass(frozen=True)
+class Submap:
+    """Frames that share a world after the last frame.
+
+    Attributes
+    ----------
+    main : number of its map with most frames. maps : numbers of all maps merged into it.
+    frames : numbers of the frames tracked in these. main_frames : of those tracked in the main map. segments : parts of
+    its time, in order; one surface fits the frames of each.
+    """
+
+    main: int
+    maps: tuple[int, ...]
+    frames: frozenset[int]
+    main_frames: frozenset[int]
+    segments: tuple[Segment, ...]
+
+    def depth_factor(self, index: int) -> float:
+        """Return the factor of the whole depth of the frame with this number."""
+        correction = self.correction(index)
+        return 1.0 if correction is None else correction.depth_factor(index)
+
+    def correction(self, index: int) -> FrameCorrection | None:
+        """Return the correction of the frame with this number; None: it is as tracked."""
+        return self.segments[self.segment_of(index)].correction
+
+    def segment_of(self, index: int) -> int:
+        """Return the number of the segment that a frame of this number is in."""
+        return min(bisect_left(self._lasts, index), len(self.segments) - 1)
+
+    @cached_property
+    def _lasts(self) -> list[int]:
+        return [segment.last for segment in self.segments]
+
+
+class _IntervalTest:
+    """Measures how well one scene explains successive keyframes, each pair of keyframes being compared once."""
 
     def __init__(self, keyframes: MapKeyframes, problem: BundleProblem) -> None:
         self._keyframes = keyframes
@@ -70,7 +106,7 @@ class IntervalJudge:
         self._grids_mm = keyframes.tracked_depths
         self._compared: dict[tuple[int, int], float] = {}
 
-    def judge(self, first: int, last: int, shared: int | None = None) -> Interval:
+    def measure(self, first: int, last: int, shared: int | None = None) -> Interval:
         """Return what is known of the keyframes from `first` to `last`; shared : where the parts of a union meet."""
         adjusted, left_out = (successive(half, first, last + 1) for half in (self._adjusted, self._left_out))
         found = adjust(adjusted, max_iterations=_ITERATIONS)
@@ -86,9 +122,9 @@ class IntervalJudge:
         tracked = [self._as_tracked(first + one, first + other) for one, other in pairs]
         return Interval(first, last, error_px, tracked_px, mean_of_known(after), mean_of_known(tracked))
 
-    def judge_union(self, one: Interval, other: Interval) -> Interval:
+    def measure_union(self, one: Interval, other: Interval) -> Interval:
         """Return what is known of two neighbours together."""
-        return self.judge(one.first, other.last, other.first)
+        return self.measure(one.first, other.last, other.first)
 
     def _as_tracked(self, one: int, other: int) -> float:
         if (one, other) not in self._compared:
@@ -107,9 +143,9 @@ def _disagreement(
 
 def choose_segments(keyframes: MapKeyframes, problem: BundleProblem) -> list[Interval]:
     """Return the intervals of keyframes that one scene explains, in order; neighbours share a keyframe within a map."""
-    judge, most_px = IntervalJudge(keyframes, problem), keyframes.settings.max_sigma_px
-    found = [judge.judge(*piece) for piece in _pieces(keyframes.map_of)]
-    unions = {pair: judge.judge_union(*pair) for pair in itertools.pairwise(found)}
+    test, most_px = _IntervalTest(keyframes, problem), keyframes.settings.max_sigma_px
+    found = [test.measure(*piece) for piece in _pieces(keyframes.map_of)]
+    unions = {pair: test.measure_union(*pair) for pair in itertools.pairwise(found)}
     while True:
         ranked = {pair: union_rank(union, pair, most_px) for pair, union in unions.items()}
         ranks = {pair: rank for pair, rank in ranked.items() if rank is not None}
@@ -120,16 +156,7 @@ def choose_segments(keyframes: MapKeyframes, problem: BundleProblem) -> list[Int
         found[place : place + 2] = [union]
         near = itertools.pairwise(found[max(place - 1, 0) : place + 2])
         kept = {pair: unions[pair] for pair in itertools.pairwise(found) if pair in unions}
-        unions = kept | {pair: judge.judge_union(*pair) for pair in near}
-
-
-def adjust_interval(keyframes: MapKeyframes, problem: BundleProblem, interval: Interval) -> FrameCorrection:
-    """Return the correction of an interval by itself: as tracked where left-out tracks or depth prefer that."""
-    own = keyframes.successive(interval.first, interval.last + 1)
-    if (refused := refusal_of_interval(interval, keyframes.settings.max_sigma_px)) is not None:
-        return replace(own.uncorrected(interval.error_px), refused=refused)
-    part = successive(problem, interval.first, interval.last + 1)
-    return adjust_maps(own, part, np.zeros((0, 2), int), own.poses[0].map).correction
+        unions = kept | {pair: test.measure_union(*pair) for pair in near}
 
 
 def _pieces(map_of: np.ndarray) -> list[tuple[int, int]]:
