@@ -16,12 +16,11 @@ from scopemap.engine.flow.corners import detect_corners, sample_flow
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp, se3_log
-from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose, adjusted_maps, backend, other_starts
+from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose, hypotheses, judge
 from scopemap.engine.mapping.bundle_problem import Observations, Points
+from scopemap.engine.mapping.correction import KeyframeStep
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
-from scopemap.engine.mapping.frame_correction import KeyframeStep
-from scopemap.engine.mapping.lens_test import LensTest
-from scopemap.engine.mapping.other_starts import ShapeTest
+from scopemap.engine.mapping.judge import LensTest, ShapeTest
 from scopemap.result.wording import text_of
 
 POSES = [
@@ -52,7 +51,7 @@ def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
 
 
 def test_poses_stay_as_tracked_where_left_out_tracks_prefer_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backend, "lens_test", lambda problem, solution: LensTest(held_px=1.04, tracked_px=0.74))
+    monkeypatch.setattr(hypotheses, "lens_test", lambda problem, solution: LensTest(held_px=1.04, tracked_px=0.74))
     correction = plane_scene.adjusted(_frame(number) for number in range(4))
     assert correction.refused is not None
     assert correction.refused.code == "mapping-worse"
@@ -220,10 +219,10 @@ def test_an_adjustment_says_what_determines_the_shape() -> None:
 
 def test_poses_stay_as_tracked_where_the_starts_end_in_different_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
     undetermined = ShapeTest("not determined", False, 0.2, 0.3, 0.30, 0.31)
-    monkeypatch.setattr(adjusted_maps, "with_other_starts", lambda problem, found, is_rigid: (found, undetermined))
+    monkeypatch.setattr(hypotheses, "with_other_starts", lambda problem, found, is_rigid: (found, undetermined))
     kept = plane_scene.adjusted(map(_frame, range(5)))  # one rigid scene fits: the poses are the better ones
     assert [notice.code for notice in kept.notices][:2] == ["mapping-adjusted", "shape-not-determined"]
-    monkeypatch.setattr(other_starts, "RIGID_SIGMA_PX", 0.01)
+    monkeypatch.setattr(judge, "RIGID_SIGMA_PX", 0.01)
     correction = plane_scene.adjusted(map(_frame, range(5)))
     assert [notice.code for notice in correction.notices] == ["mapping-not-determined"]
     assert "depth network alone" in text_of(correction.notice)

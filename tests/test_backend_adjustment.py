@@ -11,7 +11,8 @@ from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
 from scopemap.engine.mapping.bundle_adjustment import adjust, adjust_in_windows, linearised
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.engine.mapping.lens_test import LensTest, lens_test
+from scopemap.engine.mapping.judge import LensTest
+from scopemap.engine.mapping.lens import lens_test
 
 LOOSE = Priors(rotation_rad=10, translation_share=10)
 

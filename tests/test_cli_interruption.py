@@ -15,7 +15,8 @@ from front_door import call
 from tiny_phantom import FRAMES, write_tiny
 
 from scopemap.engine.frame import Frame
-from scopemap.engine.mapping.submaps import Mapper, Submap
+from scopemap.engine.mapping.mapper import Mapper
+from scopemap.engine.mapping.segments import Submap
 from scopemap.engine.odometry import Step
 from scopemap.input.sequence import Sequence
 from scopemap.result.trajectories import read_trajectory

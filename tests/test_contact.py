@@ -19,8 +19,7 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.depth.mapis import DenseCorrespondence
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.engine.mapping.segments import Segment
-from scopemap.engine.mapping.submaps import Submap
+from scopemap.engine.mapping.segments import Segment, Submap
 from scopemap.engine.tracking.causes import ADVICE, LossCause, causes_of_loss
 from scopemap.engine.tracking.relocalisation import RotationFollower, rotation_by_flow
 from scopemap.engine.tracking.track import Track

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.mapping import MAX_LOG_FACTOR, FrameCorrection
+from scopemap.engine.mapping.correction import FinalFrames
 from scopemap.engine.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthCorrectionField, fit_depth_correction
-from scopemap.engine.mapping.submaps import FinalFrames
 
 HEIGHT, WIDTH = 120, 160
 

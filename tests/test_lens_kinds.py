@@ -12,8 +12,8 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.cameras.lenses import FisheyeCamera
 from scopemap.engine.mapping.bundle_adjustment import adjust
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors
-from scopemap.engine.mapping.lens_kinds import LensKinds, angle_of_radius
-from scopemap.engine.mapping.lens_test import LensTest, lens_test
+from scopemap.engine.mapping.judge import LensTest
+from scopemap.engine.mapping.lens import LensKinds, angle_of_radius, lens_test
 from scopemap.input.scopes import KINDS
 
 LOOSE = Priors(rotation_rad=10, translation_share=10)

@@ -10,7 +10,7 @@ from turning_clip import write_clip
 
 from scopemap.engine.cameras.lenses import FisheyeCamera
 from scopemap.engine.config import Config
-from scopemap.engine.mapping.lens_test import LensTest
+from scopemap.engine.mapping.judge import LensTest
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.input.opening import open_sequence

@@ -19,7 +19,7 @@ from scopemap.engine.frame import REGIONS, Frame, rows_in_memory
 from scopemap.engine.fusion.frame_store import FrameStore, SpreadFrames
 from scopemap.engine.mapping import Backend
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
-from scopemap.engine.mapping.submaps import Mapper
+from scopemap.engine.mapping.mapper import Mapper
 from scopemap.engine.tracking.track import Track
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.result.frame_table import ROW, FrameTable, GrowingFrameTable

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, se3_exp, so3_exp
 from scopemap.engine.mapping.loop_closure import Loop
-from scopemap.engine.mapping.map_merging import merge_maps
+from scopemap.engine.mapping.pose_graph import merge_maps
 
 DEPTH_MM = 50.0
 # Of nine keyframes; the second map is left and entered again.

@@ -25,8 +25,8 @@ from scopemap.engine.fusion.surface_fusion import TsdfVolume
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, so3_exp
 from scopemap.engine.mapping import Backend, Mapper, TrackedPose
+from scopemap.engine.mapping.correction import FinalFrames
 from scopemap.engine.mapping.pose_graph import PoseGraph, optimise_pose_graph
-from scopemap.engine.mapping.submaps import FinalFrames
 from scopemap.engine.tracking.relocalisation import Relocaliser
 from scopemap.engine.tracking.track import Track
 from scopemap.evaluation.poses import match, pose_report
@@ -209,7 +209,7 @@ def test_the_pose_graph_merges_no_maps_whose_depths_then_disagree(zoom: float, m
         graph = optimise_pose_graph(*given)
         return graph._replace(log_scale=graph.log_scale + zoom * (np.arange(len(graph.log_scale)) % 2))
 
-    monkeypatch.setattr("scopemap.engine.mapping.backend.optimise_pose_graph", with_other_scales)
+    monkeypatch.setattr("scopemap.engine.mapping.keyframes.optimise_pose_graph", with_other_scales)
     # No adjustment is so exact: all are refused, as where tissue moves.
     backend = Backend(MappingSettings(max_sigma_px=1e-3), DisFlow())
     for number in range(10):

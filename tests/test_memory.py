@@ -20,7 +20,7 @@ from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion
 from scopemap.engine.fusion.tsdf import VoxelBlocks, pack
-from scopemap.engine.mapping.backend import MOST_OBSERVATIONS
+from scopemap.engine.mapping.mapper import MOST_OBSERVATIONS
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.network_cost import network_cost
 

@@ -11,7 +11,8 @@ from scopemap.engine.geometry.se3 import inverse, se3_exp
 from scopemap.engine.mapping import other_starts
 from scopemap.engine.mapping.bundle_adjustment import adjust_in_windows
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
+from scopemap.engine.mapping.judge import ShapeTest
+from scopemap.engine.mapping.other_starts import with_other_starts
 
 FOCAL_PX = 400.0  # 320 px wide: 44 degrees, as a laparoscope's
 SEEN_PX = np.array([160.0, 128.0])

@@ -16,9 +16,9 @@ from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.engine.mapping import TrackedPose
-from scopemap.engine.mapping.backend import Backend
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
-from scopemap.engine.mapping.pose_graph import path_without_drift
+from scopemap.engine.mapping.keyframes import path_without_drift
+from scopemap.engine.mapping.mapper import Backend
 
 
 def _tracked(log_scale: np.ndarray, map_number: int = 0) -> list[TrackedPose]:
@@ -33,21 +33,21 @@ def test_drift_is_removed_and_noise_of_the_network_is_not_followed(per_keyframe:
     count, rng = 120, np.random.default_rng(seed)
     chained = per_keyframe * np.arange(count)
     tracked = _tracked(chained)
-    path = path_without_drift(tracked, chained + rng.normal(0, 0.1, count))
-    np.testing.assert_allclose(path.drift, chained, atol=0.15 + 0.2 * abs(chained[-1]))
-    steps = np.diff(path.T_world_camera[:, 0, 3])
-    np.testing.assert_allclose(np.log(steps), (chained - path.drift)[1:], atol=0.05)
-    np.testing.assert_array_equal(path.T_world_camera[:, :3, :3], [pose.T_world_camera[:3, :3] for pose in tracked])
+    drift, T = path_without_drift(tracked, chained + rng.normal(0, 0.1, count))
+    np.testing.assert_allclose(drift, chained, atol=0.15 + 0.2 * abs(chained[-1]))
+    steps = np.diff(T[:, 0, 3])
+    np.testing.assert_allclose(np.log(steps), (chained - drift)[1:], atol=0.05)
+    np.testing.assert_array_equal(T[:, :3, :3], [pose.T_world_camera[:3, :3] for pose in tracked])
 
 
 def test_each_map_keeps_its_first_keyframe_and_has_a_drift_of_its_own() -> None:
     drifting, steady = 0.02 * np.arange(60), np.full(60, 0.7)
     mixed = [pose for pair in zip(_tracked(drifting), _tracked(steady, 1), strict=True) for pose in pair]
-    path = path_without_drift(mixed, np.column_stack([drifting, steady]).ravel())
-    np.testing.assert_allclose(path.T_world_camera[0], mixed[0].T_world_camera)
-    np.testing.assert_allclose(path.T_world_camera[1::2], [pose.T_world_camera for pose in mixed[1::2]])
-    np.testing.assert_allclose(path.drift[1::2], 0, atol=1e-9)
-    assert path.drift[-2] > 0.5 * drifting[-1]
+    drift, T = path_without_drift(mixed, np.column_stack([drifting, steady]).ravel())
+    np.testing.assert_allclose(T[0], mixed[0].T_world_camera)
+    np.testing.assert_allclose(T[1::2], [pose.T_world_camera for pose in mixed[1::2]])
+    np.testing.assert_allclose(drift[1::2], 0, atol=1e-9)
+    assert drift[-2] > 0.5 * drifting[-1]
 
 
 @pytest.mark.parametrize("anchored", [False, True])
@@ -80,7 +80,7 @@ def test_the_adjustment_does_not_bring_the_drift_back(monkeypatch: pytest.Monkey
     steps = np.diff([T[:3, 3] for T in true], axis=0) * np.exp((log_scale[1:] + log_scale[:-1]) / 2)[:, None]
     # A point of one keyframe is in the picture of the next one alone, as where the camera moves fast: with all of them
     # in every picture observations alone would remove the drift.
-    monkeypatch.setattr("scopemap.engine.mapping.backend.FeatureTracks", partial(FeatureTracks, gaps=(1,)))
+    monkeypatch.setattr("scopemap.engine.mapping.mapper.FeatureTracks", partial(FeatureTracks, gaps=(1,)))
     for known in (True, False):
         frames = []
         for n, T_true in enumerate(true):

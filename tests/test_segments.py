@@ -19,10 +19,11 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, se3, so3_exp, transform
-from scopemap.engine.mapping.adjusted_maps import MapKeyframes
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
-from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
-from scopemap.engine.mapping.segments import Interval, choose_segments, joined
+from scopemap.engine.mapping.correction import FrameCorrection, KeyframeStep, TrackedPose
+from scopemap.engine.mapping.judge import Interval
+from scopemap.engine.mapping.keyframes import MapKeyframes
+from scopemap.engine.mapping.segments import choose_segments, joined
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 from scopemap.result.surface_segments import SurfaceSegment, main_segment, read_segments, write_segments

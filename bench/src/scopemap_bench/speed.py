@@ -59,7 +59,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "photometric alignment": ("engine.tracking.keyframe_alignment:align",),
     "relocalisation": ("engine.tracking.relocalisation:Relocaliser.find",),
     "MAPIS": ("engine.depth.mapis:Mapis.refine",),
-    "keyframe": ("engine.tracking.tracker:Tracker.update", "engine.mapping.submaps:Mapper.add_keyframe"),
+    "keyframe": ("engine.tracking.tracker:Tracker.update", "engine.mapping.mapper:Mapper.add_keyframe"),
     "store": ("engine.fusion.frame_store:FrameStore.put", "engine.fusion.frame_store:FrameStore._read"),
     "feature tracks": ("engine.mapping.feature_tracks:FeatureTracks.add",),
     "depth triangulation": (

@@ -10,7 +10,7 @@ import numpy as np
 
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.engine.mapping.submaps import Mapper
+from scopemap.engine.mapping.mapper import Mapper
 from scopemap.engine.preprocessing import without_depth
 from scopemap.engine.tracking.track import FrameTracker, Track, TrackedFrames
 

@@ -20,9 +20,9 @@ from scopemap.engine.fusion.free_space import FreeSpace, views_among
 from scopemap.engine.fusion.moving_tissue import MovingTissue, block_edge_mm
 from scopemap.engine.fusion.new_views import NewViews
 from scopemap.engine.fusion.surface_fusion import FusedSurface, SurfaceFusion, depth_notices
+from scopemap.engine.mapping.correction import FinalFrames
 from scopemap.engine.mapping.multiview_depth import KeyframeDepths
-from scopemap.engine.mapping.segments import Segment
-from scopemap.engine.mapping.submaps import FinalFrames, Submap
+from scopemap.engine.mapping.segments import Segment, Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.track import TrackedFrames
 

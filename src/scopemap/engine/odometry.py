@@ -13,7 +13,7 @@ from scopemap.engine.faults import StageFaults
 from scopemap.engine.frame import Frame
 from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.local_adjustment import LocalAdjustment
-from scopemap.engine.mapping.submaps import Mapper
+from scopemap.engine.mapping.mapper import Mapper
 from scopemap.engine.notices import Notice
 from scopemap.engine.preprocessing import PreprocessedFrame, with_depth, with_unknown_depth, without_depth
 from scopemap.engine.tracking.causes import LossCause

@@ -35,8 +35,8 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import FrameStore, SpreadFrames
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion
 from scopemap.engine.mapping.local_adjustment import LocalAdjustment
-from scopemap.engine.mapping.segments import Segment
-from scopemap.engine.mapping.submaps import Mapper, Submap
+from scopemap.engine.mapping.mapper import Mapper
+from scopemap.engine.mapping.segments import Segment, Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Odometry, Step
 from scopemap.engine.preprocessing import Matching, PreprocessedFrame, Preprocessing

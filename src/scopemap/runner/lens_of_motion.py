@@ -6,8 +6,8 @@ import math
 
 from scopemap.engine.cameras.lenses import FisheyeCamera
 from scopemap.engine.config import Config
-from scopemap.engine.mapping.lens_kinds import LensKinds, angle_of_radius
-from scopemap.engine.mapping.lens_test import LensTest
+from scopemap.engine.mapping.judge import LensTest
+from scopemap.engine.mapping.lens import LensKinds, angle_of_radius
 from scopemap.engine.notices import Notice
 from scopemap.input.scopes import ANY_LENS, FOV_RANGE_DEG, KINDS, SCOPES
 from scopemap.input.sequence import Sequence

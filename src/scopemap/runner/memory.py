@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError, SettingsError
-from scopemap.engine.mapping.backend import MOST_OBSERVATIONS
+from scopemap.engine.mapping.mapper import MOST_OBSERVATIONS
 from scopemap.engine.notices import Notice
 from scopemap.input.sequence import Sequence
 

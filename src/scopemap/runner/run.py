@@ -18,7 +18,7 @@ from scopemap.engine.finishing import Execution
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import SpreadFrames
 from scopemap.engine.kept import Kept
-from scopemap.engine.mapping.lens_test import LensTest
+from scopemap.engine.mapping.judge import LensTest
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.engine.pipeline import Adjusted, Pipeline

@@ -10,7 +10,7 @@ import numpy as np
 
 from scopemap.engine.backwards import MapMerge
 from scopemap.engine.errors import InputError
-from scopemap.engine.mapping.submaps import Submap
+from scopemap.engine.mapping.segments import Submap
 from scopemap.engine.tracking.causes import LossCause, causes_of_loss
 from scopemap.engine.tracking.track import Track, TrackedFrames
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY

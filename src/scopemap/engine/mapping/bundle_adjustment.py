@@ -48,13 +48,6 @@ _ADDED_WITH = 2  # by hand: keyframes before a new one that move with it, and st
 _ADDED_ITERATIONS = 6  # by hand
 WINDOW = 300  # by hand
 """Most keyframes that are adjusted at once."""
-RIGID_SIGMA_PX = 0.4
-"""Robust standard deviation of reprojection errors above which the fit alone does not show that a scene is rigid.
-
-Rigid scenes leave at most 0.3 px between near keyframes, but 0.45 in a fast, interlaced video (C3VD trans_t2_a); moving
-tissue leaves 0.4 to 1.5. The ranges overlap, so there are two limits. Windows of keyframes as they come, the last word
-of other starts and the merging of segments use this one. The adjustment of all keyframes is refused above the larger
-`MappingSettings.max_sigma_px`."""
 HELD_SIGMA = 0.01  # by hand
 """Least standard deviation of ln depth of points that an earlier window adjusted."""
 

@@ -2,12 +2,14 @@
 
 A point p is on the ray of a pixel of its host keyframe h at depth exp(u_p). With T_h, T_t from world to camera, another
 keyframe t observes it at project(T_t T_h^-1 exp(u_p) ray_p).
+
+Some points of a problem, or successive keyframes alone, are a problem, too: `part_of`, `successive`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
@@ -145,6 +147,52 @@ class State(NamedTuple):
     log_depth: np.ndarray
     log_focal: float
     sigma_px: float = float("nan")
+
+
+def part_of(problem: BundleProblem, chosen: np.ndarray) -> BundleProblem:
+    """Return the problem of some points alone, (P,) bool."""
+    points, seen, start = problem.points, problem.observations, problem.start
+    kept = chosen[seen.point]
+    number = np.cumsum(chosen) - 1
+    return replace(
+        problem,
+        points=Points(points.host[chosen], points.pixel[chosen], points.log_depth[chosen], points.sigma[chosen]),
+        observations=Observations(number[seen.point[kept]], seen.keyframe[kept], seen.pixel[kept]),
+        start=start and start._replace(log_depth=start.log_depth[chosen]),
+    )
+
+
+def successive(problem: BundleProblem, first: int, end: int) -> BundleProblem:
+    """Return the problem of the keyframes from `first` to before `end` alone, with the points that they host.
+
+    A keyframe that was tracked against one outside is held to the motion from the one before it.
+    """
+    part = part_of(problem, _hosted(problem, first, end))
+    seen, pairs = part.observations, problem.neighbours
+    inside = (seen.keyframe >= first) & (seen.keyframe < end)
+    pairs = pairs[((pairs >= first) & (pairs < end)).all(1)] - first
+    others = np.setdiff1d(np.arange(1, end - first), pairs[:, 1])
+    pairs = np.concatenate([pairs, np.column_stack([others - 1, others])])
+    return replace(
+        part,
+        T_camera_world=problem.T_camera_world[first:end],
+        points=replace(part.points, host=part.points.host - first),
+        observations=Observations(seen.point[inside], seen.keyframe[inside] - first, seen.pixel[inside]),
+        neighbours=pairs,
+        start=problem.start and successive_state(problem, problem.start, first, end),
+    )
+
+
+def successive_state(problem: BundleProblem, state: State, first: int, end: int) -> State:
+    """Return the state of the keyframes from `first` to before `end`, and of the points that they host."""
+    T, log_scale = state.T_camera_world[first:end], state.log_scale[first:end]
+    own = _hosted(problem, first, end)
+    return state._replace(T_camera_world=T, log_scale=log_scale, log_depth=state.log_depth[own])
+
+
+def _hosted(problem: BundleProblem, first: int, end: int) -> np.ndarray:
+    """Return which points (P,) bool these keyframes host."""
+    return (problem.points.host >= first) & (problem.points.host < end)
 
 
 class Errors(NamedTuple):

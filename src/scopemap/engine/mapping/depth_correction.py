@@ -1,4 +1,4 @@
-"""Depth correction field: a smooth factor of a keyframe's depth over the image and over depth; whether it helps.
+"""Depth correction field: a smooth factor of a keyframe's depth over the image and over depth; how depths disagree.
 
 Errors of predicted depth vary over the image: a bright organ is too near, a far wall too far. Triangulated points
 measure them, but only at corners. A coarse grid interpolates between the points. Its axes are row, column and ln depth,
@@ -42,9 +42,6 @@ _ITERATIONS = 3  # by hand: reweightings
 _MIN_POINTS = 10  # by hand: of a keyframe; fewer fit no field
 # The first and the last level are these percentiles of the points' ln depths.
 _LEVEL_PERCENTILES = (1, 99)  # by hand
-# Disagreement of depth, ln, that a right adjustment may leave: errors of networks themselves; and its growth by noise.
-_DEPTH_ERROR = 0.05  # by hand
-_MAX_DEPTH_FACTOR = 1.1  # by hand: depths of keyframes that disagree by less than so much more agree as well as before
 _GRID_PX = 8  # by hand: between the pixels whose depth is compared between keyframes
 _F32 = np.float32
 
@@ -142,23 +139,6 @@ def depth_disagreement(
     if not compared:
         return float("nan"), float("nan")
     return float(np.median(np.concatenate(compared))), float(np.median(compared[-1]))
-
-
-def growth_of_disagreement(
-    camera: PinholeCamera,
-    before: tuple[np.ndarray, Sequence[np.ndarray]],
-    after: tuple[np.ndarray, Sequence[np.ndarray]],
-    gaps: Collection[int],
-) -> tuple[float, float] | None:
-    """Return by how much depths of keyframes disagree before and after an adjustment, where that is clearly more.
-
-    before, after : poses and depths as `depth_disagreement` takes them. None: they agree about as well as before.
-    """
-    both = (depth_disagreement(camera, *each, gaps) for each in (before, after))
-    for was, now in zip(*both, strict=True):
-        if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
-            return was, now
-    return None
 
 
 def depth_log_ratios(

@@ -19,36 +19,19 @@ from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.kept import Kept
-from scopemap.engine.mapping.bundle_adjustment import HELD_SIGMA, RIGID_SIGMA_PX, BundleSolution, adjust
+from scopemap.engine.mapping.bundle_adjustment import HELD_SIGMA, BundleSolution, adjust
 from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundleProblem, Observations, Points, State
-from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
+from scopemap.engine.mapping.correction import KeyframeCorrection, KeyframeStep
+from scopemap.engine.mapping.depth_correction import fit_depth_corrections
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
-from scopemap.engine.mapping.frame_correction import KeyframeStep
-from scopemap.engine.mapping.other_starts import ShapeTest, with_other_starts
+from scopemap.engine.mapping.judge import RIGID_SIGMA_PX, ShapeTest, keeps_window, observes_enough, tissue_moves
+from scopemap.engine.mapping.other_starts import with_other_starts
 from scopemap.engine.notices import Notice
 
 _GAPS = (1, 2)  # by hand: a keyframe's corners are matched in those so many before
 _FREE = 3  # by hand: last keyframes of the window that move
 _ITERATIONS = 10  # by hand: steps of a window's adjustment
-_LEAST_SEEN = 0.1  # by hand: of a keyframe's points that those before it must observe: else nothing corrects its depth
 _REMEMBERED = 1000  # by hand: keyframes whose correction is kept: the tracker returns to fewer
-_MOST_REFUSED = 0.1  # by hand: of the keyframes: with more, the scene is not rigid
-
-
-class KeyframeCorrection(NamedTuple):
-    """Correction of a keyframe's depth: ln of the factor of all of it, and of that of each pixel (None: 1)."""
-
-    log_scale: float = 0.0
-    field: DepthCorrectionField | None = None
-
-    def corrected(self, frame: Frame) -> Frame:
-        """Return a frame with its depth, and the standard deviation of that, corrected."""
-        depth_mm, sigma_mm = np.asarray(frame.depth_mm), frame.depth_sigma_mm
-        log = 0.0 if self.field is None else self.field.log_factor(depth_mm)
-        factor = np.exp(np.float32(self.log_scale) + log, dtype=np.float32)
-        return replace(
-            frame, depth_mm=depth_mm * factor, depth_sigma_mm=None if sigma_mm is None else sigma_mm * factor
-        )
 
 
 class AdjustedKeyframe(NamedTuple):
@@ -114,9 +97,8 @@ class LocalAdjustment:
             points, observations = self._tracks.collected(self._numbers)
             found = adjust(self._problem(points, observations, keyframe.camera.fx), max_iterations=_ITERATIONS)
             found, shape = self._with_other_starts(points, observations, found, keyframe.camera.fx, map_number)
-            own_sigma = found.log_depth_sigma[points.host == len(self._window) - 1]
-            is_seen = np.isfinite(own_sigma).sum() > _LEAST_SEEN * len(own_sigma)
-            if not (is_seen and found.sigma_px <= RIGID_SIGMA_PX) or shape.refuses_window:
+            is_seen = observes_enough(found.log_depth_sigma[points.host == len(self._window) - 1])
+            if not (is_seen and keeps_window(found.sigma_px, shape)):
                 self._refused[map_number] += int(is_seen)
                 self._begin()
                 self._take(keyframe, reference, matches)
@@ -144,9 +126,9 @@ class LocalAdjustment:
         if not adjusted + refused:
             return []
         values = {"adjusted": adjusted, "refused": refused}
-        moves = refused > _MOST_REFUSED * (adjusted + refused)
         shape = self._shapes.get(map_number, ShapeTest()).notices
-        return [Notice("mapping-local-not-rigid" if moves else "mapping-local", values), *shape]
+        code = "mapping-local-not-rigid" if tissue_moves(adjusted, refused) else "mapping-local"
+        return [Notice(code, values), *shape]
 
     @property
     def _numbers(self) -> range:

@@ -15,22 +15,26 @@ not determined. Part of the points decides: some are adjusted, others are left o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
 
 import numpy as np
 
-from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.mapping.bundle_adjustment import (
-    RIGID_SIGMA_PX,
     BundleSolution,
     adjust_in_windows,
     adjust_one_by_one,
-    errors_px,
     log_depth_sigma,
 )
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State
-from scopemap.engine.mapping.left_out import halves, placed, successive, successive_state
-from scopemap.engine.notices import Notice
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State, successive, successive_state
+from scopemap.engine.mapping.judge import (
+    KNOWN_SIGMA,
+    LEAST_COMPARED,
+    ShapeTest,
+    halves,
+    is_clearly_less,
+    is_same_shape,
+    left_out_px,
+    placed,
+)
 
 MOST_KEYFRAMES = 60  # by hand
 """That are tested at first."""
@@ -38,68 +42,7 @@ _POINTS = 100  # by hand: of a keyframe that are adjusted, and as many that are 
 _LOOSE_SIGMA = 0.5  # by hand: standard deviation of ln depth by which other starts hold their points
 # Of poses without a start: half a radian, half the depth.
 _NO_POSES = Priors(scale=0.3, rotation_rad=0.5, translation_share=0.5)  # by hand
-_KNOWN_SIGMA = 0.2  # by hand: standard deviation of ln depth below which a left-out point tells of the shape
-_LEAST_POINTS = 50  # by hand: with fewer such points nothing is compared: the camera hardly moved
 _LEAST_OF_KEYFRAME = 5  # by hand: fewer such points of a keyframe have no relief
-# Two shapes meet. Real clips: the same valley .96 to 1.00 and .003 to .07; another one at most .84, and .07 to .39.
-_LEAST_CORRELATION = 0.9
-_MOST_DIFFERENCE = 0.1  # see above
-# Errors of left-out tracks over those of the other shape. In the right valley of a laparoscopy .75; where both are
-# wrong, since tissue moves, .93 to 1.1.
-_CLEARLY_LESS = 0.85
-
-Outcome = Literal["determined", "decided", "not determined", "not tested"]
-"""decided: not all starts meet, but the shape with clearly smaller errors was met by a second one. not tested: the
-camera hardly moved."""
-
-
-class ShapeTest(NamedTuple):
-    """What other starts tell of a shape.
-
-    replaced : whether another start's shape was taken. correlation, difference : of the relief, ln depth less its
-    median in each keyframe, with that of the start that meets the shape, or comes nearest to it: correlation, and mean
-    absolute difference. error_px, other_px : errors of left-out tracks, robust standard deviation, of the shape and of
-    the best of those that end elsewhere; NaN without one.
-    """
-
-    outcome: Outcome = "not tested"
-    replaced: bool = False
-    correlation: float = float("nan")
-    difference: float = float("nan")
-    error_px: float = float("nan")
-    other_px: float = float("nan")
-
-    @property
-    def is_tested(self) -> bool:
-        """Whether the starts have judged the shape: the predicted depth, which it may contradict, does not then."""
-        return self.outcome != "not tested"
-
-    @property
-    def refuses_window(self) -> bool:
-        """Whether the keyframes of a window stay as tracked: a later one, with more motion, may determine the shape."""
-        return self.outcome == "not determined"
-
-    @property
-    def is_contradicted(self) -> bool:
-        """Whether another start, which ends elsewhere, explains the views about as well, or better."""
-        return self.outcome == "not determined" and not self.error_px < _CLEARLY_LESS * self.other_px
-
-    def refuses(self, sigma_px: float) -> bool:
-        """Whether all keyframes stay as tracked in the end; sigma_px : robust, of the reprojection errors.
-
-        Where these are as small as those of a rigid scene the adjusted poses fit the views all the same.
-        """
-        return self.is_contradicted and sigma_px > RIGID_SIGMA_PX
-
-    @property
-    def notices(self) -> list[Notice]:
-        """What determines the shape; [] where that was not tested."""
-        if self.outcome == "determined":
-            return [Notice("shape-determined", {"correlation": self.correlation})]
-        errors = {"error_px": self.error_px, "other_px": self.other_px}
-        if self.outcome == "decided":
-            return [Notice("shape-decided", errors)]
-        return [] if self.outcome == "not tested" else [Notice("shape-not-determined", errors)]
 
 
 @dataclass(frozen=True)
@@ -119,15 +62,14 @@ class _Shape:
             own = both & (self.host == k)
             if own.sum() >= _LEAST_OF_KEYFRAME:
                 reliefs.append([shape.log_depth[own] - np.median(shape.log_depth[own]) for shape in (self, other)])
-        if sum(len(one) for one, _ in reliefs) < _LEAST_POINTS:
+        if sum(len(one) for one, _ in reliefs) < LEAST_COMPARED:
             return float("nan"), float("nan")
         one, another = np.hstack(reliefs)
         return float(np.corrcoef(one, another)[0, 1]), float(np.abs(one - another).mean())
 
     def meets(self, other: _Shape) -> bool:
         """Return whether two shapes are the same."""
-        correlation, difference = self.likeness(other)
-        return correlation >= _LEAST_CORRELATION and difference <= _MOST_DIFFERENCE
+        return is_same_shape(*self.likeness(other))
 
 
 def with_other_starts(
@@ -155,21 +97,21 @@ def with_other_starts(
 def _test(problem: BundleProblem, keyframes: State, *, is_rigid: bool) -> tuple[State, ShapeTest]:
     """Return the keyframes of the start that wins, the given ones where none does, and what the starts tell."""
     adjusted, left_out = halves(problem, _POINTS)
-    if len(left_out.points.host) < _LEAST_POINTS or len(problem.T_camera_world) < 2:
+    if len(left_out.points.host) < LEAST_COMPARED or len(problem.T_camera_world) < 2:
         return keyframes, ShapeTest()
     own = _shape(left_out, keyframes)
-    if own.known.sum() < _LEAST_POINTS:
+    if own.known.sum() < LEAST_COMPARED:
         return keyframes, ShapeTest()
     mirrored = _shape(left_out, adjust_in_windows(_mirrored(adjusted)).state)
     if is_rigid and own.meets(mirrored):
         return keyframes, ShapeTest("determined", False, *own.likeness(mirrored), own.error_px)
-    if not is_rigid and mirrored.error_px >= _CLEARLY_LESS * own.error_px:
+    if not is_rigid and not is_clearly_less(mirrored.error_px, own.error_px):
         return keyframes, ShapeTest("not determined", False, *own.likeness(mirrored), own.error_px, mirrored.error_px)
     flat = _shape(left_out, adjust_one_by_one(_flat(adjusted)).state)
     if is_rigid and own.meets(flat) and own.error_px <= mirrored.error_px:
         # The mirrored one stayed in a valley of its own, which is worse.
         return keyframes, ShapeTest("decided", False, *own.likeness(flat), own.error_px, mirrored.error_px)
-    if flat.meets(mirrored) and max(flat.error_px, mirrored.error_px) < _CLEARLY_LESS * own.error_px:
+    if flat.meets(mirrored) and is_clearly_less(max(flat.error_px, mirrored.error_px), own.error_px):
         return flat.keyframes, ShapeTest("decided", True, *flat.likeness(mirrored), flat.error_px, own.error_px)
     nearest = max((mirrored, flat), key=lambda shape: np.nan_to_num(shape.likeness(own)[0], nan=-1.0))
     other_px = min(mirrored.error_px, flat.error_px)
@@ -180,10 +122,8 @@ def _shape(left_out: BundleProblem, keyframes: State) -> _Shape:
     """Return the shape of left-out points as the keyframes of a solution place them."""
     loose = _loosely(left_out, left_out.points.log_depth)
     state = placed(loose, keyframes)
-    known = log_depth_sigma(loose, state) < _KNOWN_SIGMA
-    lengths_px = errors_px(loose, state)
-    error_px = robust_sigma_2d(lengths_px[np.isfinite(lengths_px)])
-    return _Shape(keyframes, left_out.points.host, state.log_depth, known, error_px)
+    known = log_depth_sigma(loose, state) < KNOWN_SIGMA
+    return _Shape(keyframes, left_out.points.host, state.log_depth, known, left_out_px(loose, state))
 
 
 def _loosely(problem: BundleProblem, log_depth: np.ndarray) -> BundleProblem:

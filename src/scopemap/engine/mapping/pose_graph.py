@@ -1,7 +1,8 @@
-"""Pose graph optimisation over Sim(3): loop closures spread over all keyframes, as the start of bundle adjustment.
+"""What loop closures do: they merge maps, and a pose graph over Sim(3) spreads them over all keyframes.
 
-Every keyframe has a pose and a depth scale exp(s). An edge from keyframe i to j is the relative pose T_ij in the
-millimetres of i's depth and the ratio exp(r_ij) of their depth scales:
+Bundle adjustment begins where the pose graph ends. There every keyframe has a pose and a depth scale exp(s). An edge
+from keyframe i to j is the relative pose T_ij in the millimetres of i's depth and the ratio exp(r_ij) of their depth
+scales:
 
     rotation      log(R_ij^T R_i^T R_j)                     over its standard deviation
     translation   R_i^T (p_j - p_i) / exp(s_i) - t_ij       over its standard deviation
@@ -10,26 +11,36 @@ millimetres of i's depth and the ratio exp(r_ij) of their depth scales:
 Edges are the tracked motions (r = 0) and the loop closures. Cauchy's loss makes false loops and tracking failures
 outliers. Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", RSS 2010.
 
-Loop closures show drift of the scale where the camera comes back, and the network's scale along new places: each
-frame's depth takes its scale from the one before (`depth/mapis.py`), and errors add up; the network's scale is noisy
-from frame to frame but does not drift. ln of the chained scale over the network's is drift plus noise. The drift is its
-smooth part (Whittaker, "On a new method of graduation", 1923).
+Maps are merged before. Each has a world and a unit of length of its own. A loop closure between keyframe p of one map
+and n of another gives T_n_p, in the millimetres of p's depth, and the ratio exp(r) of n's depth to p's. So Sim(3) from
+the world of n's map to the world of p's has
+
+    scale exp(-r),    rotation R_p R_n_p^T R_n^T,    and takes the position of n to the position of T_p T_n_p^-1
+
+It is accepted only if loop closures of other keyframes agree with it, and maps stay merged only if they fit after an
+adjustment (`MapErrors.fit`).
+
+Where the camera was lost and aligned again to a keyframe from before, the alignment may be wrong. If keyframes from
+before and after the loss observe no points in common, nothing supports it, and the map is split there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import bsr_matrix, csc_matrix, csr_matrix, diags, identity
-from scipy.sparse.linalg import splu, spsolve
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
+from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.least_squares import Options, Problem, cauchy, minimise
 from scopemap.engine.geometry.se3 import hat, inverse, se3
-from scopemap.engine.mapping.frame_correction import TrackedPose
+from scopemap.engine.mapping.correction import TrackedPose
 from scopemap.engine.mapping.loop_closure import Loop
 
 _UNKNOWNS = 7  # of a keyframe: rotation, position, ln scale
@@ -46,18 +57,16 @@ _ORDER = "MMD_AT_PLUS_A"
 _MAX_LOOP_ERROR = 3.0  # by hand: root mean square, in standard deviations, of an accepted loop
 # A loop whose error as tracked exceeds this share of path length plus depth cannot be drift.
 _MAX_DRIFT_SHARE = 0.5  # by hand
-# Standard deviations, ln: of the network's scale at a keyframe, many of which err alike, of the drift from one keyframe
-# to the next, and of the change of that drift.
-_NETWORK_SIGMA = 0.2  # by hand
-_DRIFT_SIGMA = 0.02  # by hand
-_CHANGE_SIGMA = 0.002  # by hand
+# Maps that are merged.
+_MIN_SUPPORT = 2  # by hand: agreeing keyframes in either map
+# Maps drift independently: two loops agree within these, rad, share of the scene's depth, ln.
+_MAX_DIFFERENCE = (0.2, 0.3, 0.3)  # by hand
+_MAX_LOG_SCALE = 1.0  # by hand: between maps of one video
+# Observations of points in common that support a motion tracked across a loss: as many as relocalisation needs inliers.
+_MIN_COMMON = 20
 
-
-class PathWithoutDrift(NamedTuple):
-    """Keyframes without the drift of their scale: ln of the drift (K,), and T_world_camera (K, 4, 4), by map."""
-
-    drift: np.ndarray
-    T_world_camera: np.ndarray
+Part = tuple[int, int]
+"""A part of a map between two losses: number of the map, and segment as in `TrackedPose`."""
 
 
 class PoseGraph(NamedTuple):
@@ -91,47 +100,6 @@ class _Edges(NamedTuple):
     T: np.ndarray  # T_i_j
     log_ratio: np.ndarray
     sigma: np.ndarray  # (E, 7)
-
-
-def path_without_drift(tracked: Sequence[TrackedPose], log_scale: np.ndarray) -> PathWithoutDrift:
-    """Return the path without the drift of the scale along each map, whose first keyframe keeps pose and scale.
-
-    log_scale : (K,) ln of the factor by which each keyframe's estimated depth was scaled, `Frame.depth_scale`. The
-    translation from each keyframe to the next, and its depth, are divided by the drift there.
-    """
-    T, map_of = np.stack([pose.T_world_camera for pose in tracked]), np.array([pose.map for pose in tracked])
-    drift = np.zeros(len(T))
-    for number in set(map_of.tolist()):
-        own = np.flatnonzero(map_of == number)
-        drift[own] = _scale_drift(log_scale[own])
-        factor = np.exp(-(drift[own[1:]] + drift[own[:-1]]) / 2)
-        steps_mm = factor[:, None] * np.diff(T[own, :3, 3], axis=0)
-        T[own[1:], :3, 3] = T[own[0], :3, 3] + np.cumsum(steps_mm, axis=0)
-    return PathWithoutDrift(drift, T)
-
-
-def _scale_drift(log_scale: np.ndarray) -> np.ndarray:
-    """Return the most probable drift (K,), 0 at first: Whittaker's smoothing, by first and second differences."""
-    count = len(log_scale)
-    differences, normal = identity(count, format="csc"), identity(count, format="csc") / _NETWORK_SIGMA**2
-    for sigma in (_DRIFT_SIGMA, _CHANGE_SIGMA):
-        if differences.shape[0] > 1:
-            differences = differences[1:] - differences[:-1]
-            normal += differences.T @ differences / sigma**2
-    drift: np.ndarray = spsolve(normal.tocsc(), log_scale / _NETWORK_SIGMA**2)
-    return drift - drift[0]
-
-
-def scale_by_network(log_scale: np.ndarray, map_of: np.ndarray, number: int, anchored: bool) -> float:
-    """Return the factor of a map's millimetres that makes them those of the depth network, by most of its keyframes.
-
-    A map begins with the scale with which the one before has ended, so that drift adds up over maps, and the error of
-    the very first frame would scale them all. log_scale : (K,) as `path_without_drift` takes it, without its drift.
-    map_of : (K,) numbers of the maps. anchored : whether depth was fitted to something else on the first frame: its map
-    keeps its millimetres, and others get them by the network.
-    """
-    off = np.median(log_scale[map_of == number])
-    return float(np.exp((np.median(log_scale[map_of == map_of[0]]) if anchored else 0.0) - off))
 
 
 def tracked_pairs(frames: Sequence[int], tracked: Sequence[TrackedPose]) -> np.ndarray:
@@ -245,3 +213,107 @@ def _right_jacobian(turns: np.ndarray) -> np.ndarray:
     angle, K = np.maximum(np.linalg.norm(turns, axis=1), 1e-5)[:, None, None], hat(turns)
     jacobian: np.ndarray = np.eye(3) - (1 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * K @ K
     return jacobian
+
+
+class _Candidate(NamedTuple):
+    """Sim(3) of a map by one loop: to the common world, its keyframe's pose (4, 4) in the map, both keyframes."""
+
+    S_common_map: Similarity
+    T_map_camera: np.ndarray
+    own: int
+    other: int
+
+
+def split_maps(
+    tracked: Sequence[TrackedPose], pairs: np.ndarray, relocalised: Collection[tuple[Part, Part]]
+) -> dict[Part, int]:
+    """Return the map of each part of the maps that has a keyframe: parts stay together where something supports it.
+
+    tracked : poses of the K keyframes. pairs : (N, 2) int, keyframes that observe the same point. relocalised : pairs
+    of parts between which features found the camera again. The first part of a map keeps its number.
+    """
+    parts = list(dict.fromkeys((pose.map, pose.segment) for pose in tracked))
+    part_of = np.array([parts.index((pose.map, pose.segment)) for pose in tracked], dtype=int)
+    common = np.zeros((len(parts), len(parts)), int)
+    np.add.at(common, tuple(part_of[pairs].T), 1)
+    common += common.T
+    for one, other in relocalised:
+        if one in parts and other in parts:
+            common[parts.index(one), parts.index(other)] = common[parts.index(other), parts.index(one)] = _MIN_COMMON
+    groups: list[list[int]] = []
+    for k, (number, _) in enumerate(parts):
+        near = [group for group in groups if parts[group[0]][0] == number and common[k, group].sum() >= _MIN_COMMON]
+        groups = [group for group in groups if group not in near] + [[*chain(*near), k]]
+    found: dict[Part, int] = {}
+    unused = max(number for number, _ in parts) + 1 if parts else 0
+    for group in sorted(groups, key=min):
+        number = parts[min(group)][0]
+        if number in found.values():
+            number, unused = unused, unused + 1
+        found |= dict.fromkeys((parts[k] for k in group), number)
+    return found
+
+
+def merge_maps(
+    T_world_camera: np.ndarray, map_of: Sequence[int], loops: Sequence[Loop], main: int, depth_mm: float
+) -> dict[int, Similarity]:
+    """Return Sim(3) from the world of each map to the common world, for the main map and all that loops connect to it.
+
+    T_world_camera : (K, 4, 4) of all keyframes, each in the world of its map. map_of : (K,) numbers of these maps.
+    depth_mm : typical depth in the main map. The common world has the main map's millimetres, and its first keyframe
+    has the pose that it had in its own map. Maps are in the order in which they were merged.
+    """
+    S_common_map = {main: Similarity.identity()}
+    candidates: defaultdict[int, list[_Candidate]] = defaultdict(list)
+    latest: int | None = main
+    while latest is not None:
+        for loop in loops:
+            maps = {map_of[loop.past], map_of[loop.new]}
+            if latest in maps and (number := next(iter(maps - set(S_common_map)), None)) is not None:
+                candidates[number].append(_candidate(T_world_camera, map_of, loop, S_common_map, number))
+        latest, most = None, 0
+        for number in sorted(set(candidates) - set(S_common_map)):
+            support, found = _best(candidates[number], depth_mm)
+            if support > most:
+                latest, most, best = number, support, found
+        if latest is not None:
+            S_common_map[latest] = best
+    first = next(k for k, number in enumerate(map_of) if number in S_common_map)
+    motion = T_world_camera[first] @ inverse(S_common_map[map_of[first]].transform_poses(T_world_camera[first]))
+    moved = Similarity(1.0, motion[:3, :3], motion[:3, 3])
+    return {number: moved.after(S) for number, S in S_common_map.items()}
+
+
+def _candidate(
+    T_world_camera: np.ndarray, map_of: Sequence[int], loop: Loop, S_common_map: dict[int, Similarity], number: int
+) -> _Candidate:
+    """Return Sim(3) of map `number` by a loop to a map whose Sim(3) is known."""
+    T_new = T_world_camera[loop.past] @ inverse(loop.T_new_past)
+    scale = float(np.exp(-loop.log_ratio))
+    R = T_new[:3, :3] @ T_world_camera[loop.new, :3, :3].T
+    S_past_new = Similarity(scale, R, T_new[:3, 3] - scale * R @ T_world_camera[loop.new, :3, 3])
+    past, new = map_of[loop.past], map_of[loop.new]
+    if new == number:
+        return _Candidate(S_common_map[past].after(S_past_new), T_world_camera[loop.new], loop.new, loop.past)
+    return _Candidate(S_common_map[new].after(S_past_new.inverse()), T_world_camera[loop.past], loop.past, loop.new)
+
+
+def _best(candidates: Sequence[_Candidate], depth_mm: float) -> tuple[int, Similarity]:
+    """Return the largest number of agreeing keyframes, on the side with fewer, and Sim(3); 0: none is accepted."""
+    S, T_map_camera, own, other = zip(*candidates, strict=True)
+    scale, R, t = (np.array([getattr(each, name) for each in S]) for name in ("scale", "R", "t"))
+    own, other, centre = np.array(own), np.array(other), np.stack(T_map_camera)[:, :3, 3]
+    position = scale[:, None] * np.einsum("nij,nj->ni", R, centre) + t
+    best = (0, Similarity.identity())
+    for k, (S_common_map, *_) in enumerate(candidates):
+        if not abs(np.log(S_common_map.scale)) < _MAX_LOG_SCALE:
+            continue
+        # The trace of a relative rotation is 1 + 2 cos of its angle.
+        angle_rad = np.arccos(np.clip((np.einsum("ij,nij->n", R[k], R) - 1) / 2, -1, 1))
+        distance = np.linalg.norm(S_common_map.transform_points(centre) - position, axis=1) / depth_mm
+        log_ratio = np.abs(np.log(scale / scale[k]))
+        agree = (np.column_stack([angle_rad, distance, log_ratio]) < _MAX_DIFFERENCE).all(1)
+        support = min(len(np.unique(own[agree])), len(np.unique(other[agree])))
+        if support >= _MIN_SUPPORT and support > best[0]:
+            best = (support, S_common_map)
+    return best

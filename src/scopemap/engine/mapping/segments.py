@@ -12,63 +12,38 @@ Neighbours share a keyframe, which joins them by Sim(3): the path has no steps.
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.align import Similarity
-from scopemap.engine.geometry.least_squares import robust_sigma_2d
-from scopemap.engine.mapping.adjusted_maps import MapKeyframes, adjust_maps
-from scopemap.engine.mapping.bundle_adjustment import RIGID_SIGMA_PX, adjust, errors_px
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, State
+from scopemap.engine.mapping.bundle_adjustment import adjust
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, successive
+from scopemap.engine.mapping.correction import FrameCorrection
 from scopemap.engine.mapping.depth_correction import depth_log_ratios
 from scopemap.engine.mapping.feature_tracks import NEAR_GAPS
-from scopemap.engine.mapping.frame_correction import FrameCorrection
-from scopemap.engine.mapping.left_out import halves, placed, successive
-from scopemap.engine.notices import Notice
+from scopemap.engine.mapping.judge import (
+    LEAST_COMPARED,
+    Interval,
+    halves,
+    left_out_px,
+    mean_of_known,
+    placed,
+    union_rank,
+)
+from scopemap.engine.mapping.keyframes import MapKeyframes
 
 PIECE = 4
 """Steps between the keyframes of a piece, about a second: five keyframes, as many as are adjusted together as they
 come."""
-# Of the left-out errors of a union over those of its parts, where these are not those of a rigid scene.
-_MOST_GROWTH = 1.1
-# Of ln depth between keyframes as tracked up to which their surface can be used, whatever its parts do: surfaces of
-# such segments differ by 2.5 % from their frames (`scripts.real`, laparoscopies).
-_GOOD_AGREEMENT = 0.025
-# The same after an adjustment: what is left before views triangulate depth, which ends at half of it. Accepted ones of
-# laparoscopies .04 to .056, one whose surface is worse than as tracked .063.
-_MOST_AFTER = 0.055
 # By hand, for time: of a keyframe that are adjusted, and as many that judge.
 _POINTS = 60
 # Of the adjustment that is judged: 20 change left-out errors of real intervals by 1 % at most, 8 by 4 %.
 _ITERATIONS = 12
-# Pixels, or observations, that are compared: fewer tell nothing.
-_LEAST_COMPARED = 50
-
-
-class Interval(NamedTuple):
-    """Successive keyframes, the first and the last of them, and how well one scene explains them.
-
-    error_px, tracked_px : of left-out tracks, robust standard deviation, after an adjustment of the others and as
-    tracked; of a union those that connect its parts, NaN where hardly any does. disagreement, tracked_disagreement : of
-    ln depth between keyframes, mean of the medians of pairs; NaN without any.
-    """
-
-    first: int
-    last: int
-    error_px: float
-    tracked_px: float
-    disagreement: float
-    tracked_disagreement: float
-
-    @property
-    def is_adjusted(self) -> bool:
-        """Whether left-out tracks and depth prefer the adjustment to the poses as tracked."""
-        agrees = self.disagreement <= max(_MOST_AFTER, self.tracked_disagreement)
-        return self.error_px <= self.tracked_px and agrees
 
 
 @dataclass(frozen=True)
@@ -87,8 +62,43 @@ class Segment:
     frames: frozenset[int] = frozenset()
 
 
-class IntervalJudge:
-    """Says how well one scene explains successive keyframes, each pair of keyframes being compared once."""
+@dataclass(frozen=True)
+class Submap:
+    """Frames that share a world after the last frame.
+
+    Attributes
+    ----------
+    main : number of its map with most frames. maps : numbers of all maps merged into it.
+    frames : numbers of the frames tracked in these. main_frames : of those tracked in the main map. segments : parts of
+    its time, in order; one surface fits the frames of each.
+    """
+
+    main: int
+    maps: tuple[int, ...]
+    frames: frozenset[int]
+    main_frames: frozenset[int]
+    segments: tuple[Segment, ...]
+
+    def depth_factor(self, index: int) -> float:
+        """Return the factor of the whole depth of the frame with this number."""
+        correction = self.correction(index)
+        return 1.0 if correction is None else correction.depth_factor(index)
+
+    def correction(self, index: int) -> FrameCorrection | None:
+        """Return the correction of the frame with this number; None: it is as tracked."""
+        return self.segments[self.segment_of(index)].correction
+
+    def segment_of(self, index: int) -> int:
+        """Return the number of the segment that a frame of this number is in."""
+        return min(bisect_left(self._lasts, index), len(self.segments) - 1)
+
+    @cached_property
+    def _lasts(self) -> list[int]:
+        return [segment.last for segment in self.segments]
+
+
+class _IntervalTest:
+    """Measures how well one scene explains successive keyframes, each pair of keyframes being compared once."""
 
     def __init__(self, keyframes: MapKeyframes, problem: BundleProblem) -> None:
         self._keyframes = keyframes
@@ -96,24 +106,25 @@ class IntervalJudge:
         self._grids_mm = keyframes.tracked_depths
         self._compared: dict[tuple[int, int], float] = {}
 
-    def judge(self, first: int, last: int, shared: int | None = None) -> Interval:
+    def measure(self, first: int, last: int, shared: int | None = None) -> Interval:
         """Return what is known of the keyframes from `first` to `last`; shared : where the parts of a union meet."""
         adjusted, left_out = (successive(half, first, last + 1) for half in (self._adjusted, self._left_out))
         found = adjust(adjusted, max_iterations=_ITERATIONS)
         if shared is not None:
             left_out = _connecting(left_out, shared - first)
-        error_px, tracked_px = (_error_px(left_out, state) for state in (found.state, left_out.tracked))
+        states = (placed(left_out, keyframes) for keyframes in (found.state, left_out.tracked))
+        error_px, tracked_px = (left_out_px(left_out, state, least=LEAST_COMPARED) for state in states)
         own = self._keyframes.successive(first, last + 1)
         T, grids_mm = own.adjusted_depths(found, own.depth_fields(adjusted.points, found))
         pairs = [(k, k + gap) for gap in NEAR_GAPS for k in range(last + 1 - first - gap)]
         pairs += [(other, one) for one, other in pairs]
         after = [_disagreement(own.camera, T, grids_mm, *pair) for pair in pairs]
         tracked = [self._as_tracked(first + one, first + other) for one, other in pairs]
-        return Interval(first, last, error_px, tracked_px, _mean(after), _mean(tracked))
+        return Interval(first, last, error_px, tracked_px, mean_of_known(after), mean_of_known(tracked))
 
-    def judge_union(self, one: Interval, other: Interval) -> Interval:
+    def measure_union(self, one: Interval, other: Interval) -> Interval:
         """Return what is known of two neighbours together."""
-        return self.judge(one.first, other.last, other.first)
+        return self.measure(one.first, other.last, other.first)
 
     def _as_tracked(self, one: int, other: int) -> float:
         if (one, other) not in self._compared:
@@ -127,22 +138,17 @@ def _disagreement(
 ) -> float:
     """Return by how much ln depth of two keyframes differs where both see the same, median; NaN: nowhere."""
     ratios = depth_log_ratios(camera, T_world_camera, grids_mm, one, other)
-    return float(np.median(np.abs(ratios))) if len(ratios) >= _LEAST_COMPARED else float("nan")
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Return the mean of those that are known; NaN without any."""
-    known = [value for value in values if np.isfinite(value)]
-    return float(np.mean(known)) if known else float("nan")
+    return float(np.median(np.abs(ratios))) if len(ratios) >= LEAST_COMPARED else float("nan")
 
 
 def choose_segments(keyframes: MapKeyframes, problem: BundleProblem) -> list[Interval]:
     """Return the intervals of keyframes that one scene explains, in order; neighbours share a keyframe within a map."""
-    judge, most_px = IntervalJudge(keyframes, problem), keyframes.settings.max_sigma_px
-    found = [judge.judge(*piece) for piece in _pieces(keyframes.map_of)]
-    unions = {pair: judge.judge_union(*pair) for pair in itertools.pairwise(found)}
+    test, most_px = _IntervalTest(keyframes, problem), keyframes.settings.max_sigma_px
+    found = [test.measure(*piece) for piece in _pieces(keyframes.map_of)]
+    unions = {pair: test.measure_union(*pair) for pair in itertools.pairwise(found)}
     while True:
-        ranks = {pair: rank for pair, union in unions.items() if (rank := _rank(union, pair, most_px)) is not None}
+        ranked = {pair: union_rank(union, pair, most_px) for pair, union in unions.items()}
+        ranks = {pair: rank for pair, rank in ranked.items() if rank is not None}
         if not ranks:
             return found
         best = min(ranks, key=lambda pair: ranks[pair])
@@ -150,20 +156,7 @@ def choose_segments(keyframes: MapKeyframes, problem: BundleProblem) -> list[Int
         found[place : place + 2] = [union]
         near = itertools.pairwise(found[max(place - 1, 0) : place + 2])
         kept = {pair: unions[pair] for pair in itertools.pairwise(found) if pair in unions}
-        unions = kept | {pair: judge.judge_union(*pair) for pair in near}
-
-
-def adjust_interval(keyframes: MapKeyframes, problem: BundleProblem, interval: Interval) -> FrameCorrection:
-    """Return the correction of an interval by itself: as tracked where left-out tracks or depth prefer that.
-
-    Then nothing more is adjusted: a clip that gets nothing from it does not pay for it twice.
-    """
-    own = keyframes.successive(interval.first, interval.last + 1)
-    if not (interval.is_adjusted and interval.error_px <= keyframes.settings.max_sigma_px):
-        worse = Notice("mapping-not-rigid", {"sigma_px": interval.error_px, "merged": ""})
-        return replace(own.uncorrected(interval.error_px), refused=worse)
-    part = successive(problem, interval.first, interval.last + 1)
-    return adjust_maps(own, part, np.zeros((0, 2), int), own.poses[0].map).correction
+        unions = kept | {pair: test.measure_union(*pair) for pair in near}
 
 
 def _pieces(map_of: np.ndarray) -> list[tuple[int, int]]:
@@ -178,29 +171,12 @@ def _pieces(map_of: np.ndarray) -> list[tuple[int, int]]:
     return found
 
 
-def _rank(union: Interval, parts: Sequence[Interval], most_px: float) -> tuple[bool, float] | None:
-    """Return the place of a union in the order of merging, the least first; None where no one scene explains it."""
-    growth = union.error_px / max(_mean([part.error_px for part in parts]), 1e-9)
-    fits = union.error_px <= RIGID_SIGMA_PX or (union.error_px <= most_px and growth <= _MOST_GROWTH)
-    if fits and union.is_adjusted:
-        return False, union.error_px
-    agreed = max(_mean([part.tracked_disagreement for part in parts]), _GOOD_AGREEMENT)
-    return (True, union.tracked_disagreement) if union.tracked_disagreement <= agreed else None
-
-
 def _connecting(problem: BundleProblem, shared: int) -> BundleProblem:
     """Return the problem with the observations between keyframes before and after one that both parts share."""
     seen = problem.observations
     ends = np.column_stack([problem.points.host[seen.point], seen.keyframe])
     chosen = (ends.min(1) < shared) & (ends.max(1) > shared)
     return replace(problem, observations=Observations(*(part[chosen] for part in seen.columns)))
-
-
-def _error_px(left_out: BundleProblem, keyframes: State) -> float:
-    """Return the robust standard deviation of the errors of left-out points in the keyframes of a solution, px."""
-    lengths_px = errors_px(left_out, placed(left_out, keyframes))
-    lengths_px = lengths_px[np.isfinite(lengths_px)]
-    return robust_sigma_2d(lengths_px) if len(lengths_px) >= _LEAST_COMPARED else float("nan")
 
 
 def joined(

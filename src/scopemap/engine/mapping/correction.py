@@ -1,21 +1,30 @@
-"""Propagated correction: poses and depth of all frames, interpolated between the adjusted keyframes."""
+"""Correction: the one place that changes poses and depth of frames that were tracked.
+
+KeyframeCorrection   while frames are tracked: the depth of a keyframe as adjusted in its window, and of the frames that
+                     are tracked against it
+FrameCorrection      after the last frame: poses and depth of all frames, interpolated between the adjusted keyframes
+FinalFrames          the stored frames with that, and with triangulated depth where there is one
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, mean_near, rotation_angle_rad
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField
-from scopemap.engine.mapping.lens_test import LensTest
-from scopemap.engine.mapping.other_starts import ShapeTest
+from scopemap.engine.mapping.judge import LensTest, ShapeTest
 from scopemap.engine.notices import Notice
 
 _AT_REST = 1e-6  # guard: rad
+
+TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray] | None]
+"""Returns a frame's triangulated depth, sigma of its ln, and ln of its factor, by number and depth; None: unknown."""
 
 
 class TrackedPose(NamedTuple):
@@ -40,6 +49,18 @@ class KeyframeStep(NamedTuple):
 
     T_camera_arrived: np.ndarray = np.eye(4)
     log_scale: float = 0.0
+
+
+class KeyframeCorrection(NamedTuple):
+    """Correction of a keyframe's depth: ln of the factor of all of it, and of that of each pixel (None: 1)."""
+
+    log_scale: float = 0.0
+    field: DepthCorrectionField | None = None
+
+    def corrected(self, frame: Frame) -> Frame:
+        """Return a frame with its depth, and the standard deviation of that, corrected."""
+        log = 0.0 if self.field is None else self.field.log_factor(np.asarray(frame.depth_mm))
+        return _with_depth_times(frame, np.exp(np.float32(self.log_scale) + log, dtype=np.float32))
 
 
 @dataclass(frozen=True)
@@ -227,3 +248,66 @@ class FrameCorrection:
         place = 0 if tracked is None else int(np.searchsorted(self.index, tracked.keyframe))
         known = tracked is not None and place < len(self.index) and self.index[place] == tracked.keyframe
         return place if known else None
+
+
+class FinalFrames:
+    """Frames of a segment, in order, with poses and depth corrected by the back end.
+
+    Attributes
+    ----------
+    T_world_camera : corrected poses (4, 4) by number. keyframes : numbers of those whose depth can be triangulated:
+    none where no rigid scene explains the observations.
+    """
+
+    def __init__(
+        self, correction: FrameCorrection | None, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]
+    ) -> None:
+        """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
+        self._stored, self._correction = read, correction
+        correct = correction.pose if correction is not None else lambda _, pose: pose
+        self.T_world_camera = {index: correct(index, pose) for index, pose in sorted(T_world_camera.items())}
+        adjusted = correction.index.tolist() if correction is not None and not correction.refused else []
+        self.keyframes = [index for index in adjusted if index in self.T_world_camera]
+
+    def frames(
+        self,
+        triangulated: TriangulatedDepths | None,
+        without: Callable[[Frame], Frame] = lambda frame: frame,
+        among: Iterable[int] | None = None,
+    ) -> Iterator[Frame]:
+        """Yield the frames, with triangulated depth where there is one.
+
+        without : returns a frame without the pixels that show no tissue. among : numbers of the frames; None: all.
+        """
+        for index in self.T_world_camera if among is None else among:
+            frame = self._corrected(index)
+            found = None if triangulated is None else triangulated(index, _usable_depth_mm(frame))
+            frame = without(frame)
+            if found is not None:
+                # The factor, not the depth: pixels that are masked keep a depth, too.
+                _, sigma, log_factor = found
+                depth_mm = np.asarray(frame.depth_mm) * np.exp(log_factor)
+                frame = replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma * depth_mm)
+            yield frame
+
+    def _corrected(self, index: int) -> Frame:
+        frame = replace(self._stored(index), T_world_camera=self.T_world_camera[index])
+        if self._correction is None:
+            return frame
+        return _with_depth_times(frame, self._correction.depth_factors(index, np.asarray(frame.depth_mm)))
+
+    def view(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return picture (H, W, 3) and corrected usable depth (H, W) mm of a frame, from any thread."""
+        frame = self._corrected(index)
+        return frame.rgb, _usable_depth_mm(frame)
+
+
+def _with_depth_times(frame: Frame, factor: np.ndarray | np.float32) -> Frame:
+    """Return a frame with its depth, and the standard deviation of that, times a factor of each pixel or of all."""
+    depth_mm, sigma_mm = np.asarray(frame.depth_mm), frame.depth_sigma_mm
+    return replace(frame, depth_mm=depth_mm * factor, depth_sigma_mm=None if sigma_mm is None else sigma_mm * factor)
+
+
+def _usable_depth_mm(frame: Frame) -> np.ndarray:
+    depth_mm = np.asarray(frame.depth_mm)
+    return np.where(frame.valid & (depth_mm > 0), depth_mm, np.float32(np.nan))

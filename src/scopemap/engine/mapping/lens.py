@@ -1,9 +1,13 @@
-"""Kinds of lenses: through which one, of which focal length, do tracks left out of the adjustment fit best?
+"""Another lens: with which focal length, and through which kind of lens, do left-out tracks fit best?
+
+Half of the points are adjusted, once with the focal length held and once with it free; the other half is placed in the
+keyframes of either (`lens_test`). Where the motion does not constrain the focal length, a wrong one leaves the same
+errors, too: `LensTest.sigma` tells.
 
 Where nobody has given a lens, pictures are taken as a pinhole camera's, and what a fisheye bends can ask for a focal
 length that is far off: on C3VD's own pictures (cecum_t1_a, 126 degrees across a fisheye) for a third of the right one.
 So corners are moved to where a pinhole would have seen them, had the lens been of another kind and focal length, the
-adjustment is done again, and errors of left-out tracks are compared in pixels of the picture as it is.
+adjustment is done again, and errors of left-out tracks are compared in pixels of the picture as it is (`LensKinds`).
 """
 
 from __future__ import annotations
@@ -11,25 +15,47 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from scopemap.engine.geometry.least_squares import robust_sigma_2d
-from scopemap.engine.mapping.bundle_adjustment import adjust, errors_px
+from scopemap.engine.mapping.bundle_adjustment import WINDOW, adjust, linearised
 from scopemap.engine.mapping.bundle_problem import BundleProblem, State
-from scopemap.engine.mapping.left_out import halves, placed
-from scopemap.engine.mapping.lens_test import LensTest, lens_test
+from scopemap.engine.mapping.judge import LEAST_COMPARED, MOST_LENS_RATIO, LensTest, halves, left_out_px, placed
 
+# Of the adjustment with the focal length free.
+_PRIOR_SIGMA = 0.5  # by hand: of ln f, weak: 70 degrees are a factor of 2 from 110 ones
+_FREE_ITERATIONS = 40  # by hand: a wrong lens may be far away
+_FREE_MIN_DECREASE = 1e-4  # by hand: relative, of the cost, that ends the adjustment
+# Of the kinds.
 _FOCAL_RATIOS = np.geomspace(0.35, 1.4, 9) / 0.714
 """Focal lengths that are tried, over that of the assumed 70 degrees: pinholes of 110 to 39 degrees, fisheyes to 150."""
-_MOST_RATIO = 0.97  # of the errors through the best kind over those through the next one, as of another focal length
 _POINTS = 50  # of a keyframe: through 27 lenses all points would take longer than the adjustment itself
-_ITERATIONS = 15  # by hand: from poses that were adjusted through another lens
-_MIN_DECREASE = 1e-3  # by hand: relative, of the cost, that ends an adjustment
+_KIND_ITERATIONS = 15  # by hand: from poses that were adjusted through another lens
+_KIND_MIN_DECREASE = 1e-3  # by hand: relative, of the cost, that ends an adjustment
 _WIDEST_RAD = math.radians(86)  # a pinhole picture of rays farther out has no end
 _ANGLES_RAD = np.linspace(0, _WIDEST_RAD, 1024)  # where lenses are inverted: every twelfth of a degree
 _ON_AXIS = 1e-9  # guard: focal lengths from the axis
+
+
+def lens_test(problem: BundleProblem, solution: State) -> LensTest:
+    """Return the test of the lens from a solution with it held; nothing is known with too few or too many keyframes."""
+    observed = np.unique(problem.observations.point)
+    if len(observed) < 2 * LEAST_COMPARED or not 2 <= len(problem.T_camera_world) <= WINDOW:
+        return LensTest()
+    adjusted, left_out = halves(replace(problem, start=solution))
+    search = partial(adjust, max_iterations=_FREE_ITERATIONS, min_decrease=_FREE_MIN_DECREASE)
+    held = search(adjusted).state
+    freed = replace(adjusted, start=held, log_focal_sigma=_PRIOR_SIGMA)
+    free = search(freed).state
+    try:
+        covariance = np.linalg.pinv(linearised(freed, free).matrix, hermitian=True)
+    except np.linalg.LinAlgError:
+        return LensTest()
+    change = free.log_focal - math.log(problem.focal_px)
+    held_px, free_px, tracked_px = (left_out_px(left_out, placed(left_out, s)) for s in (held, free, left_out.tracked))
+    return LensTest(held_px, free_px, change, math.sqrt(covariance[-1, -1]), tracked_px)
 
 
 @dataclass(frozen=True)
@@ -55,7 +81,7 @@ class LensKinds:
         (kind, (error_px, focal_px)), *others = sorted(best.items(), key=lambda one: one[1])
         is_other = self.kinds[kind] != self.bend
         next_px = min((error for _, (error, _) in others), default=math.inf)
-        if error_px > _MOST_RATIO * (min(held_px, next_px) if is_other else held_px) or not (is_other or self.bend):
+        if error_px > MOST_LENS_RATIO * (min(held_px, next_px) if is_other else held_px) or not (is_other or self.bend):
             return test
         through = seen.through(self.kinds[kind], focal_px)
         deviation, change = lens_test(through, through.begin).sigma, math.log(focal_px / problem.focal_px)
@@ -81,9 +107,10 @@ class _Seen:
     def error_px(self, bend: tuple[float, ...], focal_px: float) -> float:
         """Return the error of left-out tracks through a lens, px of the picture, robust standard deviation."""
         adjusted, left_out = halves(self.through(bend, focal_px), _POINTS)
-        state = placed(left_out, adjust(adjusted, max_iterations=_ITERATIONS, min_decrease=_MIN_DECREASE).state)
-        errors = errors_px(left_out, state) * _shrink(left_out.observations.pixel, bend, focal_px)
-        return robust_sigma_2d(errors[np.isfinite(errors)])
+        state = placed(
+            left_out, adjust(adjusted, max_iterations=_KIND_ITERATIONS, min_decrease=_KIND_MIN_DECREASE).state
+        )
+        return left_out_px(left_out, state, _shrink(left_out.observations.pixel, bend, focal_px))
 
     def best_focal(self, bend: tuple[float, ...]) -> tuple[float, float]:
         """Return the least error of left-out tracks through a kind of lens, and the focal length, px."""

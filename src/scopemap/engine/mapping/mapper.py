@@ -1,32 +1,36 @@
-"""Submaps: the frames that share a world, sorted, adjusted and merged by loop closures after the last frame."""
+"""Mapper: takes every track and every keyframe while frames are tracked, and returns the submaps after the last one.
+
+`Backend` collects the keyframes, and has the hypotheses tried that explain them. `Mapper` sorts the frames by maps.
+"""
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
+from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.kept import Kept
-from scopemap.engine.mapping.backend import Backend
-from scopemap.engine.mapping.feature_tracks import KeyframeMatches
-from scopemap.engine.mapping.frame_correction import FrameCorrection, KeyframeStep, TrackedPose
-from scopemap.engine.mapping.lens_kinds import LensKinds
-from scopemap.engine.mapping.map_merging import Part
-from scopemap.engine.mapping.segments import Segment
+from scopemap.engine.mapping.correction import KeyframeStep, TrackedPose
+from scopemap.engine.mapping.depth_correction import depth_grid
+from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
+from scopemap.engine.mapping.hypotheses import explain
+from scopemap.engine.mapping.keyframes import Keyframes
+from scopemap.engine.mapping.lens import LensKinds
+from scopemap.engine.mapping.loop_closure import LOOP, Loop, LoopFinder
+from scopemap.engine.mapping.pose_graph import Part
+from scopemap.engine.mapping.segments import Segment, Submap
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.features import FeatureDetector
 from scopemap.engine.tracking.track import Track
-
-TriangulatedDepths = Callable[[int, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray] | None]
-"""Returns a frame's triangulated depth, sigma of its ln, and ln of its factor, by number and depth; None: unknown."""
 
 _TRACKED = np.dtype(
     [
@@ -41,41 +45,156 @@ _TRACKED = np.dtype(
 
 LEAST_FRAMES = 10  # by hand
 """Tracked frames that a submap needs to be a result beside the largest."""
+# Those of about 300 keyframes: with more, memory and time of the adjustment would grow without any use to the poses.
+MOST_OBSERVATIONS = 1_000_000  # by hand
+"""Of an adjustment, unless memory is limited."""
 
 
-@dataclass(frozen=True)
-class Submap:
-    """Frames that share a world after the last frame.
+class Backend:
+    """Takes keyframes one by one, and returns the correction of all frames.
 
-    Attributes
-    ----------
-    main : number of its map with most frames. maps : numbers of all maps merged into it.
-    frames : numbers of the frames tracked in these. main_frames : of those tracked in the main map. segments : parts of
-    its time, in order; one surface fits the frames of each.
+    Feature tracks and loop closures are computed in another thread; no other one may use `flow` meanwhile. table : of
+    observations until the last keyframe. anchored : as `scale_by_network` takes it.
     """
 
-    main: int
-    maps: tuple[int, ...]
-    frames: frozenset[int]
-    main_frames: frozenset[int]
-    segments: tuple[Segment, ...]
+    _frames: Kept[list[int]]
+    _tracked: Kept[list[TrackedPose]]
+    _steps: Kept[list[KeyframeStep]]
+    _log_scales: Kept[list[float]]
+    _depths_mm: Kept[Rows]
+    _grid_shape: Kept[tuple[int, int]] = (0, 0)
+    _tracks: Kept[FeatureTracks]
+    _finder: Kept[LoopFinder | None]
+    _loops: Kept[Rows]
+    _camera: Kept[PinholeCamera | None] = None
 
-    def depth_factor(self, index: int) -> float:
-        """Return the factor of the whole depth of the frame with this number."""
-        correction = self.correction(index)
-        return 1.0 if correction is None else correction.depth_factor(index)
+    def __init__(
+        self,
+        settings: MappingSettings,
+        flow: FlowEstimator,
+        table: RowTable = rows_in_memory,
+        features: FeatureDetector | None = None,
+        anchored: bool = False,
+    ) -> None:
+        self._settings, self._anchored = settings, anchored
+        self._frames, self._tracked, self._steps, self._log_scales = [], [], [], []
+        self._depths_mm, self._loops = table("depth_grids", np.dtype(np.float32)), table("loops", LOOP)
+        self._tracks = FeatureTracks(flow, table)
+        self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
+        self._all_weighed = False
+        self.most_observations = MOST_OBSERVATIONS
+        """About so many are adjusted."""
+        self.lenses = LensKinds()
+        """What the lens may be."""
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backend")
+        self._pending: deque[Future[None]] = deque()
 
-    def correction(self, index: int) -> FrameCorrection | None:
-        """Return the correction of the frame with this number; None: it is as tracked."""
-        return self.segments[self.segment_of(index)].correction
+    @property
+    def keyframe_count(self) -> int:
+        """Number of keyframes of all maps."""
+        return len(self._frames)
 
-    def segment_of(self, index: int) -> int:
-        """Return the number of the segment that a frame of this number is in."""
-        return min(bisect_left(self._lasts, index), len(self.segments) - 1)
+    def keyframes(self, map_number: int = 0) -> int:
+        """Return the number of keyframes of a map."""
+        return sum(pose.map == map_number for pose in self._tracked)
 
-    @cached_property
-    def _lasts(self) -> list[int]:
-        return [segment.last for segment in self.segments]
+    def add(
+        self,
+        keyframe: Frame,
+        tracked: TrackedPose | None = None,
+        matches: KeyframeMatches | None = None,
+        step: KeyframeStep | None = None,
+    ) -> None:
+        """Take a keyframe with depth and pose, later than those before; poses of one map share a world.
+
+        tracked : pose as tracked; None: in map 0, from the keyframe before. matches : what is known of its feature
+        tracks. step : by how much it was moved as it came; None: not at all. Raises an error of an earlier keyframe's
+        feature tracks, and ValueError without a pose or a depth.
+        """
+        if keyframe.T_world_camera is None or keyframe.depth_mm is None:
+            raise ValueError("a keyframe needs a pose and a depth")
+        if tracked is None:
+            reference = self._frames[-1] if self._frames else keyframe.index
+            tracked = TrackedPose(0, reference, keyframe.T_world_camera)
+        self._frames.append(keyframe.index)
+        self._tracked.append(tracked)
+        self._steps.append(step or KeyframeStep())
+        self._log_scales.append(math.log(keyframe.depth_scale))
+        grid = depth_grid(keyframe.depth_mm, keyframe.valid)
+        self._depths_mm.append(grid.ravel())
+        self._grid_shape = grid.shape
+        while self._pending and self._pending[0].done():
+            self._pending.popleft().result()
+        self._pending.append(self._worker.submit(self._observe, keyframe, tracked.map, matches))
+
+    def replace_tracked(self, change: Callable[[TrackedPose], TrackedPose]) -> None:
+        """Change the poses as tracked of all keyframes, after the last one."""
+        self._tracked = [change(pose) for pose in self._tracked]
+
+    def split(self, relocalised: Collection[tuple[Part, Part]]) -> dict[Part, int]:
+        """Split maps after the last keyframe, where nothing supports a motion across a loss: see `split_maps`."""
+        self.settle()
+        maps = {} if self._camera is None else self._collected(self._camera).split(relocalised)
+        if maps:
+            self._tracked = [pose._replace(map=maps[pose.map, pose.segment]) for pose in self._tracked]
+        return maps
+
+    def settle(self) -> None:
+        """Wait for the features of all keyframes so far."""
+        while self._pending:
+            self._pending.popleft().result()
+
+    def adjust(
+        self,
+        map_number: int = 0,
+        tracked: Mapping[int, TrackedPose] | None = None,
+        among: Collection[int] | None = None,
+    ) -> list[Segment]:
+        """Return the segments of a map and of the maps merged with it, after the last keyframe: one where one scene
+        explains all of it.
+
+        tracked : poses as tracked by number of the frame; needed for several maps. among : numbers of the maps that may
+        be merged; None: all. Where an adjustment is refused, keyframes stay as tracked, and only their steps are spread
+        over the frames that lead to them. Raises ValueError where the map has no keyframe.
+        """
+        if not self.keyframes(map_number):
+            raise ValueError("nothing to adjust: no keyframe was added")
+        self.settle()
+        self._worker.shutdown()
+        if self._finder is not None and not self._all_weighed:
+            self._take(self._finder.between([pose.map for pose in self._tracked]))
+            self._all_weighed = True
+        allowed = {pose.map for pose in self._tracked} if among is None else set(among)
+        assert self._camera is not None
+        return explain(self._collected(self._camera), map_number, allowed, tracked or {}, self.lenses)
+
+    def _collected(self, camera: PinholeCamera) -> Keyframes:
+        return Keyframes(
+            self._frames,
+            self._tracked,
+            self._steps,
+            np.array(self._log_scales),
+            self._depths_mm,
+            self._grid_shape,
+            self._tracks,
+            self._loops,
+            camera,
+            self._settings,
+            self._anchored,
+            self.most_observations,
+        )
+
+    def _observe(self, keyframe: Frame, map_number: int, matches: KeyframeMatches | None) -> None:
+        """Add a keyframe's feature tracks and loop closures."""
+        self._camera = keyframe.camera
+        self._tracks.add(keyframe, map_number, matches)
+        if self._finder is not None:
+            self._take(self._finder.add(keyframe, map_number))
+
+    def _take(self, loops: Sequence[Loop]) -> None:
+        for loop in loops:
+            self._tracks.add_loop(loop)
+            self._loops.append(loop.row())
 
 
 class Mapper:
@@ -273,66 +392,3 @@ class Mapper:
 
     def _pose(self, track: Track) -> TrackedPose:
         return TrackedPose(track.map, track.keyframe, track.T_world_camera, self._lost_frames)
-
-
-class FinalFrames:
-    """Frames of a segment, in order, with poses and depth corrected by the back end.
-
-    Attributes
-    ----------
-    T_world_camera : corrected poses (4, 4) by number. keyframes : numbers of those whose depth can be triangulated:
-    none where no rigid scene explains the observations.
-    """
-
-    def __init__(
-        self, correction: FrameCorrection | None, T_world_camera: Mapping[int, np.ndarray], read: Callable[[int], Frame]
-    ) -> None:
-        """Take poses as tracked by number, and what returns a stored frame by its number, from any thread."""
-        self._stored, self._correction = read, correction
-        correct = correction.pose if correction is not None else lambda _, pose: pose
-        self.T_world_camera = {index: correct(index, pose) for index, pose in sorted(T_world_camera.items())}
-        adjusted = correction.index.tolist() if correction is not None and not correction.refused else []
-        self.keyframes = [index for index in adjusted if index in self.T_world_camera]
-
-    def frames(
-        self,
-        triangulated: TriangulatedDepths | None,
-        without: Callable[[Frame], Frame] = lambda frame: frame,
-        among: Iterable[int] | None = None,
-    ) -> Iterator[Frame]:
-        """Yield the frames, with triangulated depth where there is one.
-
-        without : returns a frame without the pixels that show no tissue. among : numbers of the frames; None: all.
-        """
-        for index in self.T_world_camera if among is None else among:
-            frame = self._corrected(index)
-            found = None if triangulated is None else triangulated(index, _usable_depth_mm(frame))
-            frame = without(frame)
-            if found is not None:
-                # The factor, not the depth: pixels that are masked keep a depth, too.
-                _, sigma, log_factor = found
-                depth_mm = np.asarray(frame.depth_mm) * np.exp(log_factor)
-                frame = replace(frame, depth_mm=depth_mm, depth_sigma_mm=sigma * depth_mm)
-            yield frame
-
-    def _corrected(self, index: int) -> Frame:
-        frame = replace(self._stored(index), T_world_camera=self.T_world_camera[index])
-        return frame if self._correction is None else _with_depth(frame, self._correction)
-
-    def view(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return picture (H, W, 3) and corrected usable depth (H, W) mm of a frame, from any thread."""
-        frame = self._corrected(index)
-        return frame.rgb, _usable_depth_mm(frame)
-
-
-def _with_depth(frame: Frame, correction: FrameCorrection) -> Frame:
-    """Return a frame with its depth and the standard deviation of that corrected."""
-    assert frame.depth_mm is not None
-    factors = correction.depth_factors(frame.index, frame.depth_mm)
-    sigma_mm = None if frame.depth_sigma_mm is None else frame.depth_sigma_mm * factors
-    return replace(frame, depth_mm=frame.depth_mm * factors, depth_sigma_mm=sigma_mm)
-
-
-def _usable_depth_mm(frame: Frame) -> np.ndarray:
-    depth_mm = np.asarray(frame.depth_mm)
-    return np.where(frame.valid & (depth_mm > 0), depth_mm, np.float32(np.nan))

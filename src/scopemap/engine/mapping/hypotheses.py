@@ -1,0 +1,244 @@
+"""Hypotheses: what is tried after the last frame to explain what keyframes observe, and in which order.
+
+| | hypothesis | what is free | where it begins |
+|---|---|---|---|
+| 1 | one map without the drift of its scale | poses, depth scales, points | as tracked, the drift divided out |
+| 2 | the same with the drift, if 1 is refused | the same | as tracked |
+| 3 | another shape, beside 1 and 2 | the same | mirrored, and flat (`other_starts.py`) |
+| 4 | other maps merged with it, one by one | the same, of all of them | as their loop closures have them |
+| 5 | another lens (`lens.py`) | the focal length, or the kind of lens, too | where 4 has ended |
+| 6 | as tracked, if all of these are refused | nothing | |
+| 7 | segments (`segments.py`), after 6 | as 1, of each by itself | as tracked |
+
+Where loops close, 1, 2 and 4 begin where the pose graph has the keyframes. `BundleProblem` holds what is free, and in
+`start` where it begins. `explain` is that order; `judge.py` says what is kept. Another lens is only reported: the run
+may take it, and begin again (`runner/lens_of_motion.py`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.least_squares import robust_sigma_2d
+from scopemap.engine.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px
+from scopemap.engine.mapping.bundle_problem import BundleProblem, State, successive
+from scopemap.engine.mapping.correction import FrameCorrection, TrackedPose
+from scopemap.engine.mapping.depth_correction import DepthCorrectionField
+from scopemap.engine.mapping.judge import (
+    Interval,
+    MapErrors,
+    ShapeTest,
+    refusal_by_lens,
+    refusal_by_views,
+    refusal_of_interval,
+)
+from scopemap.engine.mapping.keyframes import Keyframes, MapKeyframes
+from scopemap.engine.mapping.lens import LensKinds, lens_test
+from scopemap.engine.mapping.other_starts import with_other_starts
+from scopemap.engine.mapping.segments import Segment, choose_segments, joined
+
+
+class AdjustedMaps(NamedTuple):
+    """A correction, what merged maps are judged by, what was solved, and where that ended, refused or not."""
+
+    correction: FrameCorrection
+    errors: MapErrors
+    problem: BundleProblem
+    solution: State
+
+
+def explain(
+    keyframes: Keyframes,
+    main: int,
+    allowed: Collection[int],
+    tracked: Mapping[int, TrackedPose],
+    lenses: LensKinds,
+) -> list[Segment]:
+    """Return the segments of a map and of the maps merged with it: one where one scene explains all of it.
+
+    allowed : numbers of the maps that may be merged. tracked : poses as tracked by number of the frame; needed for
+    several maps. lenses : what the lens may be.
+    """
+    keyframes, alone = _alone(keyframes, main)
+    found, worlds = _merged(keyframes, main, allowed, alone)
+    merged = keyframes.of_maps(worlds)
+    correction = _with_lens(merged, found, alone, lenses)
+    correction = replace(correction, S_common_map=worlds, tracked=tracked)
+    whole = Segment(int(correction.index[-1]), correction)
+    if not correction.refused:
+        return [whole]
+    return _segments(merged, found.problem, correction) or [whole]
+
+
+def _alone(keyframes: Keyframes, main: int) -> tuple[Keyframes, AdjustedMaps]:
+    """Return the adjustment of one map, and the keyframes of all without the drift of the scale if that is confirmed.
+
+    Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
+    """
+    if keyframes.log_scales.any():
+        without = keyframes.without_drift(1.0)
+        found = _adjusted(without, {main: without.unit(main)}, main)
+        if not found.correction.refused:
+            return without, found
+        del found  # for memory
+    keyframes = keyframes.without_drift(0.0)
+    return keyframes, _adjusted(keyframes, {main: keyframes.unit(main)}, main)
+
+
+def _merged(
+    keyframes: Keyframes, main: int, allowed: Collection[int], alone: AdjustedMaps
+) -> tuple[AdjustedMaps, dict[int, Similarity]]:
+    """Return the adjustment of a map with all that fit to it, the best supported first, and their Sim(3).
+
+    alone : the map's own. Each map is tried with the main one and with that of the merged ones that it has most
+    loops with, so that time grows with the number of maps, and all are adjusted together in the end.
+    """
+    most_px = keyframes.settings.max_sigma_px
+    found, worlds, merged, refused = alone, {main: keyframes.unit(main)}, {main}, 0
+    for number in [*keyframes.merged_worlds(main, allowed)][1:]:
+        few = {main, keyframes.partner(number, merged), number}
+        # Each try costs an adjustment: no more of them fail than maps are merged, and one.
+        if refused > len(merged) or number not in (S := keyframes.merged_worlds(main, few)):
+            continue
+        together = _adjusted(keyframes, S, main)
+        if not together.errors.fit(alone.errors, most_px):
+            refused += 1
+            continue
+        merged.add(number)
+        if merged <= few or len(worlds) == 1:
+            found, worlds = together, S
+    if len(worlds) < len(merged):
+        S = keyframes.merged_worlds(main, merged)
+        together = _adjusted(keyframes, S, main)
+        if together.errors.fit(alone.errors, most_px):
+            return together, S
+    return found, worlds
+
+
+def _with_lens(keyframes: MapKeyframes, found: AdjustedMaps, alone: AdjustedMaps, lenses: LensKinds) -> FrameCorrection:
+    """Return the correction with the test of the lens; where one map was refused, only if it contradicts the lens.
+
+    alone : the main map's own adjustment, which tells enough of the lens.
+    """
+    tested = found if alone.correction.refused else alone
+    lens = lens_test(tested.problem, tested.solution)
+    lens = lenses.better_than(lens, tested.problem, tested.solution)
+    worse = refusal_by_lens(lens)
+    if worse is not None and tested is found and not found.correction.refused:
+        return replace(keyframes.uncorrected(lens.held_px), refused=worse, lens=lens)
+    if len(keyframes.S_common_map) == 1 and found.correction.refused and not lens.contradicts:
+        return found.correction
+    return replace(found.correction, lens=lens)
+
+
+def _segments(keyframes: MapKeyframes, problem: BundleProblem, refused: FrameCorrection) -> list[Segment]:
+    """Return the segments of maps that no one scene explains, each adjusted by itself; [] where there is one.
+
+    problem : of all keyframes. refused : the correction of all, which is none.
+    """
+    problem = replace(problem, start=None)
+    intervals = choose_segments(keyframes, problem)
+    if len(intervals) < 2:
+        return []
+    worlds, tracked, lens = refused.S_common_map, refused.tracked, refused.lens
+    alone = (_of_interval(keyframes, problem, interval) for interval in intervals)
+    corrections = [replace(one, S_common_map=worlds, tracked=tracked, lens=lens) for one in alone]
+    return joined(corrections, intervals, keyframes)
+
+
+def _of_interval(keyframes: MapKeyframes, problem: BundleProblem, interval: Interval) -> FrameCorrection:
+    """Return the correction of an interval by itself: as tracked where left-out tracks or depth prefer that."""
+    own = keyframes.successive(interval.first, interval.last + 1)
+    if (refused := refusal_of_interval(interval, keyframes.settings.max_sigma_px)) is not None:
+        return replace(own.uncorrected(interval.error_px), refused=refused)
+    part = successive(problem, interval.first, interval.last + 1)
+    return adjust_maps(own, part, np.zeros((0, 2), int), own.poses[0].map).correction
+
+
+def _adjusted(keyframes: Keyframes, worlds: Mapping[int, Similarity], main: int) -> AdjustedMaps:
+    """Return the bundle adjustment of all keyframes of maps with these Sim(3) to the common world."""
+    problem, accepted = keyframes.problem(worlds)
+    return adjust_maps(keyframes.of_maps(worlds), problem, accepted, main)
+
+
+def adjust_maps(keyframes: MapKeyframes, problem: BundleProblem, loops: np.ndarray, main: int) -> AdjustedMaps:
+    """Return the bundle adjustment of keyframes, judged; loops : (A, 2) int, those of the accepted loop closures."""
+    found, shape = _solution(keyframes, problem)
+    fields: tuple[DepthCorrectionField, ...] = ()
+    refused = refusal_by_views(found.sigma_px, keyframes.settings.max_sigma_px, shape)
+    if refused is None:
+        fields = keyframes.depth_fields(problem.points, found)
+        # Other starts have judged the shape, where they could; else the depths do.
+        refused = None if shape.is_tested else keyframes.refusal_by_depth(found, fields)
+    graph_contradicts = False
+    if refused is None:
+        correction = replace(keyframes.correction(found), depth_fields=fields, shape=shape, loops=len(loops))
+    elif len(keyframes.S_common_map) > 1 and problem.start is not None:
+        by_graph = found._replace(state=problem.start._replace(sigma_px=found.sigma_px))
+        correction = replace(keyframes.correction(by_graph), refused=refused, loops=len(loops))
+        graph_contradicts = keyframes.refusal_by_depth(by_graph) is not None
+    else:
+        correction = replace(keyframes.uncorrected(found.sigma_px), refused=refused, shape=shape)
+    correction = replace(correction, loop_frames=keyframes.index[loops].tolist() if correction.loops else [])
+    within_px, between_px = _errors_of_maps(keyframes, problem, found.state, main)
+    before_px, _ = _errors_of_maps(keyframes, problem, problem.begin, main)
+    errors = MapErrors(
+        is_adjusted=refused is None,
+        main_px=within_px[main],
+        largest_px=_largest(within_px),
+        graph_px=math.inf if graph_contradicts else _largest(before_px),
+        between_px=between_px,
+        loops=correction.loops,
+        support=_loop_support(loops, keyframes.map_of, main),
+    )
+    return AdjustedMaps(correction, errors, problem, found.state)
+
+
+def _solution(keyframes: MapKeyframes, problem: BundleProblem) -> tuple[BundleSolution, ShapeTest]:
+    """Return the solution; of one map that of the start that wins, and what the starts tell."""
+    found, settings = adjust_in_windows(problem), keyframes.settings
+    if len(keyframes.S_common_map) > 1 or not settings.other_starts:
+        return found, ShapeTest()
+    return with_other_starts(problem, found, is_rigid=found.sigma_px <= settings.max_sigma_px)
+
+
+def _errors_of_maps(
+    keyframes: MapKeyframes, problem: BundleProblem, state: State, main: int
+) -> tuple[dict[int, float], float]:
+    """Return the robust standard deviations of reprojection errors within each map, and the largest between maps.
+
+    Between: of each map but the main one with all others, for a wrong one hides among right ones that have more loops;
+    NaN where a map has no loop.
+    """
+    length_px, map_of, seen = errors_px(problem, state), keyframes.map_of, problem.observations
+    host, observer = map_of[problem.points.host[seen.point]], map_of[seen.keyframe]
+
+    def sigma_px(chosen: np.ndarray) -> float:
+        return robust_sigma_2d(length_px[chosen]) if chosen.any() else math.nan
+
+    maps = [*keyframes.S_common_map]
+    within_px = {number: sigma_px((host == number) & (observer == number)) for number in maps}
+    between_px = [sigma_px((host == number) != (observer == number)) for number in maps if number != main]
+    return within_px, float(np.max(between_px or math.nan))
+
+
+def _largest(within_px: Mapping[int, float]) -> float:
+    """Return the largest known error; NaN without any, as of a map of one keyframe."""
+    return float(np.fmax.reduce([*within_px.values()]))
+
+
+def _loop_support(loops: np.ndarray, map_of: np.ndarray, main: int) -> int:
+    """Return the fewest keyframes, on either side, of the loops (A, 2) of a map with others; 0: a map has none."""
+    least = []
+    for number in sorted(set(map_of.tolist()) - {main}):
+        inside = map_of[loops] == number
+        ends = loops[inside.sum(1) == 1]
+        own = map_of[ends] == number
+        least.append(min(len(np.unique(ends[own])), len(np.unique(ends[~own]))))
+    return min(least, default=0)
