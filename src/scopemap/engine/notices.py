@@ -115,6 +115,9 @@ KINDS: dict[str, _Kind] = {
     "depth-propagated": _Kind(
         "info", "The network estimated depth in one frame in {every}; optical flow propagated it to {frames:frame}."
     ),
+    "depth-files-kind": _Kind(
+        "info", "The depth files hold {kind}: {reason}.", "If that is wrong, set depth.files_kind."
+    ),
     "frames-skipped": _Kind("info", "{frames:frame} without usable texture were skipped: {causes}."),
     "frames-few": _Kind("note", "Only {frames:frame} are in the result: too few to judge it.", in_verdict=False),
     "frames-forgotten": _Kind("note", "The result keeps the last {kept} frames; {frames} older ones are not in it."),

@@ -11,7 +11,7 @@ from scopemap.engine.depth.estimate import DepthEstimator
 from scopemap.engine.depth.shading import ShadingDepth
 from scopemap.engine.depth.stereo import StereoDepth
 from scopemap.engine.errors import CalibrationError, SettingsError
-from scopemap.input.depth_files import FilesDepth
+from scopemap.input.depth_files import FilesDepth, FilesOfInput
 
 _FILES = "files:"
 
@@ -20,7 +20,7 @@ def create_depth(
     settings: DepthSettings,
     rectifier: Rectifier,
     device: str,
-    depth_scale_mm: float | None = None,
+    of_input: FilesOfInput | None = None,
     *,
     calibrated: bool = True,
     averaged: bool = False,
@@ -31,7 +31,7 @@ def create_depth(
 
     rectifier : from the camera that depth files show the view of to the working camera.
     device : "auto", "cpu" or "cuda", for networks but scopenet, which runs on the CPU.
-    depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
+    of_input : what the input knows of depth files.
     calibrated : whether the frames' camera is known; False: ScopeNet gets no ray directions (wrong ones mislead it).
     averaged : whether ScopeNet may take three times as long, and err less.
     pair : the cameras of both views that the frames carry, or why they are not known; None where they carry one.
@@ -48,7 +48,7 @@ def create_depth(
         return StereoDepth(pair, rectifier.target)
     folder = files_folder(settings)
     if folder is not None:
-        return FilesDepth(folder, rectifier, settings, depth_scale_mm)
+        return FilesDepth(folder, rectifier, settings, of_input)
     if settings.backend == "shading":
         return ShadingDepth(settings)
     # Networks take seconds to import, so they are imported when chosen.

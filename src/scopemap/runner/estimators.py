@@ -25,7 +25,7 @@ from scopemap.engine.models.device import choose_device
 from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.at_rest import CameraAtRest
 from scopemap.engine.tracking.features import SiftFeatures
-from scopemap.input.depth_files import FilesDepth
+from scopemap.input.depth_files import FilesDepth, FilesOfInput
 from scopemap.input.mask_files import create_masks
 from scopemap.input.sequence import Sequence
 from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder
@@ -56,7 +56,7 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         config.depth,
         sequence.depth_rectifier if in_input else sequence.rectifier,
         networks.device,
-        sequence.depth_scale_mm,
+        FilesOfInput(sequence.depth_scale_mm, sequence.source.picture_files()),
         calibrated=sequence.calibrated,
         averaged=config.tracking.camera_at_rest,  # no parallax corrects its shape
         pair=sequence.pair,
