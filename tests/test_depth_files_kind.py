@@ -89,6 +89,7 @@ def test_the_first_frames_tell_inverse_depth(form: str, phantom: Path, pictures:
     (notice,) = [notice for notice in notices if notice.code == "depth-files-kind"]
     assert "inverse depth (near is large): " in notice.text
     assert "the camera motion shows it" in notice.text
+    assert len(notice.text) <= 120
 
 
 def test_the_first_frames_tell_depth(phantom: Path, pictures: Path, tmp_path: Path) -> None:

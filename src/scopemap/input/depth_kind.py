@@ -95,8 +95,8 @@ class KindEvidence:
     def reason(self) -> str:
         """What decided, as the end of a sentence."""
         told = "the camera motion shows it" if self.by_motion else ""
-        agrees = f"scopenet's depth agrees (rank correlation {self.network:.2f})" if self.by_network else ""
-        return " and ".join(filter(None, (told, agrees)))
+        agrees = f"scopenet agrees (correlation {abs(self.network):.2f})" if self.by_network else ""
+        return ", and ".join(filter(None, (told, agrees)))
 
 
 def kind_evidence(sequence: Sequence, config: Config, numbers: Numbers) -> KindEvidence:
