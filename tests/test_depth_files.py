@@ -17,7 +17,7 @@ from scopemap.engine.config import DepthSettings
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
 from scopemap.input.camera_files.writing import write_calibration
-from scopemap.input.depth_files import FilesDepth
+from scopemap.input.depth_files import FilesDepth, FilesOfInput
 
 SOURCE = PinholeCamera(100.0, 100.0, 59.5, 49.5, 120, 100)
 TARGET = SOURCE.resized(60, 50)
@@ -30,7 +30,7 @@ def frame(index: int = 0, camera: PinholeCamera = TARGET) -> Frame:
 
 
 def files(folder: Path, scale_mm: float | None = None, rectifier: Rectifier = SAME, **settings: Any) -> FilesDepth:
-    return FilesDepth(folder, rectifier, DepthSettings(**settings), scale_mm)
+    return FilesDepth(folder, rectifier, DepthSettings(**settings), FilesOfInput(scale_mm))
 
 
 def write(folder: Path, name: str, array: np.ndarray) -> None:

@@ -44,6 +44,7 @@ KINDS: dict[str, _Kind] = {
     "frames-failed": _Kind("note", ("frames", "first", "reason")),
     "frames-without-depth": _Kind("note", ("frames", "first")),
     "depth-propagated": _Kind("info", ("every", "frames")),
+    "depth-files-kind": _Kind("info", ("kind", "reason")),
     "frames-skipped": _Kind("info", ("frames", "causes")),
     "frames-few": _Kind("note", ("frames",)),
     "frames-forgotten": _Kind("note", ("kept", "frames")),

@@ -1,15 +1,19 @@
-"""Depth from files: one disparity or depth image per frame, found by the number in its name.
+"""Depth from files: one disparity or depth image per frame.
 
-8-bit images are disparity unless `depth.files_kind` is set (0 = farthest, not unknown); 16-bit images are
-measured depth. The files show the source's view, distorted as the frames are, at any size; a depth folder written by
-scopemap itself (`depth.json` in it) is in the geometry of the rectified frames.
+8-bit images are disparity unless `depth.files_kind` is set (0 = farthest, not unknown). 16-bit images and floats are
+taken as measured depth, unless the first frames tell that they are inverse depth (`depth_kind`). The files show the
+source's view, distorted as the frames are, at any size; a depth folder written by scopemap itself (`depth.json` in it)
+is in the geometry of the rectified frames.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -25,10 +29,14 @@ from scopemap.input.decoding import by_number, frame_number, read_decoded
 _IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _NUMPY = ".npy"
 _NAMED_DEPTH = re.compile(r"(^|[._-])(depth|disp|disparity)([._-]|$)", re.IGNORECASE)
+_COLOUR = re.compile(r"[._-](color|colour|rgb)$", re.IGNORECASE)
 _OTHER_CONTENT = re.compile(r"[._-](color|colour|rgb|normals?|flow|occlusion|masks?)$", re.IGNORECASE)
+_SEPARATORS = "._-"
 _ASPECT_TOLERANCE = 0.02
+_LOOKED_AT = 5  # files whose median tells the unit; by hand: a first frame at the wall is one of them
 # C3VD writes 0..100 mm over the whole range of its `NNNN_depth.tiff` (DATASETS: u16, 65535 = clipped).
 _C3VD_RANGE_MM = 100.0
+_C3VD_NAMES = ("_depth.tiff", "_depth.tif")
 
 
 @dataclass(frozen=True)
@@ -40,30 +48,93 @@ class _Scale:
     is_known: bool = True
 
 
+@dataclass(frozen=True)
+class FilesOfInput:
+    """What an input knows of depth files.
+
+    scale_mm : mm per unit by its calibration, or None. pictures : its pictures by frame number, none of a video.
+    """
+
+    scale_mm: float | None = None
+    pictures: Mapping[int, Path] = field(default_factory=dict)
+
+
 class FilesDepth:
     """Depth estimator that reads depth or disparity from files.
 
     folder : holds one file per frame; `*_depth.*` and `*.depth.*` are preferred where the folder has other images.
     rectifier : from the source camera to the working camera.
-    depth_scale_mm : mm per unit by the input's own calibration, or None.
-    measured_max_mm : farthest depth that measured files can hold, of floats twice the first file's; None: predicted.
+    of_input : what the input knows of them.
+    kind : of the values. kind_is_stated : whether a setting, or a file beside them, says so. kind_reason : why they are
+    of this kind where it is implied; "": a guess.
 
-    Raises `InputError` where the folder does not exist, holds no usable file, or two files for one number.
+    Raises `InputError` where the folder does not exist, holds no usable file, or two files for one frame.
     """
 
     name = "files"
 
     def __init__(
-        self, folder: Path, rectifier: Rectifier, settings: DepthSettings, depth_scale_mm: float | None = None
+        self, folder: Path, rectifier: Rectifier, settings: DepthSettings, of_input: FilesOfInput | None = None
     ) -> None:
+        of_input = of_input or FilesOfInput()
         self._folder, self._rectifier = Path(folder), rectifier
-        self._files = depth_files(self._folder)
+        self._files = depth_files(self._folder, of_input.pictures)
         first = _read(next(iter(self._files.values())))
-        self._kind = settings.files_kind if settings.files_kind != "auto" else self._kind_of(first)
         self._only_type = first.dtype if settings.files_kind == "auto" else None
         self._is_rectified = (self._folder / "depth.json").exists()
-        self._scale = self._found_scale(first, settings, depth_scale_mm)
-        self.measured_max_mm = _largest(first) * self._scale.mm if self._kind == "measured" else None
+        stated = _scale_in(self._folder)
+        self.kind_is_stated = settings.files_kind != "auto" or stated is not None
+        self.kind, self.kind_reason = self._kind_of(first, settings)
+        self._scale = self._found_scale(first, settings, stated, of_input.scale_mm)
+        self._largest = _largest(first)
+
+    @property
+    def folder(self) -> Path:
+        """Where the files are."""
+        return self._folder
+
+    @property
+    def is_in_mm(self) -> bool:
+        """Whether they are meant to be mm by their scale; a run of unknown scale writes depth in a unit of its own."""
+        return not self._is_rectified or self._scale.is_known
+
+    @property
+    def scale(self) -> tuple[float, str]:
+        """Millimetres per unit of depth, and where that number comes from."""
+        return self._scale.mm, self._scale.source
+
+    @property
+    def measured_max_mm(self) -> float | None:
+        """Farthest depth that measured files can hold, of floats twice the first file's; None: predicted."""
+        return self._largest * self._scale.mm if self.kind == "measured" else None
+
+    def of_kind(self, kind: DepthKind) -> FilesDepth:
+        """Return the same files, read as another kind."""
+        other = copy.copy(self)
+        other.kind, other.kind_is_stated = kind, True
+        return other
+
+    def numbers(self, frame: Frame) -> np.ndarray | None:
+        """Return what the file of `frame` holds, rectified, (H, W) float32, 0 and NaN = unknown; None: cannot be read.
+
+        The numbers are those of the file, whatever its kind.
+        """
+        try:
+            array = _read(self._files[frame.index])
+            self._check(array, self._files[frame.index])
+        except (KeyError, InputError):
+            return None
+        values = _depth(array, 1.0)
+        return self._resized(values) if self._is_rectified else self._rectifier.nearest(values)
+
+    def median(self) -> float:
+        """Return the median of all positive values in a few files, in their unit; NaN where none can be read."""
+        files, medians = list(self._files.values()), list[float]()
+        for file in files[:: max(1, len(files) // _LOOKED_AT)]:
+            with suppress(InputError):
+                values = _depth(_read(file), 1.0)
+                medians += [float(np.nanmedian(values))] if np.isfinite(values).any() else []
+        return float(np.median(medians)) if medians else float("nan")
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return the depth or disparity of `frame` (found by `frame.index`), rectified, NaN = unknown.
@@ -76,12 +147,12 @@ class FilesDepth:
             numbers = sorted(self._files)
             raise InputError(
                 f"no depth file for frame {frame.index} in {self._folder} ({len(numbers)} files, numbers {numbers[0]} "
-                f"to {numbers[-1]}): the number in a file's name must be the frame's"
+                f"to {numbers[-1]}): name each file as its picture, or by the frame's number"
             )
         array = _read(file)
         self._check(array, file)
-        values = _disparity(array) if self._kind == "disparity" else _depth(array, self._scale.mm)
-        return DepthEstimate(self._rectified(values), self._kind)
+        values = _disparity(array) if self.kind == "disparity" else _depth(array, self._scale.mm)
+        return DepthEstimate(self._rectified(values), self.kind)
 
     @property
     def scale_is_known(self) -> bool:
@@ -90,28 +161,36 @@ class FilesDepth:
 
     def provenance(self) -> dict[str, str]:
         """Return the folder, the kind of values and, for depth, mm per unit with the reason."""
-        origin = {"depth": f"{len(self._files)} files in {self._folder}", "depth_kind": self._kind}
-        if self._kind != "disparity":
+        origin = {"depth": f"{len(self._files)} files in {self._folder}", "depth_kind": self.kind}
+        if self.kind != "disparity":
             origin["depth_scale"] = f"{self._scale.mm:.6g} mm per unit ({self._scale.source})"
         return origin
 
-    def _kind_of(self, array: np.ndarray) -> DepthKind:
+    def _kind_of(self, array: np.ndarray, settings: DepthSettings) -> tuple[DepthKind, str]:
+        """Return the kind by what is stated or implied, and why that implies it."""
+        if settings.files_kind != "auto":
+            return settings.files_kind, "depth.files_kind"
         if array.dtype == np.uint8:
-            return "disparity"
+            return "disparity", "they have 8 bits"
         first_name = next(iter(self._files.values())).name.lower()
-        return "disparity" if array.dtype != np.uint16 and "disp" in first_name else "measured"
+        if array.dtype != np.uint16 and "disp" in first_name:
+            return "disparity", 'their names contain "disp"'
+        if settings.files_scale_mm is not None:
+            return "measured", "depth.files_scale_mm states their unit"
+        return "measured", "their names are those of C3VD's depth" if first_name.endswith(_C3VD_NAMES) else ""
 
-    def _found_scale(self, array: np.ndarray, settings: DepthSettings, calibrated_mm: float | None) -> _Scale:
+    def _found_scale(
+        self, array: np.ndarray, settings: DepthSettings, stated: _Scale | None, calibrated_mm: float | None
+    ) -> _Scale:
         if settings.files_scale_mm is not None:
             return _Scale(settings.files_scale_mm, "depth.files_scale_mm")
-        stated = _scale_in(self._folder)
         if stated is not None:
             return stated
         if np.issubdtype(array.dtype, np.floating):
             return _Scale(1.0, "floats are taken as mm")
         if calibrated_mm is not None:
             return _Scale(calibrated_mm, "depth_scale of the input's calibration")
-        if next(iter(self._files.values())).name.lower().endswith(("_depth.tiff", "_depth.tif")):
+        if next(iter(self._files.values())).name.lower().endswith(_C3VD_NAMES):
             return _Scale(_C3VD_RANGE_MM / np.iinfo(array.dtype).max, "C3VD's 0..100 mm")
         return _Scale(1.0, "assumed; set depth.files_scale_mm if it is not so", is_known=False)
 
@@ -131,28 +210,75 @@ class FilesDepth:
 
     def _rectified(self, values: np.ndarray) -> np.ndarray:
         if self._is_rectified:
-            size = (self._rectifier.target.width, self._rectifier.target.height)
-            return cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)
-        return self._rectifier.smooth(values) if self._kind == "disparity" else self._rectifier.nearest(values)
+            return self._resized(values)
+        return self._rectifier.smooth(values) if self.kind == "disparity" else self._rectifier.nearest(values)
+
+    def _resized(self, values: np.ndarray) -> np.ndarray:
+        size = (self._rectifier.target.width, self._rectifier.target.height)
+        return cv2.resize(values, size, interpolation=cv2.INTER_NEAREST)
 
 
-def depth_files(folder: Path) -> dict[int, Path]:
-    """Return the depth files of a folder by the last whole number in their names, in the order of the numbers.
+def depth_files(folder: Path, pictures: Mapping[int, Path] | None = None) -> dict[int, Path]:
+    """Return the depth files of a folder by the number of their frame, in the order of the numbers.
 
-    Where some names contain depth or disparity, the others are left out, as are names of other content
-    (`*_color.*`, masks, normals). Raises `InputError` where there is none, or two have the same number.
+    pictures : the input's pictures by frame number, None of a video. A depth file belongs to the picture whose name it
+    has, with more before or after a separator (`0001_color.png`, `0001_color-dpt_512.png`), where half of the files or
+    of the pictures match; else to the frame of the last whole number in its name. Where some names contain depth or
+    disparity, the others are left out, as are names of other content (`*_color.*`, masks, normals), unless pictures
+    are named so. Raises `InputError` where there is none, or two belong to one frame.
     """
     if not folder.is_dir():
         raise InputError(f"reading depth files: {folder} is no folder; give files:FOLDER with the folder of the files")
     candidates = [f for f in sorted(folder.iterdir()) if f.suffix.lower() in (*_IMAGES, _NUMPY) and f.name[0] != "."]
-    numbered = [f for f in candidates if frame_number(f) is not None and not _OTHER_CONTENT.search(f.stem)]
-    named = [f for f in numbered if _NAMED_DEPTH.search(f.stem)]
+    own = {picture.resolve() for picture in (pictures or {}).values()}
+    others = [file for file in candidates if file.resolve() not in own]
+    if pictures and (matched := _by_picture(others, pictures)):
+        return matched
+    with_number = [file for file in others if frame_number(file) is not None]
+    numbered = [file for file in with_number if not _OTHER_CONTENT.search(file.stem)]
+    named = [file for file in numbered if _NAMED_DEPTH.search(file.stem)]
+    # A program that writes depth by the name of its picture keeps "color".
+    numbered = numbered or [file for file in with_number if _COLOUR.search(file.stem)]
     if not numbered:
         raise InputError(
             f"reading depth files: {folder} holds no png, tif, jpg or npy file with a number in its name that could be "
             "depth; the number is the frame's"
         )
     return by_number(named or numbered)
+
+
+def _by_picture(files: list[Path], pictures: Mapping[int, Path]) -> dict[int, Path]:
+    """Return the files whose names contain that of a picture, by its frame; {} where less than half of either do."""
+    number_of = {picture.stem: number for number, picture in pictures.items()}
+    if len(number_of) < len(pictures):
+        return {}
+    found: dict[int, list[Path]] = {}
+    for file in files:
+        if (stem := _picture_in(file.stem, number_of)) is not None:
+            found.setdefault(number_of[stem], []).append(file)
+    if 2 * len(found) < min(len(pictures), len(files)):
+        return {}
+    matched = {}
+    for number, of_one in sorted(found.items()):
+        chosen = [file for file in of_one if _NAMED_DEPTH.search(file.stem)] or of_one
+        if len(chosen) > 1:
+            first, second, *_ = chosen
+            raise InputError(
+                f"reading {first.parent}: {first.name} and {second.name} are both named as {pictures[number].name}; "
+                "leave one depth file for each picture"
+            )
+        matched[number] = chosen[0]
+    return matched
+
+
+def _picture_in(stem: str, pictures: Mapping[str, int]) -> str | None:
+    """Return the longest name of a picture that `stem` is, begins with or ends with; None for other content, too."""
+    if stem in pictures:
+        return stem
+    at = [i for i, letter in enumerate(stem) if letter in _SEPARATORS]
+    begins = [stem[:i] for i in reversed(at) if stem[:i] in pictures]
+    ends = [stem[i + 1 :] for i in at if stem[i + 1 :] in pictures]
+    return next(iter([] if _OTHER_CONTENT.search(stem) else [*begins, *ends]), None)
 
 
 def _read(file: Path) -> np.ndarray:

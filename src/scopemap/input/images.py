@@ -85,6 +85,10 @@ class ImageFolder(Source):
         """The images by frame number."""
         return dict(zip(self.numbers, self.files, strict=True))
 
+    def picture_files(self) -> dict[int, Path]:
+        """Return the files of the frames by number."""
+        return self.file_of
+
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames; unreadable files, with a warning, and those of another size are left out."""
         for number, file in list(zip(self.numbers, self.files, strict=True))[selection]:

@@ -34,7 +34,7 @@ _SAMPLES_BYTES = 100_000_000
 _KEPT = (
     "name", "width", "height", "pixel_aspect", "count", "numbers", "stamped", "rate_hz", "notes", "warnings",
     "frame_limit_s", "left_out", "resized", "quality", "depth_scale_mm", "depth_sensor", "masks", "stamps", "media",
-    "pose", "truth",
+    "pose", "truth", "picture_files",
 )  # fmt: skip
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 

@@ -143,6 +143,10 @@ class Source:
         """Return the name that FFmpeg opens where the frames are those of one video; None elsewhere."""
         return None
 
+    def picture_files(self) -> dict[int, Path]:
+        """Return the files of the frames by number; none where they are no pictures in a folder."""
+        return {}
+
     def pose(self, index: int) -> np.ndarray | None:
         """Return the true pose (4, 4), camera to world, mm, of the frame with this index, or None; reads no depth."""
         return self.poses.get(index)

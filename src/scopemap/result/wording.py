@@ -93,6 +93,7 @@ WORDINGS: dict[str, Wording] = {
     "depth-propagated": Wording(
         "The network estimated depth in one frame in {every}; optical flow propagated it to {frames:frame}."
     ),
+    "depth-files-kind": Wording("The depth files hold {kind}: {reason}.", "If that is wrong, set depth.files_kind."),
     "frames-skipped": Wording("{frames:frame} without usable texture were skipped: {causes}."),
     "frames-few": Wording("Only {frames:frame} are in the result: too few to judge it."),
     "frames-forgotten": Wording("The result keeps the last {kept} frames; {frames} older ones are not in it."),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from scopemap.engine.cameras.rectification import Rectifier, StereoPair
 from scopemap.engine.config import DepthSettings
@@ -11,6 +12,9 @@ from scopemap.engine.depth.estimate import DepthEstimator
 from scopemap.engine.depth.shading import ShadingDepth
 from scopemap.engine.errors import CalibrationError, SettingsError
 
+if TYPE_CHECKING:
+    from scopemap.input.depth_files import FilesOfInput
+
 _FILES = "files:"
 
 
@@ -18,7 +22,7 @@ def create_depth(
     settings: DepthSettings,
     rectifier: Rectifier,
     device: str,
-    depth_scale_mm: float | None = None,
+    of_input: FilesOfInput | None = None,
     *,
     calibrated: bool = True,
     averaged: bool = False,
@@ -29,7 +33,7 @@ def create_depth(
 
     rectifier : from the camera that depth files show the view of to the working camera.
     device : "auto", "cpu" or "cuda", for networks but scopenet, which runs on the CPU.
-    depth_scale_mm : mm per unit of depth files by the input's calibration, or None.
+    of_input : what the input knows of depth files.
     calibrated : whether the frames' camera is known; False: ScopeNet gets no ray directions (wrong ones mislead it).
     averaged : whether ScopeNet may take three times as long, and err less.
     pair : the cameras of both views that the frames carry, or why they are not known; None where they carry one.
@@ -50,7 +54,7 @@ def create_depth(
     if folder is not None:
         from scopemap.input.depth_files import FilesDepth
 
-        return FilesDepth(folder, rectifier, settings, depth_scale_mm)
+        return FilesDepth(folder, rectifier, settings, of_input)
     if settings.backend == "shading":
         return ShadingDepth(settings)
     # Networks take seconds to import, so they are imported when chosen.

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from scopemap.engine.config import Config
 from scopemap.engine.depth.anchor import max_depth_mm
@@ -25,6 +26,9 @@ from scopemap.engine.tracking.features import SiftFeatures
 from scopemap.input.mask_files import create_masks
 from scopemap.input.sequence import Sequence
 from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder
+
+if TYPE_CHECKING:
+    from scopemap.input.depth_files import FilesOfInput
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         config.depth,
         sequence.depth_rectifier if in_input else sequence.rectifier,
         networks.device,
-        sequence.depth_scale_mm,
+        None if folder is None else _files_of(sequence),
         calibrated=sequence.calibrated,
         averaged=config.tracking.camera_at_rest,  # no parallax corrects its shape
         pair=sequence.pair,
@@ -74,6 +78,12 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
         tracker,
     )
+
+
+def _files_of(sequence: Sequence) -> FilesOfInput:
+    from scopemap.input.depth_files import FilesOfInput
+
+    return FilesOfInput(sequence.depth_scale_mm, sequence.source.picture_files())
 
 
 def missing_weights(config: Config, *other_flows: str, verified: bool = False) -> list[str]:

@@ -1,4 +1,4 @@
-"""What comes before the first frame of a run: estimators, an unknown focal length."""
+"""What comes before the first frame of a run: estimators, an unknown focal length, the kind of depth files."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import is_constant
 from scopemap.engine.notices import Notice
 from scopemap.input.sequence import Sequence
+from scopemap.runner.depth_backends import files_folder
 from scopemap.runner.estimators import CustomEstimators, create_estimators
 from scopemap.runner.run import Progress
 
@@ -26,8 +27,15 @@ def prepare(
     estimators = timed("prepare", create_estimators, config, sequence, own)
     if not (sequence.calibrated or sequence.is_estimated):
         progress("estimating the focal length", 0, 0)
-    sequence, camera_notices = _with_estimated_focal(sequence, config, estimators, timed)
-    return sequence, config, estimators, camera_notices
+    sequence, notices = _with_estimated_focal(sequence, config, estimators, timed)
+    if files_folder(config.depth) is not None:
+        # Runs without depth files do not import what judges them.
+        from scopemap.runner.own_depth import with_files_judged
+
+        progress("examining the depth files", 0, 0)
+        config, estimators, of_files = timed("prepare", with_files_judged, sequence, config, estimators)
+        notices = [*notices, *of_files]
+    return sequence, config, estimators, notices
 
 
 def _with_estimated_focal(

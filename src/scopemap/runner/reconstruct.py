@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -151,6 +151,14 @@ class _DepthPictures:
 
 
 @dataclass(frozen=True)
+class _Again:
+    """What another pass begins with: the sequence with another lens, and the settings as resolved."""
+
+    sequence: Sequence
+    config: Config
+
+
+@dataclass(frozen=True)
 class _Passes:
     """Passes of a run through its frames: another one where the motion contradicts a lens that nobody has given.
 
@@ -174,11 +182,13 @@ class _Passes:
 
     def result(self, sequence: Sequence) -> tuple[Result, _DepthPictures | None]:
         """Return the result of the last pass, and what has written its depth."""
+        passes = self
         for number in range(1, MOST_PASSES + 1):
-            found = self._pass(sequence, number)
-            if not isinstance(found, Sequence):
+            found = passes._pass(sequence, number)
+            if not isinstance(found, _Again):
                 break
-            sequence = found
+            # What was decided before the first frame stays decided.
+            sequence, passes = found.sequence, replace(self, config=found.config)
             # Nothing resumes from a pass with another lens: where the next one is killed the run begins anew.
             if self.folder is not None:
                 discard_checkpoint(self.folder)
@@ -188,11 +198,11 @@ class _Passes:
             from scopemap.report.run_state import TRACKING_AGAIN
 
             self.progress(f"{TRACKING_AGAIN}, lens {sequence.camera_source}", 0, 0)
-        assert not isinstance(found, Sequence)
+        assert not isinstance(found, _Again)
         return found
 
-    def _pass(self, sequence: Sequence, number: int) -> tuple[Result, _DepthPictures | None] | Sequence:
-        """Return the result of a sequence, and what has written its depth; or the sequence with another lens."""
+    def _pass(self, sequence: Sequence, number: int) -> tuple[Result, _DepthPictures | None] | _Again:
+        """Return the result of a sequence, and what has written its depth; or what to begin again with."""
         folder = self.folder
         store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
         sequence, config, estimators, prepared = prepare(sequence, self.config, self.clock.timed, self.progress)
@@ -221,7 +231,7 @@ class _Passes:
             if number < MOST_PASSES and self.tracker is None and not run.stopped:
                 other = with_lens_of_motion(sequence, config, run.lens, again=number > 1)
                 if other is not None:
-                    return other
+                    return _Again(other, config)
             return run.result(self.notices), written
 
 

@@ -40,7 +40,8 @@ class DepthSettings(StageSettings):
     )
     files_kind: Literal["auto", "disparity", "depth", "measured"] = Field(
         "auto",
-        description="kind of depth files; auto: 8 bit is disparity, else measured; depth: predicted, scale may float",
+        description="kind of depth files, disparity: near is large; depth: predicted, scale may float; auto: 8 bit is "
+        "disparity, of others the first frames decide between disparity and measured",
     )
     files_scale_mm: float | None = Field(
         None, gt=0, le=1e6, description="mm per unit of depth files; unset: from the calibration, else 1"
