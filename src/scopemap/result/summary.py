@@ -7,7 +7,7 @@ from typing import Any
 
 from scopemap.result.input_part import part_of_input
 from scopemap.result.result import Result
-from scopemap.result.verdict import frames_per_s, verdict
+from scopemap.result.verdict import frames_per_s, percent_words, verdict
 
 _SKIPPED = {"repeated": "skipped as repeats", "thinned": "skipped by --fps", "size": "skipped: of another size"}
 _MOST_REASONS = 6
@@ -69,5 +69,5 @@ def _surface(figures: dict[str, float]) -> str:
     """Return how well the surface agrees with the frames that it was made of, "" where that is not known."""
     if "depth_error" not in figures:
         return ""
-    covered = f", covers {int(100 * figures['coverage_mean'])} % of what its frames see"
-    return f"{covered}, depth differs by {100 * figures['depth_error']:.1f} %"
+    covered = f", covers {percent_words(figures['coverage_mean'])} of what its frames see"
+    return f"{covered}, depth differs by {percent_words(figures['depth_error'], 1)}"

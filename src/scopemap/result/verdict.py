@@ -195,7 +195,7 @@ def _sentence(run: Result) -> str:
     if not len(run.mesh.faces):
         facts.append("There is no surface")
     elif "coverage_mean" in surface:
-        covered = _percent(surface["coverage_mean"])
+        covered = percent_words(surface["coverage_mean"])
         facts.append(f"The surface covers {covered} of what these frames show, not of the organ")
     return "".join(f"{fact}. " for fact in facts).rstrip()
 
@@ -217,7 +217,7 @@ def _usable(run: Result) -> str:
     words = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in longest)
     words += f" and {len(ranges) - len(longest)} shorter parts" if len(ranges) > len(longest) else ""
     _, used = frames_in_result(run.frames)
-    share = _percent(np.isin(run.frames["segment"], [segment.segment for segment in usable]).sum() / max(used, 1))
+    share = percent_words(np.isin(run.frames["segment"], [segment.segment for segment in usable]).sum() / max(used, 1))
     good = any(segment.level == "good" for segment in usable)
     return f"Usable: {words}, {share} of the video{'' if good else ', for looking, not for measuring'}."
 
@@ -245,7 +245,7 @@ def _of_frames(run: Result) -> Reason:
     if apart:
         where += f" or in usable submaps of {LEAST_SEGMENT_S:g} s and more"
         counted = f"{inside} and {apart} of {used}"
-    text = f"{_percent(share)} of the{chosen} frames{until} are {where} ({counted}){longest}.{which}"
+    text = f"{percent_words(share)} of the{chosen} frames{until} are {where} ({counted}){longest}.{which}"
     return Reason("frames-in-result", _level(-share, -GOOD_SHARE, -LEAST_SHARE), text)
 
 
@@ -309,8 +309,8 @@ def _of_surface(surface: dict[str, float], faces: int) -> list[Reason]:
         return [Reason("surface-missing", "bad", "There is no surface.")]
     found = []
     if "coverage_mean" in surface:
-        coverage, least = float(surface["coverage_mean"]), _percent(float(surface["coverage_least"]))
-        text = f"The surface covers {_percent(coverage)} of the tissue in its own frames (worst frame: {least})"
+        coverage, least = float(surface["coverage_mean"]), percent_words(float(surface["coverage_least"]))
+        text = f"The surface covers {percent_words(coverage)} of the tissue in its own frames (worst frame: {least})"
         text += ", not of the organ."
         found.append(Reason("surface-coverage", _level(-coverage, -GOOD_COVERAGE, -LEAST_COVERAGE), text))
     if "depth_error" in surface:
@@ -319,10 +319,12 @@ def _of_surface(surface: dict[str, float], faces: int) -> list[Reason]:
         if "within_10_percent_mean" in surface:
             mean, least_share = (float(surface[f"within_10_percent_{name}"]) for name in ("mean", "least"))
             levels.append(_level(-mean, -GOOD_WITHIN, -LEAST_WITHIN))
-            seen = f"; {_percent(mean)} of the picture agrees within 10 % (worst frame: {_percent(least_share)})"
+            seen = (
+                f"; {percent_words(mean)} of the picture agrees within 10 % (worst frame: {percent_words(least_share)})"
+            )
         level = max(levels, key=("good", "doubtful", "bad").index)
         words = {"good": "fits", "doubtful": "only roughly fits", "bad": "contradicts"}[level]
-        text = f"The surface {words} the frames: depth differs by {_percent(error, 1)} (median){seen}."
+        text = f"The surface {words} the frames: depth differs by {percent_words(error, 1)} (median){seen}."
         found.append(Reason("surface-depth", level, text))
     return found
 
@@ -385,7 +387,7 @@ def _level(value: float, good: float, bad: float) -> Level:
     return "good" if value <= good else "doubtful" if value <= bad else "bad"
 
 
-def _percent(share: float, digits: int = 0) -> str:
-    """Return a share as text; rounded down, so that not even a pixel short of all is all."""
+def percent_words(share: float, digits: int = 0) -> str:
+    """Return a share as text, the same everywhere; rounded down, so that not even a pixel short of all is all."""
     factor = 10.0**digits
     return f"{np.floor(100 * share * factor + 1e-9) / factor:.{digits}f} %"
