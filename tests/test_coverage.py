@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -208,6 +209,8 @@ def test_the_command_writes_figures_map_and_picture(holed: Path, capfd: pytest.C
     said = capfd.readouterr().out
     assert "3 o'clock" in said
     assert "scale unknown" in said
+    assert re.search(r" of \d+ square units of a lumen", said)
+    assert "unit2" not in said
     colours = trimesh.load(holed / "coverage" / "coverage.ply", process=False).visual.face_colors
     share = (colours[:, 0] > 150) & (colours[:, 1] < 60)
     assert 0 < share.mean() < 0.5  # the hole is red

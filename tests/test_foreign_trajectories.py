@@ -117,10 +117,12 @@ def test_bodyslam_writes_the_upper_three_rows_of_every_pose(tmp_path: Path) -> N
     poses = moving_camera()
     lines = [" ".join(map(str, pose.flatten()[:-4])) for pose in poses]
     (tmp_path / "poses.txt").write_text("\n".join(lines) + "\n")
-    for kind, source in (("auto", "KITTI, camera"), ("kitti", "KITTI, camera"), ("bodyslam", "KITTI, camera")):
+    assert_is(found := read_trajectory(tmp_path / "poses.txt", kind="bodyslam"), poses, list(range(20)))
+    assert found.source == "KITTI, camera-to-world, mm (assumed), row = frame"
+    for kind in ("auto", "kitti"):
         found = read_trajectory(tmp_path / "poses.txt", kind=kind)
-        assert_is(found, poses, list(range(20)))
-        assert found.source.startswith(source)
+        np.testing.assert_allclose(found.positions_mm, 1000 * poses[:, :3, 3])
+        assert_is(read_trajectory(tmp_path / "poses.txt", kind=kind, unit="mm"), poses, list(range(20)))
 
 
 # ---- Open3D and Endo-Depth-and-Motion

@@ -95,7 +95,7 @@ if TYPE_CHECKING:
     from scopemap.engine.depth.custom import CustomDepth
     from scopemap.engine.errors import ScopemapError
     from scopemap.engine.frame import Frame
-    from scopemap.evaluation.poses import evaluate_poses
+    from scopemap.evaluation.doubts import evaluate_poses
     from scopemap.input.opening import open_sequence
     from scopemap.input.trajectory.trajectory import Trajectory
     from scopemap.result.result import Result
@@ -126,7 +126,7 @@ _HOMES = {
     "Result": "result.result",
     "ScopemapError": "engine.errors",
     "Trajectory": "input.trajectory.trajectory",
-    "evaluate_poses": "evaluation.poses",
+    "evaluate_poses": "evaluation.doubts",
     "open_sequence": "input.opening",
     "read_trajectory": "result.trajectories",
     "reconstruct": "runner.reconstruct",

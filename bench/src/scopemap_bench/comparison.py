@@ -241,7 +241,12 @@ def _draw_mesh(run: FinishedRun, frames: Frames, file: Path) -> bool:
 
 
 def compare(
-    paths: Sequence[Path], truth: Path | None, protocol: ProtocolPlan, *, names: Sequence[str] = (), unit: Unit = "mm"
+    paths: Sequence[Path],
+    truth: Path | None,
+    protocol: ProtocolPlan,
+    *,
+    names: Sequence[str] = (),
+    unit: Unit | None = None,
 ) -> list[FinishedRun]:
     """Return the figures of each run's folder, benchmark's run or trajectory file against `truth`.
 
@@ -277,7 +282,7 @@ def _of_benchmark(path: Path, name: str, protocol: ProtocolPlan) -> FinishedRun:
     return FinishedRun(result, path / "run", entry.open, entry.sequence.figure)
 
 
-def _scored(path: Path, name: str, truth: Path, protocol: ProtocolPlan, unit: Unit) -> FinishedRun:
+def _scored(path: Path, name: str, truth: Path, protocol: ProtocolPlan, unit: Unit | None) -> FinishedRun:
     if not path.exists():
         raise InputError(f"comparing {path}: no such file or folder")
     result = RunResult(truth.stem if truth.is_file() else truth.resolve().name, name, timing=_timing(path))

@@ -76,6 +76,8 @@ class Entry(BaseModel):
     def key(self) -> str:
         """Fingerprint of all that decides the figures but the code: the plan, and size and time of the files in it."""
         described = self.model_dump(mode="json", exclude={"out": True, "data": True, "sequence": {"figure"}})
+        if not self.method.files:
+            described["method"]["unit"] = "mm"  # of no figure; results of earlier versions were kept under this key
         named = [self.method.files.format(sequence=self.sequence.name, seed=self.seed), self.sequence.camera or ""]
         named += [self.sequence.depth.partition("files:")[2], (self.sequence.phantom or {}).get("path_file", "")]
         stamps = [_stamp(self.data / name) for name in named if name and self.data is not None]

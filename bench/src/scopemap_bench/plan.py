@@ -129,7 +129,7 @@ class MethodPlan(_Part):
     name : for tables and folders. use : "scopemap", "import", "colmap", or a baseline (`methods.method.BASELINES`).
     preset, settings : what it changes; a preset comes before the plan's and the sequence's settings, these after them.
     files : of `use = "import"`: trajectory below the data folder; may hold {sequence} and {seed}.
-    unit, kind : of these files.
+    unit, kind : of these files; without a unit that of their format.
     """
 
     name: str
@@ -137,7 +137,7 @@ class MethodPlan(_Part):
     preset: Preset | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     files: str = ""
-    unit: Literal["mm", "m"] = "mm"
+    unit: Literal["mm", "m"] | None = None
     kind: str = "auto"
 
     @model_validator(mode="after")

@@ -13,6 +13,7 @@ import warnings
 from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 from scopemap.apps.batch.command import batch
 from scopemap.apps.browser.command import app as window_app
@@ -35,7 +36,25 @@ from scopemap.apps.view.command import view
 from scopemap.engine.errors import ScopemapError
 from scopemap.input.plugins import plugins
 
+_OF_BENCH = ("bench", "climb", "compare", "datasets", "phantom")
+"""Commands of scopemap-bench, which may not be installed."""
+
+
+class _Commands(TyperGroup):
+    """The commands; one whose package is missing is no misspelt other one."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return a command by its name; an error names the package of one that is not installed."""
+        if args and args[0] in _OF_BENCH and args[0] not in self.commands:
+            ctx.fail(
+                f"{args[0]} is a command of the package scopemap-bench, which is not installed; in the folder of "
+                "scopemap's source: pip install -c constraints.txt -e bench"
+            )
+        return super().resolve_command(ctx, args)
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="From a monocular endoscope video to camera poses and a tissue surface.",
     no_args_is_help=True,
     add_completion=False,

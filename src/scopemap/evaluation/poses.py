@@ -7,7 +7,6 @@ Poses are camera to world, (N, 4, 4) float64, mm, matched row by row. Definition
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from scopemap.engine.geometry.align import AlignMode, Similarity, align_trajecto
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.evaluation.turn import NOT_DETERMINED, Turn
 from scopemap.input.trajectory.trajectory import Trajectory, path_length_mm
-from scopemap.result.trajectories import read_trajectory
 
 MIN_MATCHED = 3
 # evo's 0.01 s, and a little over, since decimal time stamps are not exact in binary.
@@ -218,25 +216,20 @@ def _too_few(estimate: Trajectory, reference: Trajectory, found: int) -> str:
     spans = [f"{values[0]:.10g}..{values[-1]:.10g}" if len(values) else "none" for values in stamps]
     start = f"cannot compare the trajectories: {found} tracked frames match, at least {MIN_MATCHED} are needed; "
     if gap == 0:
-        return f"{start}frame numbers are {spans[0]} and {spans[1]}"
+        return f"{start}frame numbers are {spans[0]} and {spans[1]}{_numbered_otherwise(estimate, reference)}"
     times = f"time stamps are {spans[0]} s and {spans[1]} s (30 frames per s where a file has none)"
     return f"{start}{times}; frame numbers as stamps match too"
 
 
-def evaluate_poses(
-    estimate: Trajectory | Path | str, reference: Trajectory | Path | str, align: AlignMode, *, first: int | None = None
-) -> dict[str, Any]:
-    """Return the errors of a trajectory against the true one, by name: `ate_rmse_mm`, `rotation_mean_deg`, `rpe_10_mm`.
-
-    All names are in the docstring of `pose_report`. Raises `AlignmentError` where too few frames match, or where these
-    determine no alignment, and what `read_trajectory` does.
-
-    estimate, reference : trajectories, or what `read_trajectory` reads: files, folders of runs or of data sets.
-    align : what is fitted first, "none", "origin" (the first frames), "se3", "sim3" or "scale" (the size alone).
-    first : fit on so many tracked frames; None: on all.
-    """
-    one, other = (path if isinstance(path, Trajectory) else read_trajectory(path) for path in (estimate, reference))
-    return pose_report(match(one, other, align, first=first))
+def _numbered_otherwise(estimate: Trajectory, reference: Trajectory) -> str:
+    """Return that frame numbers would match if one side counted from another number, in words; "" if not."""
+    if not (estimate.has_indices and reference.has_indices):
+        return ""
+    shared = {by: len(np.intersect1d(estimate.indices, reference.indices + by)) for by in (-1, 1)}
+    by = max(shared, key=lambda one: shared[one])
+    if shared[by] < max(MIN_MATCHED, len(estimate) / 2):
+        return ""
+    return f"; {shared[by]} would match with the truth's numbers one {'higher' if by > 0 else 'lower'}"
 
 
 def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:

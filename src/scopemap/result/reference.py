@@ -15,7 +15,7 @@ from scopemap.input.trajectory.trajectory import Trajectory, Unit
 from scopemap.result.trajectories import holds_trajectory, read_trajectory, trajectory_kinds
 
 
-def read_reference(path: Path | str, *, unit: Unit = "mm", kind: str = "auto") -> Trajectory | None:
+def read_reference(path: Path | str, *, unit: Unit | None = None, kind: str = "auto") -> Trajectory | None:
     """Return the true poses of a data set's sequence, or of a trajectory file or folder; None where there are none.
 
     A folder is read as a data set first: its reader defines the camera of the poses. `unit` and `kind` are those
@@ -24,7 +24,7 @@ def read_reference(path: Path | str, *, unit: Unit = "mm", kind: str = "auto") -
     """
     path = Path(path)
     is_trajectory = not path.is_dir() or holds_trajectory(path)
-    asked_for = kind in trajectory_kinds() or (kind == "auto" and unit != "mm")
+    asked_for = kind in trajectory_kinds() or (kind == "auto" and unit == "m")
     if not path.is_dir() or (is_trajectory and asked_for) or kind not in ("auto", *readers()):
         return read_trajectory(path, unit=unit, kind=kind)
     try:

@@ -39,7 +39,7 @@ def frames_in_result(evidence: Evidence, level: Level) -> str:
     if evidence.frames_in_usable_submaps:
         where += f" or in usable submaps of {LEAST_SUBMAP_S:g} s and more"
         counted = f"{evidence.frames_usable} and {evidence.frames_in_usable_submaps} of {evidence.frames_used}"
-    share = _percent(evidence.usable_share or 0.0)
+    share = percent_words(evidence.usable_share or 0.0)
     return f"{share} of the{chosen} frames{until} are {where} ({counted}){longest}.{which}"
 
 
@@ -69,7 +69,7 @@ def against_losses(evidence: Evidence) -> str:
 
 def surface_coverage(evidence: Evidence, level: Level) -> str:
     """Return how much the surface covers."""
-    mean, least = _percent(evidence.coverage_mean or 0.0), _percent(evidence.coverage_least or 0.0)
+    mean, least = percent_words(evidence.coverage_mean or 0.0), percent_words(evidence.coverage_least or 0.0)
     return f"The surface covers {mean} of the tissue in its own frames (worst frame: {least}), not of the organ."
 
 
@@ -78,9 +78,9 @@ def surface_depth(evidence: Evidence, level: Level) -> str:
     words = {"good": "fits", "doubtful": "only roughly fits", "bad": "contradicts"}[level]
     seen, mean = "", evidence.within_10_percent_mean
     if mean is not None:
-        least = _percent(evidence.within_10_percent_least or 0.0)
-        seen = f"; {_percent(mean)} of the picture agrees within 10 % (worst frame: {least})"
-    error = _percent(evidence.depth_error or 0.0, 1)
+        least = percent_words(evidence.within_10_percent_least or 0.0)
+        seen = f"; {percent_words(mean)} of the picture agrees within 10 % (worst frame: {least})"
+    error = percent_words(evidence.depth_error or 0.0, 1)
     return f"The surface {words} the frames: depth differs by {error} (median){seen}."
 
 
@@ -116,7 +116,7 @@ def main_facts(evidence: Evidence) -> str:
     if not evidence.faces:
         facts.append("There is no surface")
     elif evidence.coverage_mean is not None:
-        covered = _percent(evidence.coverage_mean)
+        covered = percent_words(evidence.coverage_mean)
         facts.append(f"The surface covers {covered} of what these frames show, not of the organ")
     return "".join(f"{fact}. " for fact in facts).rstrip()
 
@@ -139,7 +139,7 @@ def _usable_parts(evidence: Evidence) -> str:
     longest = sorted(sorted(ranges, key=lambda ends: ends[0] - ends[1])[:_MOST_RANGES])
     words = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in longest)
     words += f" and {len(ranges) - len(longest)} shorter parts" if len(ranges) > len(longest) else ""
-    share = _percent(evidence.frames_usable / max(evidence.frames_used, 1))
+    share = percent_words(evidence.frames_usable / max(evidence.frames_used, 1))
     good = any(segment.level == "good" for segment in usable)
     return f"Usable: {words}, {share} of the video{'' if good else ', for looking, not for measuring'}."
 
@@ -171,7 +171,7 @@ def _counted(levels: list[Level]) -> str:
     return ", ".join(f"{levels.count(level)} {word}" for level, word in LEVEL_WORDS.items() if level in levels)
 
 
-def _percent(share: float, digits: int = 0) -> str:
-    """Return a share as text; rounded down, so that not even a pixel short of all is all."""
+def percent_words(share: float, digits: int = 0) -> str:
+    """Return a share as text, the same everywhere; rounded down, so that not even a pixel short of all is all."""
     factor = 10.0**digits
     return f"{np.floor(100 * share * factor + 1e-9) / factor:.{digits}f} %"

@@ -9,6 +9,7 @@ import numpy as np
 
 from scopemap.result.input_part import part_of_input
 from scopemap.result.result import Result
+from scopemap.result.sentences import percent_words
 from scopemap.result.verdict import verdict
 
 _SKIPPED = {"repeated": "skipped as repeats", "thinned": "skipped by --fps", "size": "skipped: of another size"}
@@ -82,5 +83,5 @@ def _surface(figures: dict[str, float]) -> str:
     """Return how well the surface agrees with the frames that it was made of, "" where that is not known."""
     if "depth_error" not in figures:
         return ""
-    covered = f", covers {int(100 * figures['coverage_mean'])} % of what its frames see"
-    return f"{covered}, depth differs by {100 * figures['depth_error']:.1f} %"
+    covered = f", covers {percent_words(figures['coverage_mean'])} of what its frames see"
+    return f"{covered}, depth differs by {percent_words(figures['depth_error'], 1)}"

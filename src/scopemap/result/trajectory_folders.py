@@ -39,7 +39,7 @@ def read_frames(folder: Path) -> tuple[FrameTable, str]:
 
     Raises `InputError` where its files are missing, damaged, or not of one run.
     """
-    poses = read_numbers(folder / "trajectory.tum").with_columns(8, "TUM")
+    poses = read_numbers(folder / "trajectory.tum").as_tum("TUM")
     frames = FrameTable.read(folder / "frames.csv")
     tracked = frames.tracked
     if len(poses.values) == len(frames.trajectory):

@@ -32,7 +32,9 @@ def compare(
     align: Annotated[
         Align, typer.Option(help="Align before measuring; runs of a benchmark keep their figures.")
     ] = "sim3",
-    unit: Annotated[Unit, typer.Option(help="Unit of trajectory files that state none.")] = "mm",
+    unit: Annotated[
+        Unit | None, typer.Option(help="Unit of trajectory files that state none; default: their format's.")
+    ] = None,
     consistency: Annotated[
         bool, typer.Option("--consistency", help="Also measure the consistency of depth over time.")
     ] = False,
@@ -61,7 +63,7 @@ def compare(
     if truth is not None:
         refuse_run_as_truth(truth)
     elif len(paths) == 2 and all(Result(path).is_finished for path in paths):
-        if (align, unit, consistency, paper_units) != ("sim3", "mm", False, False):
+        if (align, unit, consistency, paper_units) != ("sim3", None, False, False):
             raise InputError("--align, --unit, --consistency and --paper-units need --truth: two runs alone have none")
         _compare_two(paths, given, out, as_json=as_json, quiet=quiet)
         return

@@ -22,7 +22,7 @@ from scopemap.input.camera_files.parsing import calibration_bytes
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.decoding import by_number, read_decoded
 from scopemap.input.images import image_files
-from scopemap.input.trajectory.poses import are_frame_numbers
+from scopemap.input.trajectory.columns import are_frame_numbers
 from scopemap.input.trajectory.text import tum_poses
 from scopemap_bench.datasets.layouts import LayoutFolder, Place
 from scopemap_bench.datasets.tum import read_stamped

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from scopemap.engine.errors import InputError
 from scopemap.input.camera_files.reading import stated_calibration
-from scopemap.input.trajectory.poses import are_frame_numbers
+from scopemap.input.trajectory.columns import are_frame_numbers
 from scopemap.input.trajectory.text import read_numbers
 from scopemap_bench.datasets.layouts import poses_by_row
 from scopemap_bench.datasets.posed_video import PosedVideo, videos_in
@@ -56,7 +56,7 @@ class StereoMisFolder(PosedVideo):
         A row that holds NaN or infinity is a frame without a pose. Raises `InputError`, with the line, for what is no
         such row, and for a frame that is repeated.
         """
-        table = read_numbers(file, missing=True).with_columns(8, "frame tx ty tz qx qy qz qw").sorted_by_stamp()
+        table = read_numbers(file, missing=True).as_tum("frame tx ty tz qx qy qz qw").sorted_by_stamp()
         numbers = table.values[:, 0]
         if not are_frame_numbers(numbers) or numbers[0] < 0:
             raise InputError(f"reading {file}: the first column of 8 must be frame numbers, found {numbers[0]:g}")

@@ -18,7 +18,7 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.lenses import OpenCvCamera
 from scopemap.engine.errors import InputError, reporting
 from scopemap.input.images import ImageFolder
-from scopemap.input.trajectory.poses import are_frame_numbers
+from scopemap.input.trajectory.columns import are_frame_numbers
 from scopemap.input.trajectory.text import NumberTable, read_numbers, text_lines, tum_poses
 
 CAMERAS: dict[str, CameraModel] = {
@@ -126,7 +126,7 @@ def read_stamped(file: Path) -> NumberTable:
 
     Raises `InputError`, with the line, for any other row, for a stamp that is repeated, and where no pose is left.
     """
-    table = read_numbers(file, missing=True).with_columns(8, "stamp tx ty tz qx qy qz qw")
+    table = read_numbers(file, missing=True).as_tum("stamp tx ty tz qx qy qz qw")
     known = np.isfinite(table.values).all(axis=1) & table.values[:, 4:].any(axis=1)
     if not known.any():
         raise InputError(f"reading {file}: it holds no pose; leave the file out where none is known")

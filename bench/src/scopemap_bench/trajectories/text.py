@@ -16,7 +16,8 @@ import numpy as np
 
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.se3 import inverse
-from scopemap.input.trajectory.poses import are_frame_numbers, file_of, rigid, stamped
+from scopemap.input.trajectory.columns import are_frame_numbers
+from scopemap.input.trajectory.poses import file_of, rigid, stamped
 from scopemap.input.trajectory.text import fields_of, read_numbers, read_rows, text_lines, tum_poses
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
@@ -46,7 +47,7 @@ def refuse_log(path: Path, unit: Unit) -> Trajectory:
 
 def read_oneslam(path: Path, unit: Unit) -> Trajectory:
     """Read the keyframes of a OneSLAM run, or the `poses_gt.txt` of a data set in its layout."""
-    table = read_numbers(file_of(path, ONESLAM_FILES)).with_columns(8, "OneSLAM").sorted_by_stamp()
+    table = read_numbers(file_of(path, ONESLAM_FILES)).as_tum("OneSLAM").sorted_by_stamp()
     stamps, (T, words) = table.values[:, 0], tum_poses(table, unit)
     if not are_frame_numbers(stamps):
         raise InputError(f"{table.path}: OneSLAM stamps poses by frame number; with seconds the kind is 'tum'")

@@ -75,11 +75,12 @@ class HandMeasure:
     @classmethod
     def from_json(cls, kept: dict[str, Any]) -> HandMeasure:
         """Return what measurements.json has of one, as `read_measurements` returns it."""
+        known = [
+            {name: np.nan if one[name] is None else float(one[name]) for name in _NUMBERS} for one in kept["found"]
+        ]
         found = [
-            Measure(
-                one["what"], **{name: np.nan if one[name] is None else one[name] for name in _NUMBERS}, unit=one["unit"]
-            )
-            for one in kept["found"]
+            Measure(one["what"], numbers["value"], numbers["low"], numbers["high"], one["unit"])
+            for one, numbers in zip(kept["found"], known, strict=True)
         ]
         reference = None if kept["reference"] is None else np.array(kept["reference"], float)
         pixels, world = np.array(kept["points"], float), np.array(kept["world"], float).reshape(-1, 3)

@@ -153,6 +153,12 @@ class Coverage:
         return known | shares | {"blind_spots": spots}
 
     @property
+    def _units(self) -> tuple[str, str]:
+        """The units of places along and of areas, in words; without a scale they are the surface's own."""
+        length, area = ("mm", "mm2") if self.unit == "mm" else ("units", "square units")
+        return ("deg" if self.layout.kind == "cavity" else length), area
+
+    @property
     def sentence(self) -> str:
         """The share not seen with its interval, as the end of a sentence."""
         low, share, high = (f"{100 * value:.0f}" for value in (self.total.low, self.total.share, self.total.high))
@@ -160,7 +166,7 @@ class Coverage:
 
     def __str__(self) -> str:
         """The figures in a few lines: the whole, the segments, and the largest blind spots."""
-        along, area = ("deg" if self.layout.kind == "cavity" else self.unit), f"{self.unit}2"
+        along, area = self._units
         of = "a lumen" if self.layout.kind == "lumen" else "a cavity, by angles from the mean direction of view"
         lines = [f"not seen: {_percent(self.total)} of {_three_digits(self.total.area)} {area} of {of}; {self.scale}"]
         lines += [f"  {part.start:.0f} to {part.end:.0f} {along}: {_percent(part)}" for part in self.segments]
@@ -172,7 +178,7 @@ class Coverage:
     @property
     def findings(self) -> list[SurfaceFinding]:
         """The blind spots, for `write_findings`."""
-        along, area = self.facts["along_unit"], f"{self.unit}2"
+        along, area = self._units
         return [
             SurfaceFinding(
                 f"blind spot {number} {spot.where(along)}",

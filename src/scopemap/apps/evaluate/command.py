@@ -49,7 +49,9 @@ def evaluate(
             help="Read the truth this much later, s; fit: find the offset within half a second.",
         ),
     ] = "0",
-    unit: Annotated[Unit, advanced(help="Unit of a trajectory file that states none.")] = "mm",
+    unit: Annotated[
+        Unit | None, advanced(help="Unit of a trajectory file that states none; default: its format's, m for TUM.")
+    ] = None,
     truth_unit: Annotated[Unit | None, advanced(help="Unit of the truth; default: as --unit.")] = None,
     kind: Annotated[str, advanced(help="Format of the trajectory file; auto: by its content.")] = "auto",
     truth_kind: Annotated[
@@ -75,6 +77,7 @@ def evaluate(
     figures = _against_own_video(trajectory, source) if against_video else {}
     if truth is not None:
         from scopemap.evaluation.clock import by_clock
+        from scopemap.evaluation.doubts import doubts
         from scopemap.evaluation.poses import match, pose_report
         from scopemap.result.reference import read_reference
         from scopemap.result.trajectories import read_trajectory
@@ -88,9 +91,11 @@ def evaluate(
             matched = match(estimate, reference, align, first=align_first)
             measured = _measured(Compared(trajectory, truth, estimate, reference, matched), further)
             sources = {"trajectory": estimate.source, "truth": reference.source}
-            figures = pose_report(matched) | clock | measured | figures | {"sources": sources}
+            doubted = doubts(estimate, reference, matched)
+            said = {"doubts": doubted} if doubted else {}
+            figures = pose_report(matched) | clock | measured | figures | said | {"sources": sources}
             if not quiet:
-                _warn_of(matched, clock)
+                _warn_of(matched, clock, doubted)
     show(figures, form)
 
 
@@ -134,10 +139,15 @@ def _against_own_video(run: Path, source: Path | None = None) -> dict[str, Any]:
     return {"against_video": agreement.figures()}
 
 
-def _warn_of(matched: MatchedTrajectories, clock: dict[str, Any]) -> None:
-    """Print what limits the figures of these trajectories; `clock` : what `by_clock` says of the truth's clock."""
+def _warn_of(matched: MatchedTrajectories, clock: dict[str, Any], doubted: Sequence[str]) -> None:
+    """Print what limits the figures of these trajectories.
+
+    clock : what `by_clock` says of the truth's clock. doubted : other readings of the two that would agree better.
+    """
     from scopemap.evaluation.clock import clock_sentence
 
+    for sentence in doubted:
+        typer.echo(f"warning: {sentence}", err=True)
     if said := clock_sentence(clock):
         typer.echo(f"warning: {said}", err=True)
     lost = int((~matched.tracked).sum())

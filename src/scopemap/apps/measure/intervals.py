@@ -16,6 +16,8 @@ import numpy as np
 SIGMAS = 1.96
 """Ends of a 95 % interval of a normal distribution, standard deviations."""
 
+_SHARED = ("the depth of the frame", "the focal length", "the scale")
+
 
 @dataclass(frozen=True)
 class LogChanges:
@@ -45,6 +47,12 @@ class LogChanges:
     def to_power(self, power: float) -> LogChanges:
         """Return those of a power of the figure."""
         return LogChanges(power * self.shared, power * self.own)
+
+    def main_source(self, of_own: str) -> str:
+        """Return what widens the interval most, in words; of_own : the figure's own sources, in words."""
+        size = np.square(np.abs(self.shared).max(axis=1, initial=0))
+        own = float(np.square(np.abs(self.own).max(axis=1, initial=0)).sum())
+        return (*_SHARED, of_own)[int(np.argmax([*size, own]))]
 
     @property
     def factors(self) -> tuple[float, float]:

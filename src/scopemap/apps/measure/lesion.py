@@ -17,7 +17,7 @@ import trimesh
 from scipy import ndimage
 
 from scopemap.apps.measure.intervals import LogChanges
-from scopemap.apps.measure.measure import Known, KnownScale, Measure, known_scale
+from scopemap.apps.measure.measure import WIDE, Known, KnownScale, Measure, known_scale
 from scopemap.engine.cameras.rectification import Rectifier
 from scopemap.engine.errors import InputError, SettingsError, check_shape
 from scopemap.engine.geometry.lesion_shape import LesionView, view_shape
@@ -27,6 +27,8 @@ from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.decoding import by_number, read_decoded, write_image
 from scopemap.result.result import Result
 
+_OF_VIEWS = "the outline and what frames differ by"
+_OF_RELIEF = "depth, which tells little of relief"
 _FIGURES = {
     "diameter": ("largest diameter", 1, 0.04),
     "cross": ("diameter across it", 1, 0.12),
@@ -100,7 +102,7 @@ def measure_lesion(
         value, sigma = _combined(views, shown, figure, common)
         changes = scale.from_views.times(LogChanges.of_own(sigma)).to_power(power)
         unit = scale.unit if power == 1 else scale.square
-        found.append(Measure.of(name, value / scale.divisor**power, changes, unit))
+        found.append(Measure.of(name, value / scale.divisor**power, changes, unit, _OF_VIEWS))
     found.append(_height(views, found[0], scale))
     counted = {index: shown[index] for index in views}
     sizes_px = np.array([mask.sum() for mask in counted.values()])
@@ -281,7 +283,7 @@ def _height(views: dict[int, LesionView], diameter: Measure, scale: KnownScale) 
     value = _weighted_median(values[known], _facing(views)[known] ** 2) / scale.divisor if known.any() else 0.0
     value = max(value, 0.0)
     low, high = max(value - _LOWER * diameter.high, 0.0), value + _HIGHER * diameter.high
-    return Measure("height", value, low, high, diameter.unit)
+    return Measure("height", value, low, high, diameter.unit, _OF_RELIEF if high > WIDE * low else "")
 
 
 def _facing(views: dict[int, LesionView]) -> np.ndarray:

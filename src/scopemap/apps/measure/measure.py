@@ -21,6 +21,9 @@ from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside,
 from scopemap.report.measured_surface import measure_errors, measured_depth, measured_mesh
 from scopemap.result.result import Result
 
+WIDE = 1.5
+"""An interval is wide where its ends differ by more than this factor (by hand: about a quarter to either side)."""
+_OF_POINTS = "the depth and the place of the single points"
 _REFERENCE_SHARE = 0.3
 _MOST_SIGMA = 0.05
 """Share of the depth's standard deviation at a reference that does not cancel in lengths beside it, and its most.
@@ -33,7 +36,8 @@ As a share of the depth, by phantoms (docs/measure.md): the surface is the mean 
 class Measure:
     """What was measured, its value, and the ends of its 95 % interval, NaN: unknown. unit : mm, mm2, or the reference.
 
-    The value is infinite where the surface has a gap between the points.
+    The value is infinite where the surface has a gap between the points. why : what makes a wide interval wide; "":
+    it is narrow, or not known.
     """
 
     what: str
@@ -41,12 +45,14 @@ class Measure:
     low: float
     high: float
     unit: str
+    why: str = ""
 
     @classmethod
-    def of(cls, what: str, value: float, changes: LogChanges, unit: str) -> Measure:
-        """Return a measure by its value and by what moves it."""
+    def of(cls, what: str, value: float, changes: LogChanges, unit: str, of_own: str = _OF_POINTS) -> Measure:
+        """Return a measure by its value and by what moves it; of_own : its own sources of error, in words."""
         low, high = changes.factors
-        return cls(what, float(value), float(value * low), float(value * high), unit)
+        why = changes.main_source(of_own) if high > WIDE * low else ""
+        return cls(what, float(value), float(value * low), float(value * high), unit, why)
 
     def __str__(self) -> str:
         if not np.isfinite(self.value):
@@ -54,7 +60,8 @@ class Measure:
         value, low, high = (
             np.format_float_positional(float(f"{one:.3g}"), trim="-") for one in (self.value, self.low, self.high)
         )
-        return f"{self.what}: {value} {self.unit}" + (f" ({low} to {high})" if np.isfinite(self.low) else "")
+        why = f"; wide mainly because of {self.why}" if self.why else ""
+        return f"{self.what}: {value} {self.unit}" + (f" ({low} to {high}{why})" if np.isfinite(self.low) else "")
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ def verify(
     if as_json:
         print_json(asdict(found) | {"is_whole": found.is_whole})
     elif not quiet:
-        for what, names in (("damaged", found.damaged), ("missing", found.missing), ("not of the run", found.added)):
+        changed = {"damaged": found.damaged, "missing": found.missing, "not of the run": found.added}
+        for what, names in (changed | {"added by scopemap after the run": found.later}).items():
             for name in names[:_MOST_NAMED]:
                 typer.echo(f"{what}: {name}")
             if len(names) > _MOST_NAMED:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -11,6 +12,13 @@ from scopemap.engine.errors import InputError, reporting
 from scopemap.result.checksums import NEEDED, SUMS, digest_of, files_in, read_checksums
 from scopemap.result.result import Result
 
+_WRITTEN_LATER = {
+    *(f"coverage/{name}" for name in ("coverage.json", "map.csv", "map.png", "coverage.ply")),
+    *("against_video/frames.csv", "against_video/worst.png", "measurements.json"),
+}
+"""Files that `coverage`, `evaluate --against-video` and the report's measures add to a result or a submap."""
+_SUBMAP = re.compile(r"^maps/\d+/")
+
 
 @dataclass(frozen=True)
 class Verified:
@@ -18,7 +26,7 @@ class Verified:
 
     whole : number of files that are as they were. damaged, missing : names of those that are not. added : names of
     files that are not the result's. bytes : of all files that were read. notes : how it came about, and what is other
-    than on this machine.
+    than on this machine. later : names of files that commands of scopemap add to a result.
     """
 
     whole: int
@@ -27,6 +35,7 @@ class Verified:
     added: list[str]
     bytes: int
     notes: list[str] = field(default_factory=list)
+    later: list[str] = field(default_factory=list)
 
     @property
     def is_whole(self) -> bool:
@@ -49,9 +58,12 @@ def verify_result(folder: Path) -> Verified:
             size += (folder / name).stat().st_size
             if digest_of(folder / name) != digest:
                 damaged.append(name)
-    added = [name for name in files_in(folder) if name not in sums and name != SUMS]
+    others = [name for name in files_in(folder) if name not in sums and name != SUMS]
+    later = [name for name in others if _SUBMAP.sub("", name) in _WRITTEN_LATER]
+    added = [name for name in others if name not in later]
     whole = len(sums) - len(damaged) - len(missing)
-    return Verified(whole, damaged, missing, added, size, [] if "provenance.json" in damaged else _notes(folder))
+    notes = [] if "provenance.json" in damaged else _notes(folder)
+    return Verified(whole, damaged, missing, added, size, notes, later)
 
 
 def _notes(folder: Path) -> list[str]:

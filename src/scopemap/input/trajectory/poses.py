@@ -12,7 +12,6 @@ from scopemap.engine.geometry.se3 import orthonormalised
 from scopemap.input.trajectory.trajectory import ASSUMED_FRAMES_PER_S, Trajectory
 
 _RIGID_TOLERANCE = 1e-2
-_MOST_FRAMES = 1e9  # whole seconds since 1970 are more
 
 
 def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
@@ -44,11 +43,6 @@ def from_quaternions(xyzw: np.ndarray, positions: np.ndarray, where: list[str]) 
         T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()
         T[:, :3, 3] = positions
     return T
-
-
-def are_frame_numbers(stamps: np.ndarray) -> bool:
-    """Return whether stamps (N,) are all whole, and small enough to count frames."""
-    return bool(np.all((stamps == np.round(stamps)) & (np.abs(stamps) < _MOST_FRAMES)))
 
 
 def stamped(T: np.ndarray, indices: np.ndarray | None, times_s: np.ndarray | None, source: str) -> Trajectory:

@@ -1,4 +1,4 @@
-"""Text files of poses, one a line: TUM (8 numbers), KITTI (12), C3VD (16, or 17 with the time first)."""
+"""Text files of poses, one a line: TUM and EuRoC (8 numbers), KITTI (12), C3VD (16, or 17 with the time first)."""
 
 from __future__ import annotations
 
@@ -9,23 +9,28 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.engine.errors import InputError, reporting
-from scopemap.input.trajectory.poses import are_frame_numbers, file_of, from_quaternions, rigid, stamped
+from scopemap.input.trajectory.columns import TUM_ORDER, W_FIRST, Columns, are_frame_numbers, named_columns, stamps_s
+from scopemap.input.trajectory.poses import file_of, from_quaternions, rigid, stamped
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
 _TIMED_COLUMNS = 17
+EUROC_FILES = ("mav0/state_groundtruth_estimate0/data.csv", "state_groundtruth_estimate0/data.csv")
+_UNIT_LENGTH = 1e-2  # tolerance of a quaternion's length
 
 
 @dataclass(frozen=True)
 class NumberTable:
     """The numbers of a text file.
 
-    values : (N, C) float64. line_numbers : line of each row, from 1. comments : the comment lines.
+    values : (N, C) float64. line_numbers : line of each row, from 1. comments : the comment lines. columns : what a
+    header names them; None: there is none that names those of a pose.
     """
 
     path: Path
     values: np.ndarray
     line_numbers: np.ndarray
     comments: str
+    columns: Columns | None = None
 
     @property
     def where(self) -> list[str]:
@@ -35,9 +40,25 @@ class NumberTable:
     def unit(self, assumed: Unit) -> tuple[float, str]:
         """Return mm per unit, and the unit in words: what a comment states, else `assumed`."""
         stated = re.search(r"\bunit:\s*(mm|m)\b", self.comments)
-        if stated is None:
+        unit = stated[1] if stated is not None else "" if self.columns is None else self.columns.unit
+        if not unit:
             return MM_PER_UNIT[assumed], f"{assumed} (assumed)"
-        return MM_PER_UNIT["m" if stated[1] == "m" else "mm"], f"{stated[1]} (stated)"
+        return MM_PER_UNIT["m" if unit == "m" else "mm"], f"{unit} (stated)"
+
+    @property
+    def time_unit(self) -> str:
+        """The unit of time stamps that a comment or the header states; ""."""
+        stated = re.search(r"\btime:\s*(ns|us|ms|s)\b", self.comments)
+        return stated[1] if stated is not None else "" if self.columns is None else self.columns.time_unit
+
+    def as_tum(self, form: str, order: tuple[int, ...] = TUM_ORDER) -> NumberTable:
+        """Return the table of time, position and quaternion, scalar last: by its header, without one by `order`.
+
+        Raises `InputError` where there is no header, and not the 8 numbers that `form` has.
+        """
+        table = self if self.columns is not None else self.with_columns(8, form)
+        order = order if self.columns is None else self.columns.order
+        return replace(table, values=self.values[:, list(order)])
 
     def with_columns(self, count: int, form: str) -> NumberTable:
         """Return the table if its rows hold `count` numbers, as `form` does; raises `InputError`."""
@@ -78,9 +99,11 @@ def read_rows(path: Path, *, missing: bool = False) -> list[tuple[int, list[floa
 
     `missing` allows NaN and infinity. Raises `InputError`, with the line, for other text, and where there is no row.
     """
-    rows = []
+    rows: list[tuple[int, list[float]]] = []
     for number, line in enumerate(text_lines(path), start=1):
         fields = fields_of(line)
+        if not rows and named_columns(line) is not None:  # a header, marked as a comment or not
+            continue
         try:
             row = [float(field) for field in fields]
         except ValueError as error:
@@ -101,25 +124,63 @@ def read_numbers(path: Path, *, missing: bool = False) -> NumberTable:
     for number, row in rows:
         if len(row) != width:
             raise InputError(f"{path}, line {number}: found {len(row)} numbers where earlier lines have {width}")
-    comments = "\n".join(line for line in text_lines(path) if line.lstrip().startswith("#"))
-    return NumberTable(path, np.array([row for _, row in rows]), np.array([number for number, _ in rows]), comments)
+    lines = text_lines(path)[: rows[-1][0]]
+    comments = "\n".join(line for line in lines if line.lstrip().startswith("#"))
+    columns = next((found for line in lines[: rows[0][0] - 1] if (found := named_columns(line)) is not None), None)
+    if columns is not None and columns.count != width:
+        fault = f"found {width} numbers where the header names {columns.count} columns"
+        raise InputError(f"{path}, line {rows[0][0]}: {fault}; correct the header or remove it")
+    values, numbers = np.array([row for _, row in rows]), np.array([number for number, _ in rows])
+    return NumberTable(path, values, numbers, comments, columns)
 
 
 def tum_poses(table: NumberTable, unit: Unit) -> tuple[np.ndarray, str]:
-    """Return the poses (N, 4, 4), mm, of `stamp tx ty tz qx qy qz qw` rows, and their unit in words."""
+    """Return the poses (N, 4, 4), mm, of `stamp tx ty tz qx qy qz qw` rows, and unit and order of columns in words."""
     mm_per_unit, words = table.unit(unit)
-    return from_quaternions(table.values[:, 4:], table.values[:, 1:4] * mm_per_unit, table.where), words
+    order = "" if table.columns is None else table.columns.words
+    T = from_quaternions(table.values[:, 4:], table.values[:, 1:4] * mm_per_unit, table.where)
+    return T, ", ".join(filter(None, (words, order)))
 
 
 def read_tum(path: Path, unit: Unit) -> Trajectory:
-    """Read TUM rows; stamps that are all integers are frame numbers, unless a comment says `time: s`."""
-    table = read_numbers(file_of(path, ())).with_columns(8, "TUM").sorted_by_stamp()
-    T, words = tum_poses(table, unit)
-    stamps = table.values[:, 0]
-    source = f"TUM, camera-to-world, {words}"
-    if re.search(r"\btime:\s*s\b", table.comments) or not are_frame_numbers(stamps):
-        return stamped(T, None, stamps, f"{source}, stamps are seconds")
-    return stamped(T, stamps, None, f"{source}, whole stamps taken for frame numbers")
+    """Read TUM rows, or those of a file whose header names the columns of a pose.
+
+    Whole stamps that may count frames are their numbers, unless the file states a unit of time.
+    """
+    table = read_numbers(file_of(path, ()))
+    form = "TUM" if table.columns is None or table.columns.order == TUM_ORDER else "text with a header"
+    return _stamped_poses(table.as_tum("TUM"), unit, form)
+
+
+def read_euroc(path: Path, unit: Unit) -> Trajectory:
+    """Read EuRoC's data.csv: time in ns, position, quaternion with the scalar first, and more, which is not used."""
+    table = read_numbers(file_of(path, EUROC_FILES))
+    if table.columns is None and table.values.shape[1] == _TIMED_COLUMNS:
+        table = replace(table, values=table.values[:, :8])
+    table = table.as_tum("EuRoC", W_FIRST)
+    return _stamped_poses(table, unit, "EuRoC", table.time_unit or "ns")
+
+
+def _stamped_poses(table: NumberTable, unit: Unit, form: str, time_unit: str = "") -> Trajectory:
+    table, time_unit = table.sorted_by_stamp(), time_unit or table.time_unit
+    stamps, (T, words) = table.values[:, 0], tum_poses(table, unit)
+    source = f"{form}, camera-to-world, {words}"
+    if not time_unit and are_frame_numbers(stamps):
+        return stamped(T, stamps, None, f"{source}, whole stamps taken for frame numbers")
+    times_s, stated = stamps_s(stamps, time_unit)
+    return stamped(T, None, times_s, f"{source}, {stated}")
+
+
+def is_euroc(table: NumberTable) -> bool:
+    """Return whether rows without a header are EuRoC's 17 numbers: the fifth to eighth are a quaternion.
+
+    C3VD's pose with its time before it has as many, and a row or column of 0 0 0 1.
+    """
+    if table.values.shape[1] != _TIMED_COLUMNS:
+        return False
+    matrices = table.values[:, 1:].reshape(-1, 4, 4)
+    homogeneous = any(np.allclose(last, [0, 0, 0, 1]) for last in (matrices[:, 3], matrices[:, :, 3]))
+    return not homogeneous and bool(np.all(np.abs(np.linalg.norm(table.values[:, 4:8], axis=1) - 1) <= _UNIT_LENGTH))
 
 
 def read_kitti(path: Path, unit: Unit) -> Trajectory:
@@ -153,7 +214,8 @@ def read_c3vd(path: Path, unit: Unit) -> Trajectory:
         return stamped(T, np.arange(len(T)), None, f"{source}, row = frame")
     if are_frame_numbers(table.values[:, 0]):
         return stamped(T, table.values[:, 0], None, f"{source}, whole stamps taken for frame numbers")
-    return stamped(T, None, table.values[:, 0], f"{source}, stamps are seconds")
+    times_s, words = stamps_s(table.values[:, 0])
+    return stamped(T, None, times_s, f"{source}, {words}")
 
 
 def read_poses(path: Path) -> np.ndarray:

@@ -1,0 +1,128 @@
+"""Mistakes in reading poses that leave a method's figures are said by `evaluate`, and a method's own errors are not."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from front_door import call
+from sample_trajectories import as_trajectory, random_pair, vector_a, write_c3vd
+from scipy.spatial.transform import Rotation
+
+from scopemap.engine.errors import AlignmentError
+from scopemap.engine.geometry.se3 import inverse
+from scopemap.evaluation.doubts import doubts, evaluate_poses
+from scopemap.evaluation.poses import match
+from scopemap.input.trajectory.trajectory import Trajectory, write_tum
+
+ESTIMATED, TRUTH = (as_trajectory(poses) for poses in vector_a())
+"""A path and a noisy estimate of it in another world and scale."""
+
+
+def numbered_from_1(truth: Trajectory) -> Trajectory:
+    return replace(truth, indices=truth.indices + 1)
+
+
+def one_frame_late(truth: Trajectory) -> Trajectory:
+    return replace(truth, times_s=truth.times_s + 1 / 30, has_indices=False)
+
+
+def inverted(truth: Trajectory) -> Trajectory:
+    return replace(truth, T_world_camera=inverse(truth.T_world_camera))
+
+
+def scalar_first(truth: Trajectory) -> Trajectory:
+    xyzw = Rotation.from_matrix(truth.T_world_camera[:, :3, :3]).as_quat()
+    T = truth.T_world_camera.copy()
+    T[:, :3, :3] = Rotation.from_quat(np.roll(xyzw, 1, axis=1)).as_matrix()
+    return replace(truth, T_world_camera=T)
+
+
+def opengl(truth: Trajectory) -> Trajectory:
+    return replace(truth, T_world_camera=truth.T_world_camera @ np.diag([1.0, -1, -1, 1]))
+
+
+def in_metres(truth: Trajectory) -> Trajectory:
+    T = truth.T_world_camera.copy()
+    T[:, :3, 3] /= 1000
+    return replace(truth, T_world_camera=T)
+
+
+def said(estimate: Trajectory, truth: Trajectory, align: str = "sim3") -> str:
+    return "\n".join(doubts(estimate, truth, match(estimate, truth, align)))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "sentence"),
+    [
+        (numbered_from_1, "the truth may be numbered from 1, .*; if so, make its numbers one lower"),
+        (one_frame_late, "the truth may be one frame too late, .*; if so, give --time-offset 0.0333"),
+        (inverted, "the poses of the truth may be world-to-camera, .*; if so, invert them"),
+        (lambda truth: numbered_from_1(inverted(truth)), "world-to-camera and the truth may be numbered from 1"),
+        (scalar_first, "positions agree .*, but rotations are 153 deg off, 0.00 deg with the scalar of the truth's"),
+        (opengl, "positions agree .*all by one turn of 180 deg: one side may have OpenGL's axes"),
+        (in_metres, "the fitted scale is 0.001: the trajectory may be in mm and read as m"),
+    ],
+)
+def test_another_reading_that_agrees_far_better_is_said(
+    mistake: Callable[[Trajectory], Trajectory], sentence: str
+) -> None:
+    assert re.search(sentence, said(TRUTH, mistake(TRUTH)))
+    assert said(TRUTH, TRUTH) == ""
+
+
+@pytest.mark.parametrize(
+    ("mistake", "sentence"),
+    [(inverted, "may be world-to-camera"), (scalar_first, "scalar of the truth's quaternions first")],
+)
+def test_it_is_said_of_a_methods_noisy_path_too(mistake: Callable[[Trajectory], Trajectory], sentence: str) -> None:
+    assert sentence in said(ESTIMATED, mistake(TRUTH))
+    assert "of the trajectory" in said(inverted(ESTIMATED), TRUTH)
+
+
+@pytest.mark.parametrize("align", ["none", "origin", "se3"])
+def test_units_are_questioned_without_a_fitted_scale(align: str) -> None:
+    assert "the ratio of the true to the estimated path is 0.001" in said(TRUTH, in_metres(TRUTH), align)
+    assert "the ratio of the true to the estimated path is 1000" in said(in_metres(TRUTH), TRUTH, align)
+
+
+def test_a_methods_own_errors_are_not_doubted() -> None:
+    assert said(ESTIMATED, TRUTH) == ""
+    for seed in range(5):
+        wandering, truth = (as_trajectory(poses) for poses in random_pair(seed))
+        assert said(wandering, truth) == ""
+    still = replace(TRUTH, T_world_camera=np.tile(np.eye(4), (60, 1, 1)))
+    assert said(still, TRUTH, "origin") == ""
+    for factor in (0.01, 0.1, 100):  # the scale of one camera is any
+        T = TRUTH.T_world_camera.copy()
+        T[:, :3, 3] *= factor
+        assert said(replace(TRUTH, T_world_camera=T), TRUTH) == ""
+
+
+def test_evaluate_says_it_and_applies_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    write_tum(tmp_path / "estimate.txt", TRUTH)
+    numbers = replace(TRUTH, times_s=TRUTH.indices + 1.0)
+    write_tum(tmp_path / "truth.txt", numbers)
+    (tmp_path / "truth.txt").write_text((tmp_path / "truth.txt").read_text().replace("; time: s", ""))
+    given = ("evaluate", write_c3vd(tmp_path / "estimate", TRUTH.T_world_camera), "--truth", tmp_path / "truth.txt")
+    capfd.readouterr()
+    assert call(*given, "--json") == 0
+    printed = capfd.readouterr()
+    figures = json.loads(printed.out)
+    assert "numbered from 1" in figures["doubts"][0]
+    assert f"warning: {figures['doubts'][0]}" in printed.err
+    assert figures["ate_rmse_mm"] > 0.5
+    assert call(*given, "--quiet") == 0
+    assert capfd.readouterr().err == ""
+    assert "numbered from 1" in evaluate_poses(given[1], given[3], "sim3")["doubts"][0]
+
+
+def test_numbers_that_miss_each_other_by_one_are_named() -> None:
+    every_tenth = TRUTH.rows(np.arange(0, 60, 10))
+    with pytest.raises(AlignmentError, match="6 would match with the truth's numbers one lower"):
+        match(every_tenth, numbered_from_1(every_tenth), "sim3")
