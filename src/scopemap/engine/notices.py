@@ -110,6 +110,25 @@ KINDS: dict[str, _Kind] = {
         "{missing} of {frames} frames have no mask in {folder}: instruments may be part of the surface.",
         "Name each mask so that its last number is the frame's number.",
     ),
+    "masks-shifted": _Kind(
+        "info", "The masks in {folder} begin and end one number from the frames: each is used {shift:+d} frame from it."
+    ),
+    "masks-late": _Kind(
+        "note",
+        "The frames begin at {frame} and the masks in {folder} at {mask}: each mask may be one frame late.",
+        "Name each mask so that its last number is the frame's number.",
+    ),
+    "masks-unused": _Kind(
+        "note",
+        "{masks} masks in {folder} have no frame of their number (first: {first}).",
+        "Name each mask so that its last number is the frame's number.",
+    ),
+    "masks-empty": _Kind("note", "No mask in {folder} hides a pixel: all are black.", unsaid=("level",)),
+    "masks-faint": _Kind(
+        "doubtful",
+        "No mask in {folder} hides a pixel: of a JPEG levels above 127 count, and the largest is {level}.",
+        "Write the masks as PNG, or with levels of 0 and 255.",
+    ),
     "frames-failed": _Kind("note", "Processing failed in {frames:frame}, first in frame {first}: {reason}."),
     "frames-without-depth": _Kind("note", "The network returned no depth for {frames:frame}, first for frame {first}."),
     "depth-propagated": _Kind(
