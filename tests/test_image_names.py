@@ -81,17 +81,17 @@ N = range(6)
 @pytest.mark.parametrize(
     ("used", "others", "said"),
     [
-        ("left_{:04d}", ["right_{:04d}"], "of two eyes: the left one is used, 6 pictures of the right"),
-        ("{:04d}_L", ["{:04d}_R"], "of two eyes"),
-        ("img{:04d}L", ["img{:04d}R"], "of two eyes"),
-        ("colonL_{:03d}", ["colonR_{:03d}"], "of two eyes"),
+        ("left_{:04d}", ["right_{:04d}"], "show two eyes: the left one is used, 6 pictures of the right"),
+        ("{:04d}_L", ["{:04d}_R"], "show two eyes"),
+        ("img{:04d}L", ["img{:04d}R"], "show two eyes"),
+        ("colonL_{:03d}", ["colonR_{:03d}"], "show two eyes"),
         ("frame_{:04d}", ["depth_{:04d}"], "left out: 6 depth picture"),
         ("{:04d}", ["{:04d}_disp", "{:04d}-label"], "left out: 6 label picture"),
         ("image_{:02d}", ["label_{:02d}", "depth_{:02d}"], "left out: 6 depth picture"),
         ("frame{:02d}", ["frame{:02d}_segmentation"], "left out: 6 label picture"),
         ("{:04d}_color", ["{:04d}_ir"], "left out: 6 pictures of another series"),
         ("rgb_{:04d}", ["nbi_{:04d}"], "left out: 6 pictures of another series"),
-        ("left_{:02d}", ["right_{:02d}", "depth_{:02d}", "mask_{:02d}"], "of two eyes"),
+        ("left_{:02d}", ["right_{:02d}", "depth_{:02d}", "mask_{:02d}"], "show two eyes"),
     ],
 )
 def test_only_frames_of_one_camera_are_used_and_the_others_named(

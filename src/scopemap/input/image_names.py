@@ -99,7 +99,7 @@ def _one_eye(files: list[Path], notes: list[str]) -> list[Path]:
     if 4 * len(pairs) < len(files) or not pairs:
         return files
     right = {pair["r"] for pair in eyes.values() if "r" in pair}
-    both = f"the names are of two eyes: the left one is used, {len(right)} pictures of the right one are left out"
+    both = f"the names show two eyes: the left one is used, {len(right)} pictures of the right one are left out"
     notes.append(f"stereo: {both}, such as {min(right).name}; for both, move these and give --stereo use:FOLDER")
     return [file for file in files if file not in right]
 
@@ -119,7 +119,7 @@ def _one_series(folder: Path, files: list[Path], notes: list[str]) -> list[Path]
     colour = [one for one in mixed if set(_COLOUR) & {word.lower() for word in _WORD.findall(_any(one).stem)}]
     named = ", ".join(f"{len(one)} like {_any(one).name}" for one in mixed)
     if len(colour) != 1:
-        found = f"its names are of {len(mixed)} series with the same numbers ({named})"
+        found = f"its names show {len(mixed)} series with the same numbers ({named})"
         raise InputError(f"reading {folder}: {found}; move those to be used into a folder of their own")
     left = {file for one in mixed if one is not colour[0] for file in one.values()}
     notes.append(f"left out: {len(left)} pictures of another series than {_any(colour[0]).name} ({named})")
