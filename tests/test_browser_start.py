@@ -55,7 +55,7 @@ def test_a_video_that_cannot_be_read_is_a_sentence(opened: tuple[BrowserWindow, 
     settle(window)
     press(window, "Video", "broken.mp4")
     until(window, lambda: "reading the video" in words(window))
-    assert "Invalid data found" in words(window)
+    assert "it is a text file, not a video" in words(window)
     assert "Traceback" not in words(window)
     assert "Reconstruct" not in words(window)
     press(window, "Back to the start")

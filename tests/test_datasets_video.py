@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 
 from scopemap.engine.errors import InputError
 from scopemap.input.opening import open_sequence
-from scopemap.input.video import TimeStamps, VideoFile
+from scopemap.input.video import VideoFile
+from scopemap.input.video_format.time_stamps import TimeStamps
 
 
 def test_a_video_whose_title_is_no_utf8_is_read(tmp_path: Path) -> None:

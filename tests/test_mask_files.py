@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from drawn_inputs import frames_of, picture, save
+from drawn_inputs import frames_of, picture, save, write_video
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.cameras.rectification import Rectifier, working_camera
@@ -16,6 +16,7 @@ from scopemap.engine.config import Config, MaskSettings
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.engine.frame import Frame
 from scopemap.engine.masking.masker import Masker
+from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
 from scopemap.input.mask_files import MaskFiles, create_masks
 from scopemap.input.opening import open_sequence
@@ -138,3 +139,56 @@ def test_the_data_sets_own_masks_are_used_unless_others_or_none_are_asked_for(tm
     assert used("").endswith("own")
     assert used(str(others)).endswith("others")
     assert used("none") == ""
+
+
+def _codes(masks: MaskFiles, frames: range) -> dict[str, Notice]:
+    for index in frames:
+        masks.covered(index)
+    return {notice.code: notice for notice in masks.notices}
+
+
+@pytest.mark.parametrize(
+    ("first_mask", "first_frame", "shift"), [(1, 0, -1), (0, 1, 1), (0, 0, 0), (1, 1, 0), (1001, 1000, -1)]
+)
+def test_masks_numbered_from_another_number_belong_to_the_frames_in_order(
+    first_mask: int, first_frame: int, shift: int, tmp_path: Path
+) -> None:
+    levels = {f"{first_mask + k:05d}.png": left_half() if k == 2 else 0 * left_half() for k in range(5)}
+    frames = range(first_frame, first_frame + 5)
+    masks = MaskFiles(write_masks(tmp_path / "masks", levels), RECTIFIER, numbers=frames)
+    assert [masks.covered(index).any() for index in frames] == [False, False, True, False, False]
+    assert set(_codes(masks, frames)) == ({"masks-shifted"} if shift else set())
+    if shift:
+        assert _codes(masks, frames)["masks-shifted"].values["shift"] == shift
+
+
+def test_masks_without_a_frame_and_masks_that_may_be_late_are_told(tmp_path: Path) -> None:
+    folder = write_masks(tmp_path / "masks", {f"{k}.png": left_half() for k in (0, 1, 2, 3, 70, 71)})
+    unused = _codes(MaskFiles(folder, RECTIFIER, numbers=range(6)), range(6))
+    assert set(unused) == {"masks-unused"}
+    assert (unused["masks-unused"].values["masks"], unused["masks-unused"].values["first"]) == (2, "70.png")
+    late = write_masks(tmp_path / "late", {f"{k}.png": left_half() for k in range(1, 5)})
+    assert set(_codes(MaskFiles(late, RECTIFIER, numbers=range(7)), range(7))) == {"masks-late"}
+    assert _codes(MaskFiles(late, RECTIFIER, numbers=range(7)), range(1, 7)) == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "level", "code"),
+    [("{}.png", 0, "masks-empty"), ("{}.jpg", 1, "masks-faint"), ("{}.jpg", 90, "masks-faint"),
+     ("mask.png", 0, "masks-empty"), ("{}.png", 1, ""), ("{}.jpg", 255, ""), ("mask.png", 1, "")],
+)  # fmt: skip
+def test_masks_that_never_hide_a_pixel_are_told(name: str, level: int, code: str, tmp_path: Path) -> None:
+    values = {name.format(k): np.full((480, 640), level, np.uint8) for k in range(3)}
+    masks = MaskFiles(write_masks(tmp_path / "masks", values), RECTIFIER, numbers=range(3))
+    assert set(_codes(masks, range(3))) == ({code} if code else set())
+
+
+def test_masks_numbered_from_one_beside_a_video_numbered_from_zero(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "v.mp4", 6)
+    masks = write_masks(tmp_path / "masks", {f"{k + 1}.png": left_half() for k in range(6)})
+    config = Config.load(settings={"mask.files": str(masks), "depth.backend": "shading"})
+    sequence = open_sequence(video)
+    estimators = create_estimators(config, sequence)
+    assert estimators.masks is not None
+    assert all(estimators.masks.covered(index) is not None for index in range(6))
+    assert {notice.code for notice in estimators.masks.notices} == {"masks-shifted"}

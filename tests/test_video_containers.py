@@ -15,7 +15,8 @@ from drawn_inputs import number_in, picture
 from drawn_videos import encode
 
 from scopemap.input.opening import open_sequence
-from scopemap.input.video import TimeStamps, VideoFile
+from scopemap.input.video import VideoFile
+from scopemap.input.video_format.time_stamps import TimeStamps
 
 SIZE = (160, 120)
 COUNT = 42  # as many as a picture can carry in its level of red

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
 import cv2
 import numpy as np
@@ -16,29 +17,37 @@ import numpy as np
 from scopemap.engine.errors import CalibrationError, InputError
 from scopemap.input.camera_files.reading import stated_calibration
 from scopemap.input.decoding import frame_number, read_decoded, stated_size
+from scopemap.input.image_names import Chosen, chosen_frames, in_order, times_in_names
 from scopemap.input.sampling import MOST_REPEATS, SampledPair, pair_of
 from scopemap.input.source import OWN_CALIBRATION, Source, SourceFrame
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _MOST_HEADERS = 500  # are looked at
+_LATEST_START_S = 1e6  # of a video whose frames are numbered: 11 days
+_BITS = 16
+_CAMERA_BITS = (8, 10, 12, 14)  # of sensors, as they are left in 16 bits
+_OF_16_BITS = (".png", ".tif", ".tiff")
+_LOOKED_AT = 16  # pictures, for their largest level
 _COMPANION = re.compile(r"[_.](depth|normals?|flow|occlusions?|masks?)$", re.IGNORECASE)
 
 DepthCode = tuple[tuple[int, float, int], ...]
 """How integer images store depth, by bits: (bits, mm per level, largest level that is a depth). Level 0 is unknown."""
 
 
-def numeric_order(path: Path) -> list[tuple[int, int, str]]:
-    """Sorting key: digits in the name count as numbers, so that 10 comes after 9."""
-    parts = re.split(r"(\d+)", path.stem)
-    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
-
-
 def image_files(folder: Path) -> list[Path]:
     """Return the colour images in `folder` in numeric order; not depth, not masks, none of a run's folder."""
-    if all((folder / name).is_file() for name in ("trajectory.tum", "provenance.json")):
+    if _is_result(folder):
         return []
-    files = sorted(images_in(folder), key=numeric_order)
+    files = in_order(images_in(folder))
     return [file for file in files if not _COMPANION.search(file.stem)]
+
+
+def _pictures_in(folder: Path) -> list[Path]:
+    return [] if _is_result(folder) else images_in(folder)
+
+
+def _is_result(folder: Path) -> bool:
+    return all((folder / name).is_file() for name in ("trajectory.tum", "provenance.json"))
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -47,10 +56,33 @@ def images_in(folder: Path) -> list[Path]:
     return [file for file in files if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
 
 
-def read_image(file: Path) -> np.ndarray | None:
-    """Return the image as (h, w, 3) uint8 RGB, whatever its depth and channels; None where it cannot be read."""
-    image = read_decoded(file, cv2.IMREAD_COLOR)
+def read_image(file: Path, bits: int = 16) -> np.ndarray | None:
+    """Return the image as (h, w, 3) uint8 RGB, whatever its depth and channels; None where it cannot be read.
+
+    bits : how many of 16 are used, where they are fewer.
+    """
+    if bits == _BITS:
+        image = read_decoded(file, cv2.IMREAD_COLOR)
+        return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    image = read_decoded(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if image is not None and image.dtype == np.uint16:
+        image = np.minimum(image >> (bits - 8), 255).astype(np.uint8)
+    elif image is not None:
+        image = read_decoded(file, cv2.IMREAD_COLOR)
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _used_bits(files: list[Path]) -> int:
+    """Return how many bits pictures of 16 bits use, by the largest level of some of them: cameras have 10, 12 or 14."""
+    largest = 0
+    for file in files[:: max(1, len(files) // _LOOKED_AT)]:
+        image = read_decoded(file, cv2.IMREAD_UNCHANGED) if file.suffix.lower() in _OF_16_BITS else None
+        if image is None or image.dtype != np.uint16:
+            return _BITS
+        largest = max(largest, int(image[..., :3].max() if image.ndim == 3 else image.max()))
+        if largest >= 1 << _CAMERA_BITS[-1]:
+            return _BITS
+    return next((bits for bits in _CAMERA_BITS if largest < 1 << bits), _BITS) if largest else _BITS
 
 
 class ImageFolder(Source):
@@ -66,11 +98,15 @@ class ImageFolder(Source):
 
     def __init__(self, path: Path, files: list[Path] | None = None) -> None:
         super().__init__(path)
-        self.files = image_files(path) if files is None else files
+        chosen = chosen_frames(path, _pictures_in(path)) if files is None else Chosen(files, [], [])
+        self.files, self.notes, self.warnings = chosen.files, [*chosen.notes], [*chosen.warnings]
         self.numbers: list[int] = _numbers(self.files)
         self.count = len(self.files)
         self.depth_files: dict[int, Path] = {}
-        self.notes = [f"time stamps: frame number / {self.rate_hz:g} s (the folder holds none)"]
+        self._take_times()
+        self._bits = _used_bits(self.files)
+        if self._bits != _BITS:
+            self.notes.append(f"levels: 16-bit pictures hold {self._bits} bits, which are scaled to the whole range")
         self.height, self.width = self._size()
         with self._making_camera():
             use_first_calibration(self, path / OWN_CALIBRATION, self.files[0].with_name(OWN_CALIBRATION))
@@ -106,8 +142,22 @@ class ImageFolder(Source):
         runs = (self.frames(slice(start, start + 1 + MOST_REPEATS)) for start in starts)
         return [pair for run in runs if (pair := pair_of(frame.rgb for frame in run)) is not None]
 
+    def _take_times(self) -> None:
+        """Take the times that the names give, else the numbers over the assumed rate."""
+        times_s, source = times_in_names(self.files, self.numbers) if self.name == ImageFolder.name else ([], "")
+        if times_s:
+            self.times_s, self.stamped = dict(zip(self.numbers, times_s, strict=True)), True
+            self.rate_hz = 1 / median(b - a for a, b in pairwise(times_s))
+        else:
+            first = self.numbers[0] if self.numbers else 0
+            source = f"frame number / {self.rate_hz:g} s (the folder holds none)"
+            if first / self.rate_hz > _LATEST_START_S:  # a date or the number of a patient
+                self.times_s = {number: (number - first) / self.rate_hz for number in self.numbers}
+                source = f"frame number, from {first} on, / {self.rate_hz:g} s (the folder holds none)"
+        self.notes.insert(0, f"time stamps: {source}")
+
     def _image(self, file: Path) -> np.ndarray | None:
-        return read_image(file)
+        return read_image(file, self._bits)
 
     def _depth_mm(self, index: int) -> np.ndarray | None:
         """Return the depth (h, w) float32, mm, NaN = unknown; `InputError` unless stored as `depth_code` has it."""

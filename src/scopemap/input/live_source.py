@@ -16,6 +16,7 @@ from av.video.reformatter import VideoReformatter
 from scopemap.engine.errors import InputError
 from scopemap.input.opening import open_source
 from scopemap.input.source import Source, SourceFrame
+from scopemap.input.video_format.streams import video_stream
 
 _Pictures = Generator[tuple[float | None, np.ndarray], None, None]
 _TIMEOUT_S = 10.0
@@ -140,7 +141,9 @@ def _stream(address: str) -> _Pictures:
     try:
         with av.open(address, options=_STREAM_OPTIONS, timeout=_TIMEOUT_S) as container:
             reformatter = VideoReformatter()
-            for frame in container.decode(video=0):
+            if (stream := video_stream(container)) is None:
+                raise InputError(f"reading {address}: it has no picture that FFmpeg can decode")
+            for frame in container.decode(stream):
                 yield None, reformatter.reformat(frame, format="rgb24").to_ndarray()
-    except (av.FFmpegError, IndexError) as error:
+    except av.FFmpegError as error:
         raise InputError(f"reading {address}: {error}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -23,18 +24,20 @@ _GROW_PX = 3  # by hand: by which masks are widened
 _NO_MASKS = "none"
 
 
-def create_masks(settings: MaskSettings, rectifier: Rectifier, own: Path | None = None) -> MaskFiles | None:
+def create_masks(
+    settings: MaskSettings, rectifier: Rectifier, own: Path | None = None, numbers: Sequence[int] | None = None
+) -> MaskFiles | None:
     """Return the masks that the settings name, where they name none the data set's own, None where there are none.
 
-    own : folder of the data set's masks, or None. Raises as `MaskFiles` does, and `SettingsError` where the settings
-    contradict each other or the input.
+    own : folder of the data set's masks, or None. numbers : as `MaskFiles` has them. Raises as `MaskFiles` does, and
+    `SettingsError` where the settings contradict each other or the input.
     """
     folder = None if settings.files == _NO_MASKS else Path(settings.files) if settings.files else own
     if settings.instruments == "off" and folder is not None and settings.files:
         raise SettingsError(f"mask.instruments=off contradicts mask.files={settings.files}: leave one of them out")
     if folder is None or settings.instruments == "off":
         return None
-    return MaskFiles(folder, rectifier, _GROW_PX)
+    return MaskFiles(folder, rectifier, _GROW_PX, numbers)
 
 
 class MaskFiles:
@@ -44,16 +47,25 @@ class MaskFiles:
 
     folder : holds the images. rectifier : from the camera of the images to the working camera.
     grow_px : by which masks are widened, at the working size: outlines are drawn a little inside more often than not.
+    numbers : of all frames of the input, ascending, or None. Masks that are numbered from 1 where the frames are from
+    0, or the other way round, belong to the frame one before or after their number.
 
     Raises `InputError` where the folder does not exist, holds no such image, or two for one frame.
     """
 
     _asked: Kept[set[int]]
+    _hides: Kept[bool]
+    _level: Kept[int]
 
-    def __init__(self, folder: Path, rectifier: Rectifier, grow_px: int = 0) -> None:
+    def __init__(
+        self, folder: Path, rectifier: Rectifier, grow_px: int = 0, numbers: Sequence[int] | None = None
+    ) -> None:
         self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
         self._files, self._single = _numbered(self._folder)
-        self._asked = set()
+        self._numbers = range(0) if numbers is None else numbers
+        self._later = _frames_later(list(self._files), self._numbers)
+        self._files = {number + self._later: file for number, file in self._files.items()}
+        self._asked, self._hides, self._level = set(), False, 0
 
     def covered(self, index: int) -> np.ndarray | None:
         """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.
@@ -77,7 +89,9 @@ class MaskFiles:
             raise InputError(f"cannot read the mask {file}: it is no image, or damaged")
         # The alpha channel is ignored.
         level = image if image.ndim == 2 else image[..., :3].max(-1)
-        masked = self._rectifier.nearest((level > (_HALF if file.suffix.lower() in _LOSSY else 0)).astype(np.uint8))
+        hidden = level > (_HALF if file.suffix.lower() in _LOSSY else 0)
+        self._hides, self._level = self._hides or bool(hidden.any()), max(self._level, int(level.max()))
+        masked = self._rectifier.nearest(hidden.astype(np.uint8))
         return cv2.dilate(masked, disc(self._grow_px)) > 0
 
     def provenance(self) -> dict[str, str]:
@@ -91,12 +105,37 @@ class MaskFiles:
 
     @property
     def notices(self) -> list[Notice]:
-        """A notice where most frames have no mask, since wrong numbers in the names look the same."""
+        """What looks wrong: most frames have no mask, masks have no frame or another number, no mask hides a pixel."""
+        found, folder = list[Notice](), {"folder": str(self._folder)}
         missing = len(self._asked - set(self._files))
-        if 2 * missing <= len(self._asked):
-            return []
-        values = {"missing": missing, "frames": len(self._asked), "folder": str(self._folder)}
-        return [Notice("masks-missing", values)]
+        if self._single is None and 2 * missing > len(self._asked):
+            found.append(Notice("masks-missing", {"missing": missing, "frames": len(self._asked)} | folder))
+        if self._later:
+            found.append(Notice("masks-shifted", {"shift": self._later} | folder))
+        if self._may_be_late:
+            found.append(Notice("masks-late", {"frame": self._numbers[0], "mask": min(self._files)} | folder))
+        if self._numbers and (left := sorted(set(self._files) - set(self._numbers) - self._asked)):
+            found.append(Notice("masks-unused", {"masks": len(left), "first": self._files[left[0]].name} | folder))
+        used = 1 if self._single is not None else len(self._asked & set(self._files))
+        if used and not self._hides:
+            found.append(Notice("masks-faint" if self._level else "masks-empty", {"level": self._level} | folder))
+        return found
+
+    @property
+    def _may_be_late(self) -> bool:
+        """Whether masks begin at the second frame and lack none: they may be counted from another number."""
+        own = sorted(self._files)
+        gapless = len(own) > 1 and own[-1] - own[0] == len(own) - 1
+        begins = bool(self._numbers) and self._numbers[0] in self._asked and own[:1] == [self._numbers[0] + 1]
+        return not self._later and gapless and begins
+
+
+def _frames_later(masks: list[int], frames: Sequence[int]) -> int:
+    """Return by how much the numbers of masks must change so that both begin and end alike: 0, 1 or -1."""
+    if not masks or not frames:
+        return 0
+    ends = frames[0] - min(masks), frames[-1] - max(masks)
+    return ends[0] if ends[0] == ends[1] and abs(ends[0]) == 1 else 0
 
 
 def _numbered(folder: Path) -> tuple[dict[int, Path], Path | None]:

@@ -110,6 +110,7 @@ def sequence_of(
     """Return the frames of a reader as `open_sequence` returns those of a path."""
     settings = settings or InputSettings()
     with _errors_of_the_system(reader.path):
+        reader.begin_at(frames or slice(None))
         source = _prepared(reader, settings, size)
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings)
     pair = _pair_of(source, camera, settings.camera_fit, frames or slice(None)) if settings.uses_both_views else None

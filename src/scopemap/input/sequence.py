@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Sequence as Numbers
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -87,6 +88,12 @@ class Sequence:
     def count(self) -> int | None:
         """Number of selected frames, skipped ones too, by a video's header; None where only reading on would tell."""
         return None if self.source.count is None else len(range(*self.selection.indices(self.source.count)))
+
+    @property
+    def numbers(self) -> Numbers[int] | None:
+        """Numbers of all frames of the input, selected or not, by a video's header; None where they are unknown."""
+        count = self.source.count
+        return self.source.numbers if self.source.numbers is not None else None if count is None else range(count)
 
     @property
     def used_count(self) -> int | None:

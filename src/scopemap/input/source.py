@@ -131,6 +131,9 @@ class Source:
         """Yield the selected frames, decoded one at a time; `selection` counts positions, its step is positive."""
         return iter(())
 
+    def begin_at(self, selection: slice) -> None:
+        """Take what may change within the input, such as the pictures' size, as it is at the first selected frame."""
+
     def stamps(self, selection: slice) -> list[tuple[int, float]] | None:
         """Return (index, time_s) of each selected frame, no image decoded; None where only reading on would tell."""
         return None if self.numbers is None else [(number, self._time_s(number)) for number in self.numbers[selection]]
@@ -187,7 +190,22 @@ class Source:
             first = self.left_out[min(self.left_out)]
             differ = f"{len(self.left_out)} of {len(self.left_out) + used} pictures have another size"
             such = f"such as {first.name or f'frame {first.index}'}, {first.reason}"
-            raise InputError(f"reading {self.path}: {differ}, {such}; choose those of one size by --frames")
+            choose = f"choose those of one size, such as --frames {self._longest_left_out()}"
+            raise InputError(f"reading {self.path}: {differ}, {such}; {choose}")
+
+    def _longest_left_out(self) -> str:
+        """Return the longest part of the input, A:B, in which all pictures that were left out have one size."""
+        places = {number: place for place, number in enumerate(self.numbers or ())}
+        parts, last = list[list[int]](), ("", -1)
+        for index, frame in sorted(self.left_out.items()):
+            place = places.get(index, index)
+            if last == (frame.reason, place - 1) and parts:
+                parts[-1].append(place)
+            else:
+                parts.append([place])
+            last = (frame.reason, place)
+        longest = max(parts, key=len)
+        return f"{longest[0]}:{longest[-1] + 1}"
 
     @property
     def size_notices(self) -> list[Notice]:

@@ -88,6 +88,22 @@ WORDINGS: dict[str, Wording] = {
         "{missing} of {frames} frames have no mask in {folder}: instruments may be part of the surface.",
         "Name each mask so that its last number is the frame's number.",
     ),
+    "masks-shifted": Wording(
+        "The masks in {folder} begin and end one number from the frames: each is used {shift:+d} frame from it."
+    ),
+    "masks-late": Wording(
+        "The frames begin at {frame} and the masks in {folder} at {mask}: each mask may be one frame late.",
+        "Name each mask so that its last number is the frame's number.",
+    ),
+    "masks-unused": Wording(
+        "{masks} masks in {folder} have no frame of their number (first: {first}).",
+        "Name each mask so that its last number is the frame's number.",
+    ),
+    "masks-empty": Wording("No mask in {folder} hides a pixel: all are black."),
+    "masks-faint": Wording(
+        "No mask in {folder} hides a pixel: of a JPEG levels above 127 count, and the largest is {level}.",
+        "Write the masks as PNG, or with levels of 0 and 255.",
+    ),
     "frames-failed": Wording("Processing failed in {frames:frame}, first in frame {first}: {reason}."),
     "frames-without-depth": Wording("The network returned no depth for {frames:frame}, first for frame {first}."),
     "depth-propagated": Wording(

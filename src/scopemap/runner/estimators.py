@@ -74,7 +74,7 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         corner_flow,
         own.flow or create_flow(networks.keyframe_flow, networks.device),
         create_perceptual(networks.perceptual, networks.device),
-        create_masks(config.mask, sequence.rectifier, sequence.source.masks),
+        create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers),
         AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
         tracker,
     )

@@ -28,14 +28,14 @@ _MOST_ENLARGED = 1.25
 """Size of the frames over that of the pictures which a run kept, 320 px wide at most."""
 
 
-def open_truth(run: Path, truth: Path) -> Sequence:
+def open_truth(run: Path, truth: Path, frames: str = "") -> Sequence:
     """Return the data set in `truth`, rectified as the run in folder `run` rectified its input.
 
     The camera is the data set's own. Where that is unknown, does not fit or is not the run's, it is the camera that the
     run kept, so that depth is compared pixel by pixel. `run` may be any folder or file: what it does not state is taken
-    from the data set. Raises as `open_sequence`.
+    from the data set. frames : which ones, as `--frames` has them, by default all. Raises as `open_sequence`.
     """
-    camera, settings = _camera_of(run), _input_settings(run)
+    camera, settings = _camera_of(run), _input_settings(run).model_copy(update={"frames": frames})
     size = None if camera is None else (camera.width, camera.height)
     if settings.stereo != "auto" and open_source(truth).name not in OF_UNKNOWN_VIEWS:
         settings = settings.model_copy(update={"stereo": "auto"})  # a data set's reader chooses the view
@@ -70,10 +70,13 @@ def open_input(run: Path, given: Path | None = None) -> tuple[Sequence, Masker]:
     camera.
     """
     source, config = find_input(run, given), Result(run).config
-    sequence = open_truth(run, source)
+    # The run's part alone: the rest of a long video need not be decoded, and may be of another size.
+    sequence = open_truth(run, source, config.input.frames)
     if not is_camera_of(run, sequence):
         raise InputError(f"the input {source} of the run {run} gives another camera now")
-    return sequence, Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
+    return sequence, Masker(
+        config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers)
+    )
 
 
 def reread_frames(run: Path, indices: set[int], given: Path | None = None) -> Iterator[Frame]:
@@ -88,9 +91,13 @@ def reread_frames(run: Path, indices: set[int], given: Path | None = None) -> It
             raise
         yield from _kept_frames(run, indices, fault)
         return
+    left = indices.copy()
     for frame in sequence.frames():
-        if frame.index in indices:
+        if frame.index in left:
+            left.discard(frame.index)
             yield mask(frame)
+        if not left:
+            return
 
 
 def tracked_frames(run: Result) -> Iterator[Frame]:

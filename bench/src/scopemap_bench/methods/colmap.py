@@ -76,7 +76,7 @@ class Colmap:
 
 def _write_frames(sequence: Sequence, config: Config, folder: Path) -> int:
     """Write frames as NUMBER.png to images/ and their usable pixels to masks/ as COLMAP reads them; return how many."""
-    masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
+    masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers))
     for name in ("images", "masks"):
         (folder / name).mkdir()
     count = 0

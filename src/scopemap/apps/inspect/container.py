@@ -8,6 +8,7 @@ from typing import Any
 import av
 
 from scopemap.apps.inspect.clip import VideoFinding
+from scopemap.input.video_format.streams import stated_length_s, video_stream
 
 _FULL_RANGE = 2
 # FFmpeg's numbers for the order of fields: 0 unknown, 1 progressive, then the four kinds of interlaced.
@@ -22,13 +23,11 @@ def read_container(media: str) -> dict[str, Any] | None:
     """
     try:
         with av.open(media, "r", metadata_errors="replace") as container:
-            stream = next(iter(container.streams.video), None)
-            first = None if stream is None or stream.codec_context is None else next(container.decode(stream), None)
+            stream = video_stream(container)
+            first = None if stream is None else next(container.decode(stream), None)
             if stream is None or first is None:
                 return None
-            length_s = container.duration / av.time_base if container.duration else None
-            if stream.duration and stream.time_base:
-                length_s = float(stream.duration * stream.time_base)
+            length_s, is_own = stated_length_s(container, stream)
             return {
                 "container": container.format.name,
                 "codec": stream.codec_context.name,
@@ -42,7 +41,7 @@ def read_container(media: str) -> dict[str, Any] | None:
                 "rotation_deg": int(first.rotation),
                 "interlaced": bool(first.interlaced_frame or stream.codec_context.field_order > _PROGRESSIVE),
                 "frames": stream.frames or None,
-                "length_s": length_s,
+                "length_s": length_s if is_own else None,
             }
     except (av.FFmpegError, OSError, ValueError):
         return None

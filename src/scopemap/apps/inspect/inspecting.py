@@ -158,16 +158,18 @@ def inspect(
 def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:
     """Yield the frames, measured, with their positions in the input.
 
-    Unreadable images have a position, too; damaged frames of a video are not counted by `--frames`.
+    Unreadable images and damaged frames of a video have a position, too.
     """
     known = sequence.source.stamps(slice(None)) or []
     start, _, step = sequence.selection.indices(sequence.source.count or sys.maxsize)
     positions = {index: position for position, (index, _) in enumerate(known)}
     inspector = FrameInspector()
+    is_video = sequence.source.media() is not None
     for number, item in enumerate(sequence.source.frames(sequence.selection)):
         rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
         frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
-        yield inspector(positions.get(item.index, start + step * number), item.rgb, frame)
+        place = item.index if is_video else positions.get(item.index, start + step * number)
+        yield inspector(place, item.rgb, frame)
 
 
 def _of_source(warnings: list[str]) -> list[VideoFinding]:

@@ -197,7 +197,7 @@ def locate(folder: Path, sequence: FrameSequence | Path | str, source: Path | No
     """
     sequence = open_other(folder, sequence) if isinstance(sequence, Path | str) else sequence
     places, settings = PlaceMap(folder, source), Result(folder).config.mask.model_copy(update={"files": ""})
-    mask = Masker(settings, create_masks(settings, sequence.rectifier, sequence.source.masks))
+    mask = Masker(settings, create_masks(settings, sequence.rectifier, sequence.source.masks, sequence.numbers))
     return (places.locate(mask(frame)) for frame in sequence.frames())
 
 

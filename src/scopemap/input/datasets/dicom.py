@@ -22,7 +22,8 @@ import numpy as np
 from scopemap.engine.errors import InputError, check_bytes, reporting
 from scopemap.engine.notices import Notice
 from scopemap.input.decoding import check_pixels, first_bytes
-from scopemap.input.images import image_files, numeric_order
+from scopemap.input.image_names import numeric_order
+from scopemap.input.images import image_files
 from scopemap.input.source import Source, SourceFrame
 from scopemap.input.video import VideoFile
 

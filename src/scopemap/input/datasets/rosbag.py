@@ -32,7 +32,8 @@ from scopemap.input.datasets.rosbag_messages import (
     is_grey,
 )
 from scopemap.input.decoding import first_bytes
-from scopemap.input.images import image_files, numeric_order
+from scopemap.input.image_names import numeric_order
+from scopemap.input.images import image_files
 from scopemap.input.source import Source, SourceFrame
 
 _IMAGE = "sensor_msgs/msg/Image"

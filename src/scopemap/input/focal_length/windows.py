@@ -94,7 +94,7 @@ def _at_default_size(sequence: Sequence) -> Sequence:
 
 
 def _kept(sequence: Sequence, config: Config) -> Iterator[Frame]:
-    masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks))
+    masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers))
     count = min(sequence.count or MAX_FRAMES, MAX_FRAMES)
     every = min(max(count // _MIN_KEPT, 1), _EVERY)
     step = every * (sequence.selection.step or 1)
