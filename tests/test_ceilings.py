@@ -41,9 +41,10 @@ CEILINGS = {
     # Readers of formats, networks and pages are loaded when an input, a setting or a command needs them.
     "modules loaded by scopemap.reconstruct": (
         lambda: _modules_loaded_after("import scopemap; scopemap.reconstruct"),
-        145,
+        150,
     ),
-    "classes of the engine": (_engine_classes, 198),
+    # 203: the decision on a keyframe, what the steps after the last frame are carried out by, kinds of lenses.
+    "classes of the engine": (_engine_classes, 203),
     # 192: what follows after the last frame, too.
     "lines of pipeline.py": (lambda: len((ENGINE / "pipeline.py").read_text().splitlines()), 192),
 }
