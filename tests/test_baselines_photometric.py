@@ -15,7 +15,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import rotation_angle_rad
 from scopemap.engine.tracking.pyramid import build_pyramid
 from scopemap.engine.tracking.track import FrameTracker
-from scopemap.evaluation.poses import evaluate_poses
+from scopemap.evaluation.doubts import evaluate_poses
 from scopemap.input.opening import open_sequence
 from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory

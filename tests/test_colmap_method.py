@@ -9,7 +9,7 @@ import pytest
 from tiny_phantom import write_tiny
 
 from scopemap.engine.errors import InputError
-from scopemap.evaluation.poses import evaluate_poses
+from scopemap.evaluation.doubts import evaluate_poses
 from scopemap.input.opening import open_sequence
 from scopemap_bench.methods.method import create_method
 from scopemap_bench.phantom.spec import PhantomSpec

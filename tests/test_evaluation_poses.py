@@ -14,11 +14,11 @@ from sample_trajectories import as_trajectory, evo_pair, last_digit, random_pair
 from scopemap.engine.errors import AlignmentError
 from scopemap.engine.geometry.align import align_trajectories
 from scopemap.engine.geometry.se3 import se3_exp
+from scopemap.evaluation.doubts import evaluate_poses
 from scopemap.evaluation.poses import (
     ErrorSummary,
     associate,
     below_percent,
-    evaluate_poses,
     frame_pairs,
     match,
     path_pairs,

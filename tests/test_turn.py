@@ -15,7 +15,8 @@ from test_cli_evaluate import run
 
 from scopemap.engine.geometry.align import align_trajectories, umeyama
 from scopemap.engine.geometry.se3 import rotation_angle_rad, se3, se3_exp, so3_exp
-from scopemap.evaluation.poses import evaluate_poses, match, rotation_errors_rad
+from scopemap.evaluation.doubts import evaluate_poses
+from scopemap.evaluation.poses import match, rotation_errors_rad
 from scopemap.evaluation.turn import turn_sigma_rad
 from scopemap_bench.evaluation.paper import paper_figures
 
