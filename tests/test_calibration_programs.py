@@ -150,9 +150,22 @@ def test_meshroom_counts_in_mm_of_the_sensor(tmp_path: Path) -> None:
     assert isinstance(fisheye, FisheyeCamera)
     assert fisheye.distortion == tuple(FOUR)
     assert "'3deanamorphic4'" in refusal(tmp_path, meshroom(type="3deanamorphic4"), (1350, 1080))
+    newer = meshroom(type="pinhole", distortionType="radialk3", distortionParams=["0.1", "0.05", "-0.001"])
+    assert read(tmp_path, newer, (1350, 1080)).distortion == (0.1, 0.05, 0.0, 0.0, -0.001)
+    assert "3 distortionParams" in refusal(tmp_path, meshroom(type="pinhole"), (1350, 1080))
+    assert "'equidistant'" in refusal(tmp_path, meshroom(type="equidistant"), (1350, 1080))
+    assert "pixelRatio" in refusal(tmp_path, meshroom(pixelRatio="1.2"), (1350, 1080))
     both = meshroom()
     both["intrinsics"] *= 2
     assert "2 cameras" in refusal(tmp_path, both, (1350, 1080))
+
+
+def test_gyroflow_states_its_lens(tmp_path: Path) -> None:
+    profile = {"calib_dimension": {"w": 1440, "h": 1080}}
+    profile |= {"fisheye_params": {"camera_matrix": K, "distortion_coeffs": FOUR}}
+    assert isinstance(read(tmp_path, {**profile, "distortion_model": "opencv_standard"}), OpenCvCamera)
+    assert "'poly5'" in refusal(tmp_path, {**profile, "distortion_model": "poly5"})
+    assert "stretched" in refusal(tmp_path, {**profile, "input_horizontal_stretch": 1.33})
 
 
 def test_a_pose_beside_a_camera_is_no_distortion(tmp_path: Path) -> None:

@@ -61,6 +61,8 @@ def test_times_in_names_are_the_times_of_the_frames(names: list[str], step_s: fl
         [f"frame.{k:04d}" for k in range(30)],
         [f"v1.{k:04d}" for k in range(30)],
         [f"frame{k}" for k in range(95, 125)],
+        [f"video1.{k}" for k in range(85, 124, 2)],
+        [f"p1.{k}" for k in range(1, 200, 25)],
     ],
 )
 def test_counters_behind_a_point_are_no_times(names: list[str], tmp_path: Path) -> None:
@@ -117,6 +119,17 @@ def test_only_frames_of_one_camera_are_used_and_the_others_named(
 def test_what_is_not_known_to_be_one_camera_is_refused(forms: list[str], words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=words):
         open_sequence(_folder(tmp_path / "images", [form.format(k) for form in forms for k in N]))
+
+
+def test_a_stray_picture_is_not_the_folder(tmp_path: Path) -> None:
+    assert open_sequence(_folder(tmp_path / "gt", [*(f"gt_{k:03d}" for k in range(12)), "overview"])).count == 13
+    with pytest.raises(InputError, match="label pictures by their names"):
+        open_sequence(_folder(tmp_path / "masks", [*(f"mask_{k:03d}" for k in range(12)), "overview"]))
+
+
+def test_two_counters_of_two_digits_are_no_times(tmp_path: Path) -> None:
+    names = [f"scan_{a}.{b:02d}" for a in range(3) for b in range(1, 15)]
+    assert not ImageFolder(_folder(tmp_path / "images", names)).stamped
 
 
 @pytest.mark.parametrize("names", [["a_{}", "b_1{}"], ["normal_colon_{}"], ["seg_{}"], ["12_30_4{}_001"]])

@@ -69,6 +69,10 @@ def evaluate(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[dic
         ("# timestamp tx ty tz qw qx qy qz", True, "m"),
         ("timestamp,tx,ty,tz,qw,qx,qy,qz", True, "m"),
         ("# x y z qw qx qy qz", True, "m"),
+        ("# timestamp gt_x gt_y gt_z gt_qw gt_qx gt_qy gt_qz", True, "m"),
+        ("# timestamp world_x world_y world_z qw qx qy qz", True, "m"),
+        ("# timestamp tx_mm ty_mm tz_mm qw qx qy qz", True, "mm"),
+        ("# units: mm\n# timestamp tx ty tz qw qx qy qz", True, "mm"),
         ("# timestamp tx ty tz qx qy qz qw", False, "m"),
         ("Time;Pos.X [mm];Pos.Y [mm];Pos.Z [mm];Quat.X;Quat.Y;Quat.Z;Quat.W", False, "mm"),
         ("%time,position.x,position.y,position.z,orientation.w,orientation.x,orientation.y,orientation.z", True, "m"),
@@ -97,6 +101,12 @@ def test_columns_in_any_place_are_found_by_name(tmp_path: Path, truth: Trajector
     assert found.indices.tolist() == list(range(60))
     assert "columns" in found.source
     assert "by its header" in found.source
+
+
+def test_a_unit_that_is_not_read_is_refused(tmp_path: Path, truth: Trajectory) -> None:
+    header = "time,tx [cm],ty [cm],tz [cm],qw,qx,qy,qz"
+    with pytest.raises(InputError, match="states positions in 'cm'"):
+        read_trajectory(write(tmp_path / "a.csv", header, ns(), rows(truth, w_first=True)))
 
 
 def test_a_header_that_does_not_fit_its_rows_is_refused(tmp_path: Path, truth: Trajectory) -> None:

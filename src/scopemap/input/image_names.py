@@ -7,7 +7,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from statistics import median
+from statistics import median, mode
 
 from scopemap.engine.errors import InputError
 from scopemap.input.decoding import frame_number
@@ -31,6 +31,8 @@ _LEAST_COUNTED = 0.8
 _RATES_HZ = (0.1, 1000.0)  # of videos and time lapses
 _LARGEST_STEP = 2000  # of frames that are numbered
 _MOST_UNEVEN = 100.0  # longest over usual step of a clock that only pauses
+_MOST_UNEVEN_DECIMAL = 10.0  # of decimal numbers, which may be two counters: scan_0.14, scan_1.01
+_MOST_PICTURES = 8  # kinds of pictures beside one frame
 _NS, _US, _MS = 1e-9, 1e-6, 1e-3
 _UNIX_S = (6e8, 5e9)  # 1989 to 2128
 
@@ -71,7 +73,7 @@ def chosen_frames(folder: Path, files: list[Path]) -> Chosen:
 def _frames(folder: Path, files: list[Path], notes: list[str]) -> list[Path]:
     contents = {file: content for file in files if (content := _content(file))}
     others = [file for file in files if file not in contents]
-    if others or not files:
+    if len(others) * _MOST_PICTURES >= len(contents):
         for kind in sorted({kind for kind, _ in contents.values()}):
             left = [file for file, (found, _) in contents.items() if found == kind]
             notes.append(f"left out: {len(left)} {kind} picture(s) by their names, such as {min(left).name}")
@@ -164,7 +166,8 @@ def _are_decimals(whole: list[str], shares: list[str | None], written: list[str]
         return False
     counters = sorted((int(a), int(b or 0)) for a, b in zip(whole, shares, strict=True))
     steps = [b[1] - a[1] for a, b in pairwise(counters) if a[0] == b[0]]
-    return sum(step == 1 for step in steps) < _LEAST_COUNTED * len(steps)
+    # A counter goes by ones, or by as many as frames were thinned by.
+    return not steps or steps.count(mode(steps)) < _LEAST_COUNTED * len(steps)
 
 
 def times_in_names(files: list[Path], numbers: list[int]) -> tuple[list[float], str]:
@@ -178,10 +181,10 @@ def times_in_names(files: list[Path], numbers: list[int]) -> tuple[list[float], 
     steps = [b - a for a, b in pairwise(values)]
     if not steps or min(steps) <= 0:
         return [], ""
-    usual = median(steps)
+    usual, uneven = median(steps), _MOST_UNEVEN if decimal is None else _MOST_UNEVEN_DECIMAL
     for unit_s, name in ((1.0, "s"),) if decimal is not None else ((_NS, "ns"), (_US, "us"), (_MS, "ms"), (1.0, "s")):
         is_unix = _UNIX_S[0] < values[0] * unit_s < _UNIX_S[1]
         is_clock = is_unix or decimal is not None or (unit_s < _MS and usual > _LARGEST_STEP)
-        if is_clock and 1 / _RATES_HZ[1] <= usual * unit_s <= 1 / _RATES_HZ[0] and max(steps) < _MOST_UNEVEN * usual:
+        if is_clock and 1 / _RATES_HZ[1] <= usual * unit_s <= 1 / _RATES_HZ[0] and max(steps) < uneven * usual:
             return [value * unit_s for value in values], f"the numbers in the names, {name}"
     return [], ""

@@ -6,6 +6,7 @@ The keys of `provenance.json` that the verdict needs are known here alone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -168,8 +169,14 @@ def evidence_of_segment(facts: Mapping[str, Any]) -> Evidence:
 
 
 def notices_of(provenance: Mapping[str, Any]) -> list[Notice]:
-    """Return the notices in the provenance of a run, or in what it has of a segment, each once."""
-    found = (Notice(one["code"], one["values"]) for one in provenance.get("notices", []))
+    """Return the notices in the provenance of a run, or in what it has of a segment, each once.
+
+    Those of another version that this one does not know are left out.
+    """
+    found = list[Notice]()
+    for one in provenance.get("notices", []):
+        with suppress(KeyError, ValueError):
+            found.append(Notice(one["code"], one["values"]))
     return list({(notice.code, text_of(notice)): notice for notice in found}.values())
 
 

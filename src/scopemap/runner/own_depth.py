@@ -53,7 +53,7 @@ def _judged(sequence: Sequence, config: Config, depth: FilesDepth) -> tuple[Dept
     evidence = KindEvidence((), float("nan"), 0)
     if sequence.source.name not in _WITHOUT_FIRST_FRAMES:
         evidence = kind_evidence(sequence, config, depth.numbers)
-        if not evidence.frames:
+        if not evidence.frames and depth.kind_reason:
             return depth.kind, []  # the first frame without a file says so
     found: DepthKind = "measured" if evidence.sign > 0 else "disparity"
     if depth.kind_reason:
@@ -63,6 +63,11 @@ def _judged(sequence: Sequence, config: Config, depth: FilesDepth) -> tuple[Dept
                 f"{_in_words(found)}: {evidence.reason}; {_STATE_IT}"
             )
         return depth.kind, []
+    if sequence.source.name in _WITHOUT_FIRST_FRAMES:
+        raise InputError(
+            f"the depth files in {depth.folder} may hold depth or inverse depth, and frames that come one at a time do "
+            f"not decide it before the first; {_STATE_IT}"
+        )
     if not evidence.sign:
         raise InputError(
             f"the depth files in {depth.folder} may hold depth or inverse depth, which neither the motion of the first "

@@ -79,7 +79,7 @@ class HandMeasure:
             {name: np.nan if one[name] is None else float(one[name]) for name in _NUMBERS} for one in kept["found"]
         ]
         found = [
-            Measure(one["what"], numbers["value"], numbers["low"], numbers["high"], one["unit"])
+            Measure(one["what"], numbers["value"], numbers["low"], numbers["high"], one["unit"], why=one.get("why", ""))
             for one, numbers in zip(kept["found"], known, strict=True)
         ]
         reference = None if kept["reference"] is None else np.array(kept["reference"], float)

@@ -60,7 +60,7 @@ class UnseenPart:
                     self._add(found, small, len(large) + 1)
 
     def _add(self, found: Coverage, spots: Sequence[BlindSpot], first: int) -> None:
-        along, unit = found.facts["along_unit"], "mm²" if found.unit == "mm" else "unit² (scale unknown)"
+        along, unit = found.facts["along_unit"], "mm²" if found.unit == "mm" else "square units (scale unknown)"
         for number, spot in enumerate(spots, first):
             share = f"{100 * share_of(found, spot):.2g}"
             label = f"{number}. near frame {spot.frame}, {share} % of what was not seen"

@@ -22,14 +22,20 @@ _OPENSFM = {
     "fisheye": ("fisheye", ("k1", "k2")),
     "fisheye_opencv": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
-# Meshroom (AliceVision's `camera/Distortion*`): the same by the names in its file; radial ones count r^2, r^4, r^6.
+# Meshroom (AliceVision's `jsonIO.cpp`): the same by the names in its file, of one version after the other; radial ones
+# count r^2, r^4, r^6.
+_RADIAL = ("opencv", ("k1", "k2", "k3"))
 _MESHROOM = {
     "pinhole": ("opencv", ()),
+    "none": ("opencv", ()),
     "radial1": ("opencv", ("k1",)),
-    "radial3": ("opencv", ("k1", "k2", "k3")),
+    "radialk1": ("opencv", ("k1",)),
+    "radial3": _RADIAL,
+    "radialk3": _RADIAL,
     "brown": ("opencv", ("k1", "k2", "k3", "p1", "p2")),
     "fisheye4": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
+_GYROFLOW = {"": "fisheye", "opencv_fisheye": "fisheye", "opencv_standard": "opencv"}
 _OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3")
 _MIDDLE_PX = 0.5  # the middle of a row of n pixels is at (n - 1) / 2
 
@@ -108,18 +114,24 @@ def _of_meshroom(fields: Fields) -> Fields | None:
     if len(cameras) > 1:
         raise ValueError(f"it is Meshroom's and holds {len(cameras)} cameras: leave the one of these images in it")
     place = cameras[0]
-    model, names = _known(_MESHROOM, place.words(("type",)), "type")
+    kind = place.words(("type",))
+    lens_kind = place.words(("distortionType",)) if kind == "pinhole" else ""
+    model, names = _known(_MESHROOM, lens_kind or kind, "distortionType" if lens_kind else "type")
     width, height, sensor_mm, focal_mm = (
         place.number((name,)) or 0.0 for name in ("width", "height", "sensorWidth", "focalLength")
     )
     if not (width and height and sensor_mm > 0 and focal_mm > 0):
         raise ValueError("it is Meshroom's, but states no width, height, sensorWidth and focalLength of a calibration")
-    focal_px, ratio = focal_mm * width / sensor_mm, place.number(("pixelRatio",)) or 1.0
+    if (place.number(("pixelRatio",)) or 1.0) != 1:
+        raise ValueError("its pixelRatio is not 1, which versions of Meshroom mean differently: calibrate anew")
+    focal_px = focal_mm * width / sensor_mm
     x, y = place.numbers(("principalPoint",), 2) or (0.0, 0.0)
     values = next((numbers_in(node, name) or [] for name, node in place.nodes(("distortionParams",))), [])
+    if any(values[len(names) :]):
+        raise ValueError(f"it has {len(values)} distortionParams, but its lens {lens_kind or kind!r} has {len(names)}")
     lens = dict(zip(names, values, strict=False))
     centre = (width / 2 - _MIDDLE_PX + x, height / 2 - _MIDDLE_PX + y)
-    return _camera((focal_px, focal_px * ratio, *centre), (width, height), model, lens)
+    return _camera((focal_px, focal_px, *centre), (width, height), model, lens)
 
 
 def _of_gyroflow(fields: Fields) -> Fields | None:
@@ -127,11 +139,16 @@ def _of_gyroflow(fields: Fields) -> Fields | None:
     place = next(iter(fields.inner(("fisheye_params",))), None)
     if place is None:
         return None
+    lens = fields.words(("distortion_model",)).replace(" ", "_")
+    if lens not in _GYROFLOW:
+        raise ValueError(f"the lens model {lens[:40]!r} of Gyroflow has no counterpart here: calibrate as a fisheye")
+    if any((fields.number((name,)) or 1.0) != 1 for name in ("input_horizontal_stretch", "input_vertical_stretch")):
+        raise ValueError("its pictures were stretched (input_horizontal_stretch), which is not read: calibrate anew")
     size = next(iter(fields.inner(("calib_dimension",))), Fields([]))
     names = (("image_width", "w"), ("image_height", "h"))
     sides = [(ours, as_number(node, name)) for ours, name in names for _, node in size.nodes((name,))]
     kept = [(name, node) for name, node in place.pairs if name in ("camera_matrix", "distortion_coeffs")]
-    return Fields([*kept, *sides, ("model", "fisheye")])
+    return Fields([*kept, *sides, ("model", _GYROFLOW[lens])])
 
 
 def _known(models: dict[str, tuple[str, tuple[str, ...]]], kind: str, name: str) -> tuple[str, tuple[str, ...]]:

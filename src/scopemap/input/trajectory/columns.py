@@ -12,6 +12,8 @@ from typing import Final
 
 import numpy as np
 
+from scopemap.engine.errors import InputError
+
 TUM_ORDER: Final = (0, 1, 2, 3, 4, 5, 6, 7)
 W_FIRST: Final = (0, 1, 2, 3, 5, 6, 7, 4)
 """Columns of time, tx ty tz and qx qy qz qw where the scalar comes first, as in EuRoC's files."""
@@ -20,7 +22,13 @@ _UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]")
 _QUATERNION = re.compile(r"q|quat|rot|orient", re.IGNORECASE)
 # Names of the first column, the surest first; a table's own count of rows has none.
 _TIMES = (re.compile(r"time|stamp", re.IGNORECASE), re.compile(r"frame|index|^t(_[mnu]?s)?$|^id$|^$", re.IGNORECASE))
-_NO_POSITION = re.compile(r"v|b_|w|a|g|lin|eul|rpy", re.IGNORECASE)  # velocity, bias, turn rate, acceleration
+# Velocity, bias, turn rate, acceleration.
+_NO_POSITION = re.compile(r"[vbwag](_|\d|$)|vel|acc|gyr|omega|lin|ang|eul|rpy|bias", re.IGNORECASE)
+_LENGTHS = {
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
+}
+_ENDING = re.compile(r"[_.-]?(x|y|z)[_.-](mm|m)$", re.IGNORECASE)  # tx_mm
 _TIME_UNIT = re.compile(r"(?:.*_)?(n|nano|u|µ|micro|m|milli|)s(?:ec|ecs|econds?)?", re.IGNORECASE)
 _TIME_PREFIXES = {"": "s", "n": "ns", "nano": "ns", "u": "us", "µ": "us", "micro": "us", "m": "ms", "milli": "ms"}
 _MOST_FRAMES = 1e9  # whole seconds since 1970 are more
@@ -55,11 +63,18 @@ class Columns:
 
 
 def named_columns(line: str) -> Columns | None:
-    """Return the columns that a line names; None where it does not name the three of a position and four of a turn."""
+    """Return the columns that a line names; None where it does not name the three of a position and four of a turn.
+
+    Raises `InputError` where it states positions in another unit than m and mm.
+    """
     text = line.strip().lstrip("#%/ ").replace("\t", ",").replace(";", ",")
     units = {name: unit.strip() for name, unit in re.findall(r"([\w.]+)\s*[\[(]([^\])]*)[\])]", text)}
     text = _UNIT.sub("", text)
     names = [name.strip().strip("\"'") for name in (text.rstrip(", ").split(",") if "," in text else text.split())]
+    for number, name in enumerate(names):
+        if ending := _ENDING.search(name):
+            names[number] = name[: ending.end(1)]
+            units[names[number]] = ending[2].lower()
     axes = {number: (name[:-1].rstrip("_.- "), name[-1:].lower()) for number, name in enumerate(names)}
     scalars = [stem for stem, axis in axes.values() if axis == "w" and _QUATERNION.search(stem)]
     # EuRoC's biases of the gyroscope, b_w_RS_S_x, end in an axis, too, and are no turn.
@@ -77,9 +92,11 @@ def named_columns(line: str) -> Columns | None:
     without_time = not times and min(found) == 0  # the names of a pose's numbers alone
     time = times[0] if times else 0
     order = (time, *(number + without_time for number in found))
-    unit = units.get(names[found[0]], "")
+    stated = units.get(names[found[0]], "")
+    if stated and stated.lower() not in _LENGTHS:
+        raise InputError(f"the header {line.strip()[:80]!r} states positions in {stated[:20]!r}: m and mm are read")
     time_unit = "" if without_time else _time_unit(units.get(names[time], ""), names[time])
-    return Columns(order, len(names) + without_time, unit if unit in ("m", "mm") else "", time_unit)
+    return Columns(order, len(names) + without_time, _LENGTHS.get(stated.lower(), ""), time_unit)
 
 
 def _is_position(stem: str) -> bool:

@@ -39,7 +39,7 @@ class NumberTable:
 
     def unit(self, assumed: Unit) -> tuple[float, str]:
         """Return mm per unit, and the unit in words: what a comment states, else `assumed`."""
-        stated = re.search(r"\bunit:\s*(mm|m)\b", self.comments)
+        stated = re.search(r"\bunits?\s*[:=]\s*(mm|m)\b", self.comments)
         unit = stated[1] if stated is not None else "" if self.columns is None else self.columns.unit
         if not unit:
             return MM_PER_UNIT[assumed], f"{assumed} (assumed)"
