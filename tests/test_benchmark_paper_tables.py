@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("by hand")
     for name, poses in (("reference.txt", REFERENCE), ("ours.txt", ESTIMATE)):
         lines = [f"{n} {x} {y} 0 0 0 {math.sin(a / 2)} {math.cos(a / 2)}" for n, (x, y, a) in enumerate(poses)]
-        (root / name).write_text("\n".join(lines) + "\n")
+        (root / name).write_text("\n".join(["# unit: mm", *lines]) + "\n")
     for out, options in (("rad", ["--paper-units"]), ("deg", [])):
         arguments = (root / "ours.txt", "--truth", root / "reference.txt", "--align", "none", "--out", root / out)
         assert call("compare", *arguments, "--names", "ours", "--quiet", *options) == 0

@@ -70,7 +70,7 @@ def test_an_error_is_code_1_and_one_line(datasets: Say, faulty: Path) -> None:
     assert (told["figures"]["dataset"], told["figures"]["frames"]) == ("images", 3)
     assert told["findings"][0].keys() == {"severity", "code", "message"}
     assert (told["findings"][0]["severity"], told["findings"][0]["code"]) == ("error", "number-repeated")
-    assert {finding["severity"] for finding in told["findings"][1:]} == {"info"}
+    assert {finding["severity"] for finding in told["findings"][1:]} == {"info", "warning"}
     code, out, err = datasets("check", faulty)
     assert (code, err.count("\n")) == (1, 2)
     assert out.startswith(f"{faulty}\n")

@@ -20,6 +20,7 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.notices import Notice
 from scopemap.input.opening import open_sequence
 from scopemap.result.result import Result
+from scopemap.result.wording import text_of
 
 WIDTH, HEIGHT = 320, 240
 FAST = ("--preset", "realtime", "--quiet")
@@ -89,7 +90,7 @@ def test_pictures_of_another_size_are_left_out_and_named(odd: set[int], tmp_path
     found = _codes(folder)["input-other-size"]
     assert found.values["frames"] == len(odd)
     assert found.values["first"] == f"{min(odd):03d}.png"
-    assert "160x120 px, others are 320x240 px" in found.text
+    assert "160x120 px, others are 320x240 px" in text_of(found)
     # What is not selected is not named.
     assert "input-other-size" not in _codes(folder, frames=slice(10, 50))
 

@@ -35,6 +35,7 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.se3 import inverse, se3, so3_exp
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.opening import open_sequence
+from scopemap.result.wording import in_words
 from scopemap_bench.datasets.c3vd import CAMERA, UNDISTORTED_CAMERA
 from scopemap_bench.datasets.sevenscenes import COLOUR_CAMERA, T_COLOUR_DEPTH
 
@@ -199,8 +200,8 @@ def test_frames_camera_and_truth(name: str, tmp_path: Path) -> None:
             assert truth.depth_mm.dtype == np.float32
             rows, middle = truth.depth_mm.shape[0], truth.depth_mm.shape[1] // 2
             np.testing.assert_allclose(truth.depth_mm[[0, rows // 2, rows - 1], middle], depth, rtol=1e-6)
-    assert [w for w in source.warnings if "last row is cut off" not in str(w)] == []
-    notes = " ".join(map(str, source.notes))
+    assert [w for w in source.warnings if "last row is cut off" not in in_words(w)] == []
+    notes = " ".join(map(in_words, source.notes))
     assert [words for words in case.told if words not in notes] == []
 
 

@@ -89,7 +89,7 @@ WORDINGS: dict[str, Wording] = {
         "Name each mask so that its last number is the frame's number.",
     ),
     "masks-shifted": Wording(
-        "The masks in {folder} begin and end one number from the frames: each is used {shift:+d} frame from it."
+        "The masks in {folder} begin and end one number from the frames: each is used {shift:+.0f} frame from it."
     ),
     "masks-late": Wording(
         "The frames begin at {frame} and the masks in {folder} at {mask}: each mask may be one frame late.",
