@@ -11,10 +11,11 @@ import pytest
 from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.pyramid import build_pyramid
 from scopemap.engine.tracking.rtdl import align
-from scopemap.engine.tracking.track import KeyframeDecision
-from scopemap.engine.tracking.tracker import Tracker
+from scopemap.engine.tracking.track import KeyframeDecision, TrackingLoss
+from scopemap.engine.tracking.tracker import Tracker, _Failure
 from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec
 
@@ -148,6 +149,19 @@ def test_a_keyframe_without_depth_is_refused() -> None:
     assert tracker.track(frames[1]).status == "initial"
     with pytest.raises(ValueError, match="needs a depth and a pose"):
         tracker.update(frames[0], NEW, measured=True)
+
+
+def test_a_frame_that_features_alone_have_found_becomes_a_keyframe(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, _ = _sequence()
+    tracker = Tracker(SETTINGS)
+    first = tracker.track(frames[0])
+    tracker.update(replace(frames[0], T_world_camera=first.T_world_camera), first.decision, measured=True)
+    rejected = TrackingLoss(LossCause.VIEW_CHANGED, "flow is made to fail")
+    with monkeypatch.context() as failing:
+        failing.setattr(tracker, "_failure", lambda frame, alignment, sharpness: _Failure(rejected, is_obscured=False))
+        track = tracker.track(frames[1])
+    assert (track.status, track.decision.kind) == ("ok", "new")
+    assert track.decision.reason == "flow fails, features find the frame"
 
 
 def test_masked_pixels_do_not_bleed_into_coarser_levels() -> None:
