@@ -25,6 +25,7 @@ from scopemap.input.focal_length.from_motion import (
 from scopemap.input.focal_length.windows import Window
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
+from scopemap.result.wording import in_words
 from scopemap.runner.reconstruct import reconstruct
 
 HALF_PX = 160.0
@@ -222,7 +223,7 @@ def test_which_estimate_is_taken(
     estimate = ESTIMATES[name]
     monkeypatch.setattr("scopemap.input.focal_length.from_motion.focal_from_motion", lambda *_: estimate)
     found, notes = with_focal_from_motion(still, _settings(focal))
-    assert message in " ".join([found.camera_source, *map(str, notes)])
+    assert message in " ".join([found.camera_source, *map(in_words, notes)])
     if taken:
         assert found.camera.fx == pytest.approx(estimate.focal_px)
         assert found.focal_sigma_px == pytest.approx(estimate.sigma_px)

@@ -36,13 +36,13 @@ def _depth_files(folder: Path, values_mm: list[float]) -> Path:
 def test_without_any_depth_no_frame_counts_as_tracked(folder: Path, tmp_path: Path) -> None:
     empty = _depth_files(tmp_path / "empty", [0.0] * FRAMES)
     with pytest.raises(InputError, match="too little of its depth is known"):
-        reconstruct(open_sequence(folder), with_true_depth(empty))
+        reconstruct(open_sequence(folder), with_true_depth(empty, depth__files_kind="measured"))
 
 
 @pytest.mark.slow
 def test_the_world_starts_at_the_first_frame_with_depth(folder: Path, tmp_path: Path) -> None:
     late = _depth_files(tmp_path / "late", [0.0, 0.0] + [30.0] * (FRAMES - 2))
-    result = reconstruct(open_sequence(folder), with_true_depth(late))
+    result = reconstruct(open_sequence(folder), with_true_depth(late, depth__files_kind="measured"))
     status = result.frames["status"].tolist()
     assert status == ["lost", "lost", "initial"] + ["ok"] * (FRAMES - 3)
 

@@ -53,8 +53,8 @@ def _judged(sequence: Sequence, config: Config, depth: FilesDepth) -> tuple[Dept
     evidence = KindEvidence((), float("nan"), 0)
     if sequence.source.name not in _WITHOUT_FIRST_FRAMES:
         evidence = kind_evidence(sequence, config, depth.numbers)
-        if not evidence.frames and depth.kind_reason:
-            return depth.kind, []  # the first frame without a file says so
+        if not evidence.frames:
+            return depth.kind, []  # the first frame without depth says so
     found: DepthKind = "measured" if evidence.sign > 0 else "disparity"
     if depth.kind_reason:
         if evidence.sign and found != depth.kind:
