@@ -6,7 +6,7 @@
 | 2 | the same with the drift, if 1 is refused | the same | as tracked |
 | 3 | another shape, beside 1 and 2 | the same | mirrored, and flat (`other_starts.py`) |
 | 4 | other maps merged with it, one by one | the same, of all of them | as their loop closures have them |
-| 5 | another lens (`lens.py`) | the focal length, or the kind of lens, too | where 4 has ended |
+| 5 | another lens (`lens.py`) | the focal length, or the kind of lens, too | where 1 has ended; 4, if 1 was refused |
 | 6 | as tracked, if all of these are refused | nothing | |
 | 7 | segments (`segments.py`), after 6 | as 1, of each by itself | as tracked |
 

@@ -10,7 +10,8 @@
 | the same from another start | `is_clearly_less`, `is_same_shape` | the shape stays, or is not determined |
 | the same with another lens | `LensTest.contradicts`, `LensKinds.better_than` | the lens stays |
 
-What an adjustment has used cannot judge it. So it is judged by what it has not used:
+A window, a whole map and merged maps are refused first where the reprojection errors that they leave stay large. Small
+errors of what was adjusted prove little, so what an adjustment has not used judges it, too:
 
 - tracks that were left out: part of the points is adjusted, others are placed in the keyframes that were found
   (`halves`, `placed`). Their errors are compared (`left_out_px`) with those of another hypothesis, or as tracked
