@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from drawn_run import GOOD_SURFACE, draw_run, drawn_result
 from front_door import call
 from typer.main import get_command
@@ -21,12 +20,13 @@ from scopemap.result.summary import summary_lines
 
 
 @pytest.mark.parametrize("name", cli._OF_BENCH)
-def test_a_command_of_a_missing_package_names_the_package(name: str) -> None:
+def test_a_command_of_a_missing_package_names_the_package(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     group = get_command(cli.app)
     group.commands.pop(name)
-    missing = CliRunner().invoke(group, [name, "scared"])
-    said = " ".join(missing.output.replace("│", " ").split())
-    assert missing.exit_code == 2
+    with pytest.raises(SystemExit) as ended:
+        group.main([name, "scared"], prog_name="scopemap")
+    said = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert ended.value.code == 2
     assert f"{name} is a command of the package scopemap-bench, which is not installed" in said
     assert "pip install -c constraints.txt -e bench" in said
     assert "Did you mean" not in said
