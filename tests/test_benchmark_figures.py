@@ -70,13 +70,15 @@ def test_methods_that_hold_to_the_end_are_green(tmp_path: Path) -> None:
         draw_frames_until_loss(frames, [90, 80], tmp_path / "bad.png")
 
 
-def test_frames_until_contradicted_are_drawn_over_the_limit(tmp_path: Path) -> None:
-    over = pd.DataFrame({"ours": [40, 60, 80], "Park": [10, 20, 80]}, index=[1.0, 3.0, 8.0])
-    draw_frames_until_contradicted({"clip": over, "other": over}, tmp_path / "until.png")
-    picture = read(tmp_path / "until.png").astype(int)
-    # Two panels, each with two coloured curves; the rest is grey.
-    coloured = np.ptp(picture, axis=2) > 60
-    assert [bool(half.sum() > 200) for half in np.array_split(coloured, 2, axis=1)] == [True, True]
+def test_frames_until_contradicted_are_bars_and_lines_over_the_limits(tmp_path: Path) -> None:
+    frames = grid([[80.0, 40.0, 20.0], [NAN, NAN, NAN]])
+    low, high = frames / 2, frames.clip(upper=60.0) + 20.0
+    draw_frames_until_contradicted(frames, low, high, tmp_path / "until.png", limits="1 to 8 px")
+    picture = read(tmp_path / "until.png")
+    shown, left_out = np.array_split(picture, 2, axis=1)
+    lengths = np.array(bar_lengths(shown))
+    np.testing.assert_allclose(lengths / lengths[0], [1.0, 0.5, 0.25], atol=0.03)
+    assert bar_lengths(left_out) == []
 
 
 def test_depth_changes_share_one_scale(tmp_path: Path) -> None:

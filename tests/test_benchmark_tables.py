@@ -148,7 +148,8 @@ def test_figures_that_the_turn_does_not_determine_are_not_printed_and_not_the_be
     for name, column in columns[group]:
         rows = {tuple(row.values())[:2]: row[column] for row in cells(found[name])}
         assert rows["colon", "ours"] == "not determined", column
-        assert rows["colon", "Park"].startswith("**"), column
+        # Nor is anybody else: the row that is withheld may be better.
+        assert not rows["colon", "Park"].startswith("**"), column
         assert rows["tube", "ours"][0].isdecimal(), column
     mean_deg = math.degrees(np.mean([row.figures["paper"]["r_avg_rad"] for row in (turned, known[-1])]))
     # A mean over sequences of which one is not determined is none, either.

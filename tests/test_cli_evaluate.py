@@ -32,7 +32,7 @@ KEYS = [
         "align",
         "straight",
         "turn",
-        "turn_sigma_deg",
+        "turn_bound_deg",
         "scale",
         "ate_rmse_mm",
         "ate_hold_rmse_mm",

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
+import cv2
 import numpy as np
 import plane_scene
 import pytest
 from plane_scene import CAMERA, EVERYWHERE
+from sample_trajectories import as_trajectory, write_c3vd, write_run
 
+from scopemap.engine.config import MaskSettings
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import se3_exp, so3_exp
+from scopemap.engine.masking.masker import Masker
+from scopemap.input.opening import open_sequence
 from scopemap_bench.evaluation.failure import FailureMeter
+from scopemap_bench.plan import ProtocolPlan
+from scopemap_bench.scoring import score
 
 FRAMES, AT = 24, 12
 TRUTH = [
@@ -19,6 +27,7 @@ TRUTH = [
     for n in range(FRAMES)
 ]
 VIEWS = [plane_scene.see(pose).rgb for pose in TRUTH]
+SLOW_PX = np.concatenate([0.15 * np.arange(60), 9 + 0.4 * np.arange(30)])
 Change = Callable[[int, np.ndarray], np.ndarray | None]
 
 
@@ -40,7 +49,14 @@ CHANGES: dict[str, tuple[Change, int, int]] = {
     "a jump of 6 degrees": (lambda n, pose: pose @ se3_exp(np.array([0, 0.1, 0, 0, 0, 0.0]) * (n >= AT)), AT, AT),
     "growing": (grown, AT, AT + 4),
     "missing": (lambda n, pose: None if n >= AT else pose, AT, AT),
-    "not before it begins": (lambda n, pose: pose if n > 5 else None, FRAMES, FRAMES),
+    "missing at first": (lambda n, pose: pose if n > 5 else None, 0, 0),
+    "every third alone": (lambda n, pose: pose if n % 3 == 0 else None, 1, 1),
+    "every second alone": (lambda n, pose: pose if n % 2 else None, 0, 0),
+    "every third, and wrong": (
+        lambda n, pose: pose @ se3_exp(np.array([3.0 * n, 0, 0, 0, 0.3 * n, 0.0])) if n % 3 == 0 else None,
+        1,
+        1,
+    ),
     "never": (lambda *_: None, 0, 0),
     "missing twice": (lambda n, pose: None if n in (AT, AT + 1) else pose, FRAMES, FRAMES),
 }
@@ -59,8 +75,59 @@ def test_frames_until_poses_are_contradicted(name: str) -> None:
     assert counts == sorted(counts)
 
 
+def test_standing_still_is_contradicted_in_a_slow_clip() -> None:
+    """Flow over five frames stays below the limit: what has moved since an earlier frame tells."""
+    path = [plane_scene.pose(at_mm=(plane_scene.SIX_PIXELS_MM / 6 * x, 0, 0)) for x in SLOW_PX]
+    counts = {}
+    for name, poses in {"true": path, "standing still": [np.eye(4)] * len(path)}.items():
+        meter = FailureMeter(CAMERA)
+        for pose, true in zip(poses, path, strict=True):
+            meter.add(plane_scene.see(true).rgb, EVERYWHERE, pose)
+        counts[name] = meter.figures()["frames_until_contradicted"]
+        assert meter.is_contradicted == (name == "standing still")
+    assert counts["true"] == len(path)
+    assert counts["standing still"] < 40
+
+
 def test_pictures_that_tell_nothing_contradict_nothing() -> None:
     meter, grey = FailureMeter(CAMERA), np.full((CAMERA.height, CAMERA.width, 3), 90, np.uint8)
     for pose in TRUTH:
         meter.add(grey, ~EVERYWHERE, pose)
     assert meter.figures()["frames_until_contradicted"] == FRAMES
+
+
+@pytest.mark.parametrize("holds_still", [True, False])
+def test_a_clip_that_contradicts_the_true_poses_counts_nobody(holds_still: bool, tmp_path: Path) -> None:
+    """True poses that stand still before a picture that moves, and those that the pictures were seen from."""
+    truth = np.stack([np.eye(4)] * FRAMES if holds_still else TRUTH)
+    clip = write_c3vd(tmp_path / "clip", truth)
+    for number, rgb in enumerate(VIEWS):
+        cv2.imwrite(str(clip / f"{number:04d}_color.png"), rgb[..., ::-1])
+    sides = f"fx: {CAMERA.fx}\nfy: {CAMERA.fy}\ncx: {CAMERA.cx}\ncy: {CAMERA.cy}\n"
+    (clip / "camera.yaml").write_text(f"{sides}width: {CAMERA.width}\nheight: {CAMERA.height}\n")
+    sequence = open_sequence(clip, dataset="c3vd", size=(CAMERA.width, CAMERA.height))
+    run = write_run(tmp_path / "run", as_trajectory(np.stack(TRUTH)))
+    poses = score(run, sequence, ProtocolPlan(contradiction=True, align="origin", depth=False, surface=False))["poses"]
+    assert poses.get("contradiction", "") == ("true poses contradicted" if holds_still else "")
+    assert poses.get("frames_until_contradicted", 0) == (0 if holds_still else FRAMES)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("clip", ["c3vd/cecum_t1_a", "hamlyn/rectified01_part"])
+def test_on_real_clips_the_truth_holds_longest_and_who_stands_still_or_answers_seldom_does_not(
+    clip: str, real_data: Path
+) -> None:
+    sequence = open_sequence(real_data / "endoscopy" / clip, frames=slice(0, 45))
+    masker, rng = Masker(MaskSettings()), np.random.default_rng(0)
+    meters = {name: FailureMeter(sequence.camera) for name in ("true", "still", "every third, at random", "late")}
+    for n, frame in enumerate(sequence.frames()):
+        valid, true = masker(frame).valid, sequence.source.pose(frame.index)
+        random = se3_exp(rng.normal(size=6) * [5, 5, 5, 0.1, 0.1, 0.1])
+        poses = {"true": true, "still": np.eye(4), "every third, at random": None if n % 3 else random}
+        for name, pose in (poses | {"late": np.eye(4) if n >= 35 else None}).items():
+            meters[name].add(frame.rgb, valid, pose)
+    counts = {name: meter.figures()["frames_until_contradicted"] for name, meter in meters.items()}
+    # Hamlyn has no true poses.
+    assert counts.pop("true") == (45 if "c3vd" in clip else 0)
+    assert counts["still"] < 20
+    assert max(counts["every third, at random"], counts["late"]) <= 1

@@ -91,11 +91,10 @@ def _bars(results: Sequence[RunResult], folder: Path) -> Iterator[Path]:
         yield folder / "frames_until_loss.png"
     until = {limit: of_all(f"poses.frames_until_contradicted_at_{limit:g}_px") for limit in LIMITS_PX}
     if until[LIMIT_PX].notna().any(axis=None):
-        over = {
-            name: pd.DataFrame({limit: table.loc[name] for limit, table in until.items()}).T for name in lengths.index
-        }
-        pictures.draw_frames_until_contradicted(over, folder / "frames_until_contradicted.png")
-        yield folder / "frames_until_contradicted.png"
+        file, low, high = folder / "frames_until_contradicted.png", min(LIMITS_PX), max(LIMITS_PX)
+        limits = f"limits of {low:g} to {high:g} px, bar: {LIMIT_PX:g} px"
+        pictures.draw_frames_until_contradicted(until[LIMIT_PX], until[low], until[high], file, limits=limits)
+        yield file
 
 
 def _world_poses(results: Sequence[RunResult]) -> str:

@@ -6,7 +6,6 @@ per method, NaN where there is no figure. All functions write a PNG.
 
 from __future__ import annotations
 
-import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -58,20 +57,23 @@ def draw_frames_until_loss(frames: pd.DataFrame, lengths: Sequence[int], file: P
     figure.savefig(file)
 
 
-def draw_frames_until_contradicted(frames: Mapping[str, pd.DataFrame], file: Path) -> None:
-    """Draw the frames until poses contradict the pictures over the limit, px (index), of each method (columns)."""
-    across, down = _grid_size(len(frames))
-    figure = _new_figure(4.6 * across, 3.6 * down + 0.8)
-    for number, (sequence, of_methods) in enumerate(frames.items(), start=1):
-        axes = figure.add_subplot(down, across, number)
-        axes.set_title(_short(sequence), fontsize=11)
-        axes.set_xlabel("limit, px")
-        axes.set_ylabel("frames")
-        for mark, method in zip(itertools.cycle("osD^vPX*"), of_methods, strict=False):
-            axes.plot(of_methods.index, of_methods[method], marker=mark, label=_short(method), markersize=5, alpha=0.8)
-        axes.set_ylim(bottom=0)
-    axes.legend(fontsize=8)
-    _headline(figure, "Frames until the poses contradict the pictures' flow, over the limit; higher is better")
+def draw_frames_until_contradicted(
+    frames: pd.DataFrame, least: pd.DataFrame, most: pd.DataFrame, file: Path, *, limits: str
+) -> None:
+    """Draw the frames until poses contradict the pictures as bars, with a line from `least` to `most` over `limits`.
+
+    A sequence without any figure is left out, which its title says.
+    """
+    figure, panels = _bar_panels(frames)
+    for axes, sequence, low, high in zip(panels, frames.index, least.to_numpy(), most.to_numpy(), strict=True):
+        values = frames.loc[sequence].to_numpy()
+        axes.set_xlabel("frames")
+        if not np.isfinite(values).any():
+            axes.set_title(f"{_short(sequence)}\nleft out: contradicts true poses", fontsize=11)
+            continue
+        _draw_bars(axes, values, ".0f", at_least=float(np.nanmax(high)), past=high)
+        axes.hlines(np.arange(len(values)), low, high, "black", linewidth=1.2)
+    _headline(figure, f"Frames until the poses contradict the pictures' flow; line: {limits}; higher is better")
     figure.savefig(file)
 
 
@@ -174,12 +176,16 @@ def _bar_panels(values: pd.DataFrame) -> tuple[Figure, list[Axes]]:
     return figure, panels[: len(values)]
 
 
-def _draw_bars(axes: Axes, values: np.ndarray, form: str, *, at_least: float = 0.0) -> BarContainer:
-    """Draw one sequence's bars with their values at the end; the axis reaches to `at_least`."""
+def _draw_bars(
+    axes: Axes, values: np.ndarray, form: str, *, at_least: float = 0.0, past: np.ndarray | None = None
+) -> BarContainer:
+    """Draw one sequence's bars, their values at the end or at `past`; the axis reaches to `at_least`."""
     lengths = np.nan_to_num(values)
     bars = axes.barh(np.arange(len(values)), lengths, color=BAR_COLOUR, height=0.7)
     labels = [format(value, form) if np.isfinite(value) else "no figure" for value in values]
-    axes.bar_label(bars, labels, padding=4, fontsize=8)
+    ends = lengths if past is None else np.fmax(lengths, past)
+    for place, (end, label) in enumerate(zip(ends, labels, strict=True)):
+        axes.annotate(label, (end, place), (4, 0), textcoords="offset points", va="center", fontsize=8)
     axes.set_xlim(0, 1.22 * (max(float(lengths.max()), at_least) or 1.0))
     axes.grid(axis="x", alpha=0.3)
     axes.set_axisbelow(True)

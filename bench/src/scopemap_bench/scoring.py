@@ -39,6 +39,8 @@ from scopemap_bench.plan import ProtocolPlan
 from scopemap_bench.result import Figures
 from scopemap_bench.true_depth import TrueDepths
 
+TRUTH_CONTRADICTED = "true poses contradicted"
+"""The word for clips whose pictures contradict the true poses: no method is counted there."""
 _CONSISTENCY_PX = 1.0
 _MAX_VIEWS = 40
 _LIMIT_MM = 0.5  # a turn that moves surfaces by less leaves them as they are
@@ -250,11 +252,19 @@ def _consistency(
     return {"consistency": meter.report() | {"flow": estimator.name}}
 
 
-def _contradiction(sequence: Sequence, estimate: Trajectory) -> dict[str, int]:
-    meter, masker, poses = FailureMeter(sequence.camera), Masker(MaskSettings()), _tracked_poses(estimate)
+def _contradiction(sequence: Sequence, estimate: Trajectory) -> dict[str, int | str]:
+    """Count frames until the poses contradict the pictures; where the true ones do, too, only say so."""
+    masker, poses = Masker(MaskSettings()), _tracked_poses(estimate)
+    meter, meter_of_truth = FailureMeter(sequence.camera), FailureMeter(sequence.camera)
     for frame in sequence.frames():
-        meter.add(frame.rgb, masker(frame).valid, poses.get(frame.index))
-    return meter.figures()
+        valid, true_pose = masker(frame).valid, sequence.source.pose(frame.index)
+        meter.add(frame.rgb, valid, poses.get(frame.index))
+        if true_pose is not None:
+            meter_of_truth.add(frame.rgb, valid, true_pose)
+    # Tissue that moves by itself, or poses of another clip: then the criterion says nothing about a method.
+    if meter_of_truth.is_contradicted:
+        return {"contradiction": TRUTH_CONTRADICTED}
+    return dict(meter.figures())
 
 
 def _tracked_poses(estimate: Trajectory) -> dict[int, np.ndarray]:

@@ -40,7 +40,8 @@ smaller errors."""
 _LONGEST_ERROR = 80
 # Columns of text, and where the runs keep their words: rows compete where the figures were measured alike.
 _WORDS = {"alignment": "poses.align", "path": "poses.straight", "turn": "poses.turn", "surface turn": "surface.turn"}
-_WORDS |= {"flow": "consistency.flow", "scaling": "depth.scaling", "depth": "facts.depth"}
+_WORDS |= {"contradiction": "poses.contradiction", "flow": "consistency.flow", "scaling": "depth.scaling"}
+_WORDS |= {"depth": "facts.depth"}
 
 
 @dataclass(frozen=True)
@@ -78,15 +79,16 @@ class Figure:
         """Return the figures and what stands behind "±", both in the printed unit, NaN where there is none."""
         spread_key = self.spread_key or (self.key + SPREAD if self.seeds else "")
         found = rows.reindex(columns=[self.key, spread_key]).astype(float) * self.factor
-        found = found.where(self._words(rows) == "")
+        found = found.where(self.words(rows) == "")
         return found[self.key], found[spread_key]
 
-    def _words(self, rows: pd.DataFrame) -> pd.Series:
+    def words(self, rows: pd.DataFrame) -> pd.Series:
+        """Return the words that stand instead of the figure, "" where it stands."""
         return rows[self.unless] if self.unless else pd.Series("", index=rows.index)
 
     def texts(self, rows: pd.DataFrame) -> list[str]:
         """Return the figures as they are printed, the word of `unless` instead of them, "" where there is none."""
-        values = zip(*self.values(rows), self._words(rows), strict=True)
+        values = zip(*self.values(rows), self.words(rows), strict=True)
         return [word or self.text(value, spread) for value, spread, word in values]
 
     def text(self, value: float, spread: float = math.nan) -> str:
@@ -170,10 +172,15 @@ class Table:
         """Return the cells as texts; the first figure of a row that failed is the failure."""
         cells = self.rows[list(self.texts)].map(escape)
         groups = [self.rows[name] for name in self.compete_within]
+        # By whatever alignment: a camera that stands still has none to withhold a figure for.
+        anyhow = [self.rows[name] for name in self.compete_within if name != "alignment"]
+        everywhere = pd.Series(True, index=self.rows.index)
         for number, figure in enumerate(self.figures):
             values, _ = figure.values(self.rows)
             column = pd.Series(figure.texts(self.rows), index=cells.index, dtype=object).map(escape)
-            best = figure.best(values.where(self.rows["competes"]), groups or [values.map(bool)])
+            best = figure.best(values.where(self.rows["competes"]), groups or [everywhere])
+            withheld = (figure.words(self.rows) != "") & self.rows["competes"]
+            best &= ~withheld.groupby(anyhow or [everywhere]).transform("any")
             column = column.where(~best, column.map(bold.format))
             if number == 0:
                 column = column.where(self.rows["failure"] == "", self._failures.map(escape))
@@ -203,8 +210,8 @@ def summarise(results: Iterable[RunResult]) -> pd.DataFrame:
 
     Figures are medians over the seeds, by "group.name", with half their range under the same name and `SPREAD`. Further
     columns: "sequence", "method", "runs", "frames tracked", "alignment", "path", "depth", "flow", "scaling", "failure",
-    "done", "competes", "tracked", "frames", "turn", "surface turn". A sequence with its seed ("colon, seed 1")
-    is without it.
+    "done", "competes", "tracked", "frames", "turn", "surface turn", "contradiction". A sequence with its seed
+    ("colon, seed 1") is without it.
     """
     runs = _runs(results)
     order = {name: place for place, name in enumerate(dict.fromkeys(runs["sequence"]))}

@@ -239,7 +239,7 @@ def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
     align, scale : mode of the alignment, and the scale that it found.
     straight : "straight path" where the turn about it was fitted to the orientations; else "".
     turn : "not determined" where rotation errors after the alignment may be its own, and are NaN; else "".
-    turn_sigma_deg : standard deviation of the alignment's turn, ATE over the path's extent (`evaluation/turn.py`).
+    turn_bound_deg : what errors of the positions may turn the alignment by (`evaluation/turn.py`).
     ate_... : absolute translation error after the alignment; ate_hold_rmse_mm with lost frames held at the last pose.
     rotation_mean_deg, rotation_max_deg : absolute rotation error after the alignment.
     rotation_unaligned_mean_deg, rotation_unaligned_max_deg : rotation since the first tracked frame, no alignment.
@@ -263,7 +263,7 @@ def pose_report(matched: MatchedTrajectories) -> dict[str, Any]:
         "align": matched.align,
         "straight": "straight path" if matched.similarity.straight else "",
         "turn": "" if len(error_deg) else NOT_DETERMINED,
-        "turn_sigma_deg": float(np.degrees(matched.turn.sigma_rad)),
+        "turn_bound_deg": float(np.degrees(matched.turn.bound_rad)),
         "scale": matched.similarity.scale,
         "ate_rmse_mm": ate.rmse,
         "ate_hold_rmse_mm": ErrorSummary.of(held_mm).rmse,

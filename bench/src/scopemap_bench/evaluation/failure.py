@@ -2,14 +2,17 @@
 
 The relative pose of two frames lets a point of the first be seen on a segment of the second: from where it would be at
 infinity to where it would be at twice the translation. Flow that ends beside these segments contradicts the pose; so
-does a missing pose after the first one, and a depth of the scene, as flow and translation imply it, that jumps. What a
-method itself calls lost is another figure, `frames_until_loss`. The form and the limits are ours.
+does a depth of the scene, as flow and translation imply it, that jumps. A frame without a pose counts as contradicted,
+from the first one on: a method cannot gain by answering seldom. Each frame is compared with an earlier one from which
+the pictures have moved, so that poses which stand still are contradicted in slow clips, too. What a method itself calls
+lost is another figure, `frames_until_loss`. The form and the limits are ours.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,9 +25,14 @@ LIMITS_PX = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Median distances between flow and the segments above which frames contradict; the criterion is that of `LIMIT_PX`."""
 LIMIT_PX = 3.0
 
-# Frames between the two that are compared, and how many in a row must contradict.
+# The earlier frame is the latest one, at least so many frames before, from which the median flow is so long: a camera
+# that stands still is then off at every limit. Among so many frames with poses.
 _STEP = 5
-_IN_A_ROW = 3
+_MOTION_PX = max(LIMITS_PX)
+_SEARCHED = 60
+# Poses have failed where so many of so many frames in a row are contradicted or missing.
+_FAILED = 3
+_OF_FRAMES = 5
 # Spacing of the points, largest forward-backward error of their flow, px, and fewest that tell anything.
 _SPACING_PX = 12
 _CONSISTENCY_PX = 1.0
@@ -38,51 +46,104 @@ _KEPT = 10
 _LEAST_PARALLAX_PX = 1.0
 
 
+class _View(NamedTuple):
+    """A frame with a pose: its number, (H, W, 3) uint8, its usable pixels (H, W) bool, the pose (4, 4)."""
+
+    number: int
+    rgb: np.ndarray
+    valid: np.ndarray
+    T_world_camera: np.ndarray
+
+
+class _Matches(NamedTuple):
+    """Pixels (n, 2) of an earlier view and where flow takes them in a later one."""
+
+    past: np.ndarray
+    now: np.ndarray
+
+    @property
+    def motion_px(self) -> float:
+        """Median length of the flow, px; 0 where too few points are matched to tell."""
+        if len(self.past) < _FEWEST:
+            return 0.0
+        return float(np.median(np.linalg.norm(self.now - self.past, axis=1)))
+
+
+_NO_MATCHES = _Matches(np.empty((0, 2)), np.empty((0, 2)))
+
+
 class FailureMeter:
     """Takes the frames of a sequence with a method's poses, and says how many pass until these are contradicted."""
 
     def __init__(self, camera: PinholeCamera) -> None:
         self._camera, self._flow = camera, DisFlow()
-        self._before: deque[tuple[np.ndarray, np.ndarray, np.ndarray | None]] = deque(maxlen=_STEP)
+        self._earlier: deque[_View] = deque(maxlen=_SEARCHED)
         self._log_depths: deque[float] = deque(maxlen=_KEPT)
         self._off_px: list[float] = []
-        self._has_begun = False
 
     def add(self, rgb: np.ndarray, valid: np.ndarray, T_world_camera: np.ndarray | None) -> None:
         """Add the next frame: (H, W, 3) uint8, its usable pixels (H, W) bool, its pose (4, 4) or None."""
-        past = self._before[0] if self._before else None
-        self._has_begun |= T_world_camera is not None
-        self._off_px.append(math.inf if self._has_begun and T_world_camera is None else 0.0)
-        if past is not None and past[2] is not None and T_world_camera is not None:
-            self._off_px[-1] = self._off((past[0], rgb), (past[1], valid), inverse(T_world_camera) @ past[2])
-        self._before.append((rgb, valid, T_world_camera))
+        if T_world_camera is None:
+            self._off_px.append(math.inf)
+            return
+        view = _View(len(self._off_px), rgb, valid, T_world_camera)
+        self._off_px.append(self._off(view))
+        self._earlier.append(view)
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the poses have failed by the criterion."""
+        return _until(np.array(self._off_px) > LIMIT_PX) < len(self._off_px)
 
     def figures(self) -> dict[str, int]:
         """Return frames_until_contradicted, and _at_N_px for each of `LIMITS_PX`; all frames where none is."""
-        off_px = np.array(self._off_px) if self._has_begun else np.full(len(self._off_px), math.inf)
+        off_px = np.array(self._off_px)
         counts = {limit: _until(off_px > limit) for limit in LIMITS_PX}
         name = "frames_until_contradicted"
         return {name: counts[LIMIT_PX]} | {f"{name}_at_{limit:g}_px": count for limit, count in counts.items()}
 
-    def _off(self, rgb: tuple[np.ndarray, ...], valid: tuple[np.ndarray, ...], T_now_past: np.ndarray) -> float:
-        """Return how far flow is from the segments, median, px; infinite where depth jumps, 0 where too few tell.
-
-        rgb, valid : of the past frame and of this one.
-        """
-        points = np.argwhere(valid[0])[:, ::-1]
-        points = points[(points % _SPACING_PX == _SPACING_PX // 2).all(1)]
-        flows = self._flow.estimate_both(*rgb)
-        number, pixels = match_corners(points, flows, usable_pixels(valid[1]), _CONSISTENCY_PX)
-        if len(number) < _FEWEST:
+    def _off(self, view: _View) -> float:
+        """Return how far flow is from the segments, median, px; infinite where depth jumps, 0 where too few tell."""
+        found = self._moved_from(view)
+        if found is None:
             return 0.0
-        rays = self._camera.unproject(points[number].astype(float)) @ T_now_past[:3, :3].T
-        off_px, log_depth = self._compared(rays, pixels, T_now_past[:3, 3])
+        past, matches = found
+        T_now_past = inverse(view.T_world_camera) @ past.T_world_camera
+        rays = self._camera.unproject(matches.past.astype(float)) @ T_now_past[:3, :3].T
+        off_px, log_depth = self._compared(rays, matches.now, T_now_past[:3, 3])
         usual = float(np.median(self._log_depths)) if self._log_depths else log_depth
         if math.isfinite(log_depth):
             self._log_depths.append(log_depth)
             if abs(log_depth - usual) > math.log(_JUMP):
                 return math.inf
         return off_px
+
+    def _moved_from(self, view: _View) -> tuple[_View, _Matches] | None:
+        """Return the view to compare with, and the matches; None where none has enough. Those before it are forgotten.
+
+        Where too little of it is left in sight, the latest view takes over.
+        """
+        earlier = [past for past in self._earlier if view.number - past.number >= _STEP]
+        place, matches = 0, self._matches(earlier[0], view) if earlier else _NO_MATCHES
+        if earlier and len(matches.past) < _FEWEST:
+            place, matches = len(earlier) - 1, self._matches(earlier[-1], view)
+        if len(matches.past) < _FEWEST:
+            return None
+        for later in range(place + 1, len(earlier)):
+            closer = self._matches(earlier[later], view)
+            if closer.motion_px < _MOTION_PX:
+                break
+            place, matches = later, closer
+        while self._earlier[0] is not earlier[place]:
+            self._earlier.popleft()
+        return earlier[place], matches
+
+    def _matches(self, past: _View, view: _View) -> _Matches:
+        points = np.argwhere(past.valid)[:, ::-1]
+        points = points[(points % _SPACING_PX == _SPACING_PX // 2).all(1)]
+        flows = self._flow.estimate_both(past.rgb, view.rgb)
+        number, pixels = match_corners(points, flows, usable_pixels(view.valid), _CONSISTENCY_PX)
+        return _Matches(points[number], pixels)
 
     def _compared(self, rays: np.ndarray, pixels: np.ndarray, t_mm: np.ndarray) -> tuple[float, float]:
         """Return how far pixels (n, 2) are from the segments of rays (n, 3), median px, and ln of the implied depth."""
@@ -110,8 +171,9 @@ class FailureMeter:
 
 
 def _until(contradicted: np.ndarray) -> int:
-    """Return how many frames (N,) bool come before the first three in a row; N where there are none."""
-    if not len(contradicted):
-        return 0
-    in_a_row = np.convolve(contradicted, np.ones(_IN_A_ROW, int)) == _IN_A_ROW
-    return int(np.argmax(in_a_row)) - _IN_A_ROW + 1 if in_a_row.any() else len(contradicted)
+    """Return how many frames (N,) bool come before poses fail, three of five in a row; N where they do not."""
+    before = np.concatenate([[0], np.cumsum(contradicted)])
+    ends = np.minimum(np.arange(len(contradicted)) + _OF_FRAMES, len(contradicted))
+    inside = before[ends] - before[:-1]
+    failed = np.flatnonzero(inside >= _FAILED)
+    return int(failed[0] + np.argmax(contradicted[failed[0] :])) if len(failed) else len(contradicted)

@@ -158,6 +158,6 @@ def _warn_of(matched: MatchedTrajectories, clock: dict[str, Any], doubted: Seque
         turn = "the turn about it is fitted to the orientations, since positions do not tell it"
         typer.echo(f"warning: the path is nearly a straight line: {turn}", err=True)
     if not len(matched.turned[0]):
-        sigma = f"+-{math.degrees(matched.turn.sigma_rad):.1f} deg"
+        bound = f"their errors may turn it by up to {math.degrees(min(matched.turn.bound_rad, math.pi)):.1f} deg"
         left = "rotation after it is left out, rotation_unaligned_* needs none"
-        typer.echo(f"warning: the positions do not determine the alignment's turn ({sigma}): {left}", err=True)
+        typer.echo(f"warning: the positions do not determine the alignment's turn ({bound}): {left}", err=True)
