@@ -186,6 +186,26 @@ def test_a_patch_of_the_tube(known: Path, tmp_path: Path, capfd: pytest.CaptureF
     assert measured(capfd, known, "--lesion", folder / "mask_0003.png", "--second", 3.2 / 25) == found
 
 
+@pytest.mark.parametrize("second", [-1.0, 40.0])
+def test_a_time_that_the_result_does_not_show_is_refused(
+    second: float, known: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The nearest frame may be minutes away, where only a part of the video was run."""
+    mask = masks_of(tmp_path / "masks", range(3, 4)) / "mask_0003.png"
+    for what in (("--lesion", mask), ("--points", "10,10 20,10")):
+        said = refused(capfd, "measure", known, *what, "--second", second)
+        assert f"no frame with a pose is at {second:g} s" in said
+
+
+def test_points_are_measured_at_a_time(known: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    printed = []
+    for time in (("--second", 3 / 25), ("--frame", 3)):
+        capfd.readouterr()
+        assert call("measure", known, "--points", "30,40 50,40", *time) == 0
+        printed.append(capfd.readouterr().out)
+    assert printed[0] == printed[1]
+
+
 def test_many_frames_do_not_make_an_interval_vanish(known: Path, tmp_path: Path) -> None:
     def half(frames: range) -> float:
         one = measure_lesion(known, masks_of(tmp_path / str(len(frames)), frames)).measures[0]

@@ -61,10 +61,12 @@ def measure(
         raise typer.BadParameter("give either --points or --lesion")
     if reference and reference_mask is not None:
         raise typer.BadParameter("give either --reference or --reference-mask")
-    if points and (
-        frame is None or second is not None or reference_mask or pictures or export or reference_frame is not None
-    ):
-        raise typer.BadParameter("--points needs --frame, and of the others takes --reference and --reference-mm alone")
+    if frame is not None and second is not None:
+        raise typer.BadParameter("give either --frame or --second")
+    if points and frame is None and second is None:
+        raise typer.BadParameter("--points needs --frame or --second")
+    if points and (reference_mask or pictures or export or reference_frame is not None):
+        raise typer.BadParameter("--points takes --frame or --second, --reference and --reference-mm alone")
     pixels = _pixels(points, "--points") if points else []
     if points and len(pixels) < 2:
         raise typer.BadParameter("at least two pixels are needed", param_hint="--points")
@@ -83,6 +85,7 @@ def measure(
         check_output(export, FINDING_ENDINGS, overwrite=True)
 
     warn_of_damage(run, silent=as_json)
+    frame = frame if second is None else lesions.frame_at(run, second)
     if frame is not None and points:
         known = None if ends is None else np.array(ends)
         found = measuring.measure(run, frame, np.array(pixels), known, reference_mm)
@@ -91,7 +94,6 @@ def measure(
             camera = Result(run).camera
             typer.echo(f"pixels are those of frame {frame} after rectification, {camera.width}x{camera.height} px")
         return
-    frame = frame if second is None else lesions.frame_at(run, second)
     masks = Path(lesion) if Path(lesion).exists() else np.array(_pixels(lesion, "--lesion"))
     pair = lesions.shaft_width(run, reference_mask) if reference_mask is not None else ends
     given = None if pair is None else np.array(pair)

@@ -52,6 +52,7 @@ _LEAST_LEFT = 0.8
 _MOST_DIFFERENCE = np.log(1.5)
 _OUTLINE_BGR = (0, 255, 255)
 _OUTLINE_POINTS = 60
+_ROUNDED_S = 0.05  # a time that was read to a tenth of a second
 
 
 @dataclass(frozen=True)
@@ -175,9 +176,18 @@ def _read_mask(run: Result, file: Path) -> np.ndarray:
 
 
 def frame_at(folder: Path, second: float) -> int:
-    """Return the number of the frame with a pose that is nearest to a time, s."""
+    """Return the number of the frame with a pose that is shown at a time, s, of the video; `InputError` for none."""
     trajectory = Result(folder).checked(with_poses=True).tracked.trajectory
-    return int(trajectory.indices[np.abs(trajectory.times_s - second).argmin()])
+    times_s = trajectory.times_s
+    nearest = int(np.abs(times_s - second).argmin())
+    step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    if abs(times_s[nearest] - second) > max(step_s, _ROUNDED_S):
+        where = f"its frames with a pose are from {times_s[0]:.2f} to {times_s[-1]:.2f} s, the nearest is"
+        raise InputError(
+            f"no frame with a pose is at {second:g} s in the result {folder}: {where} frame "
+            f"{trajectory.indices[nearest]} at {times_s[nearest]:.2f} s"
+        )
+    return int(trajectory.indices[nearest])
 
 
 def shaft_width(folder: Path, file: Path) -> np.ndarray:
