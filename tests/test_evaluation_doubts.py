@@ -119,6 +119,8 @@ def test_evaluate_says_it_and_applies_nothing(tmp_path: Path, capfd: pytest.Capt
     assert figures["ate_rmse_mm"] > 0.5
     assert call(*given, "--quiet") == 0
     assert capfd.readouterr().err == ""
+    assert call("compare", *given[1:]) == 0
+    assert f"warning: estimate: {figures['doubts'][0]}" in capfd.readouterr().err
     assert "numbered from 1" in evaluate_poses(given[1], given[3], "sim3")["doubts"][0]
 
 

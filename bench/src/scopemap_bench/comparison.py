@@ -22,9 +22,10 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.mesh_files import read_mesh
 from scopemap.engine.geometry.se3 import inverse, se3, transform
 from scopemap.engine.masking.masker import Masker
+from scopemap.evaluation.doubts import doubts
 from scopemap.evaluation.poses import match
 from scopemap.input.sequence import Sequence as Frames
-from scopemap.input.trajectory.trajectory import Unit
+from scopemap.input.trajectory.trajectory import Trajectory, Unit
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.reference import read_reference, reference_trajectory
 from scopemap.result.result import Result
@@ -285,17 +286,28 @@ def _scored(path: Path, name: str, truth: Path, protocol: ProtocolPlan, unit: Un
     if not path.exists():
         raise InputError(f"comparing {path}: no such file or folder")
     result = RunResult(truth.stem if truth.is_file() else truth.resolve().name, name, timing=_timing(path))
-    facts = {"input": str(path)}
     frames = _frames(path, truth)
     if frames is not None:
         usual = default_protocol(frames).depth_range_mm
         figures = score(path, frames, protocol.model_copy(update={"depth_range_mm": usual}))
+        facts = {"input": str(path), "doubts": _doubts(read_trajectory(path), reference_trajectory(frames), protocol)}
         return FinishedRun(replace(result, figures=figures, facts=facts), path, lambda: frames)
     estimate, reference = read_trajectory(path, unit=unit), read_reference(truth, unit=unit)
     if reference is None:
         raise InputError(f"comparing {path}: {truth} has no true poses")
     figures = pose_groups(estimate, reference, protocol, protocol.align)[0]
-    return FinishedRun(replace(result, figures=figures, facts=facts | {"convention": estimate.source}), path)
+    facts = {"input": str(path), "convention": estimate.source, "doubts": _doubts(estimate, reference, protocol)}
+    return FinishedRun(replace(result, figures=figures, facts=facts), path)
+
+
+def _doubts(estimate: Trajectory, reference: Trajectory | None, protocol: ProtocolPlan) -> list[str]:
+    """Return in sentences how else the trajectories could be read; [] where they cannot be aligned."""
+    if reference is None:
+        return []
+    try:
+        return doubts(estimate, reference, match(estimate, reference, protocol.align))
+    except AlignmentError:
+        return []
 
 
 def _frames(path: Path, truth: Path) -> Frames | None:

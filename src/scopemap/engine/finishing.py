@@ -54,13 +54,13 @@ class SegmentSurface:
 
     mesh : world mm, may be empty; its vertices have `confidence`, the share `moving` of frames in which they move, and
     the standard deviation `sigma_mm`. settings : with the TSDF parameters that were used. agreement : figures of
-    `surface_agreement`. is_confirmed : whether depth was measured or keyframes were adjusted.
+    `surface_agreement`. is_checked : whether depth was measured, or an adjustment was tried: notices say what it found.
     """
 
     mesh: trimesh.Trimesh
     settings: FusionSettings
     agreement: dict[str, float]
-    is_confirmed: bool
+    is_checked: bool
     notices: list[Notice]
 
 
@@ -137,15 +137,15 @@ class SegmentFinishing:
     def check(self, fused: FusedSurface, adjusted: list[Notice]) -> SegmentSurface:
         """Return the finished surface with its agreement with some frames, and what there is to say about it.
 
-        adjusted : what is known of the adjustment of its keyframes; [] where they are as tracked.
+        adjusted : what is known of the adjustment of its keyframes, kept or refused; [] where none was tried.
         """
         mesh = fused.mesh
         views = surface_views(mesh, self._checked.frames(self._fusion.store))
         agreement = surface_agreement(views, fused.settings)
         mesh.vertex_attributes["sigma_mm"] = vertex_sigmas(len(mesh.vertices), views)
-        confirmed = bool(adjusted) or self._estimators.anchor.is_measured
+        is_checked = bool(adjusted) or self._estimators.anchor.is_measured
         notices = adjusted + self._fusion_notices(fused)
-        return SegmentSurface(with_normals_alone(mesh), fused.settings, agreement, confirmed, notices)
+        return SegmentSurface(with_normals_alone(mesh), fused.settings, agreement, is_checked, notices)
 
     def _fusion_notices(self, fused: FusedSurface) -> list[Notice]:
         """Return what depth and surface rest on, and what is not in the surface."""

@@ -56,13 +56,13 @@ class Limits:
         )
 
 
-def motion_notices(frames: FrameTable, config: Config, *, confirmed: bool) -> list[Notice]:
+def motion_notices(frames: FrameTable, config: Config, *, checked: bool) -> list[Notice]:
     """Return whether no view confirms path and depth, or the camera was stated to be at rest, and where tissue moves.
 
-    confirmed : whether depth was measured, or keyframes were adjusted.
+    checked : whether depth was measured, or an adjustment was tried.
     """
     at_rest = [Notice("camera-at-rest-stated")] if config.tracking.camera_at_rest else []
-    found = at_rest or ([] if confirmed else [Notice("mapping-none")])
+    found = at_rest or ([] if checked else [Notice("mapping-none")])
     measured = frames.only(frames.tracked & (frames["moving_share"] >= 0))
     moving = int((measured["moving_share"] > _MOVING_SHARE).sum())
     if not moving:

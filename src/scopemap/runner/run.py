@@ -262,7 +262,7 @@ class _Finishing:
         )
         main = main_segment(segments)
         surface = surfaces[main]
-        moving = motion_notices(frames, config, confirmed=surface.is_confirmed)
+        moving = motion_notices(frames, config, checked=surface.is_checked)
         provenance = provenance_of(sequence, pipeline.estimators, self.run.clock.seconds, frames)
         provenance["notices"] += facts_of_notices(self.notices + moving + surface.notices)
         provenance["surface"] = surface.agreement

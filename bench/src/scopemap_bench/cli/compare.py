@@ -75,6 +75,9 @@ def compare(
     if out is not None and finished:
         names_shown = [f"{run.result.method}, {run.result.sequence}" for run in finished]
         files.append(write_comparison([run.folder for run in finished], names_shown, out / PAGE))
+    for result in () if quiet else results:
+        for sentence in result.facts.get("doubts", ()):
+            typer.echo(f"warning: {result.method}: {sentence}", err=True)
     if as_json:
         print_json([asdict(result) for result in results])
     elif not quiet:
