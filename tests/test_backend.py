@@ -102,8 +102,8 @@ def test_an_error_with_a_keyframe_is_raised_at_a_later_call(monkeypatch: pytest.
         mapper.adjust()
 
 
-def _tracked(keyframe: int, x_mm: float, segment: int = 0) -> TrackedPose:
-    return TrackedPose(0, keyframe, se3_exp(np.array([0, 0, 0, x_mm, 0, 0])), segment)
+def _tracked(keyframe: int, x_mm: float, lost_before: int = 0) -> TrackedPose:
+    return TrackedPose(0, keyframe, se3_exp(np.array([0, 0, 0, x_mm, 0, 0])), lost_before)
 
 
 def test_corrections_are_interpolated_by_the_camera_motion() -> None:

@@ -31,13 +31,13 @@ class TrackedPose(NamedTuple):
     """A frame's pose as tracked.
 
     map : number of its map. keyframe : number of the frame that it was aligned to. T_world_camera : (4, 4), in that
-    map's world. segment : the same number for all frames between which the camera was not lost.
+    map's world. lost_before : how many frames were lost before it: the same between two losses.
     """
 
     map: int
     keyframe: int
     T_world_camera: np.ndarray
-    segment: int = 0
+    lost_before: int = 0
 
 
 class KeyframeStep(NamedTuple):
@@ -239,8 +239,8 @@ class FrameCorrection:
         return float(np.hypot(rotation_angle_rad(T[:3, :3]), np.linalg.norm(T[:3, 3]) / self.depth_mm))
 
     def _lost_between(self, one: int, other: int) -> bool:
-        segments = {self.tracked[frame].segment for frame in (one, other) if frame in self.tracked}
-        return len(segments) > 1
+        losses = {self.tracked[frame].lost_before for frame in (one, other) if frame in self.tracked}
+        return len(losses) > 1
 
     def _reference(self, index: int) -> int | None:
         """Place in `index` of the keyframe that a frame was aligned to; None where that is unknown."""

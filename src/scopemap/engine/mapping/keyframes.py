@@ -77,10 +77,10 @@ class Keyframes:
 
     def split(self, relocalised: Collection[tuple[Part, Part]]) -> dict[Part, int]:
         """Return the map of each part of the maps, as `split_maps` does; {} where each map is one part."""
-        parts = list(dict.fromkeys((pose.map, pose.segment) for pose in self.poses))
+        parts = list(dict.fromkeys((pose.map, pose.lost_before) for pose in self.poses))
         if len(parts) == len({number for number, _ in parts}):
             return {}
-        part_of = np.array([parts.index((pose.map, pose.segment)) for pose in self.poses])
+        part_of = np.array([parts.index((pose.map, pose.lost_before)) for pose in self.poses])
         points, observations = self.tracks.collected(across=part_of)
         T = np.stack([pose.T_world_camera for pose in self.poses])
         problem = BundleProblem(inverse(T), points, observations, Priors(), np.zeros((0, 2), int), self.camera.fx)

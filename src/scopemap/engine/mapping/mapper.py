@@ -38,7 +38,7 @@ _TRACKED = np.dtype(
         ("map", np.int64),
         ("keyframe", np.int64),
         ("T_world_camera", np.float64, (4, 4)),
-        ("segment", np.int64),
+        ("lost_before", np.int64),
     ]
 )
 """Number of a frame, and its `TrackedPose`."""
@@ -136,7 +136,7 @@ class Backend:
         self.settle()
         maps = {} if self._camera is None else self._collected(self._camera).split(relocalised)
         if maps:
-            self._tracked = [pose._replace(map=maps[pose.map, pose.segment]) for pose in self._tracked]
+            self._tracked = [pose._replace(map=maps[pose.map, pose.lost_before]) for pose in self._tracked]
         return maps
 
     def settle(self) -> None:
@@ -239,7 +239,7 @@ class Mapper:
         self._rows.append(np.array([(track.index, *part)], _TRACKED))
         self._read = None
         if track.relocalised and (found_in := self._poses().get(track.keyframe)) is not None:
-            self._relocalised.add(((part.map, part.segment), (found_in.map, found_in.segment)))
+            self._relocalised.add(((part.map, part.lost_before), (found_in.map, found_in.lost_before)))
 
     @property
     def adjusts(self) -> bool:
@@ -265,10 +265,10 @@ class Mapper:
 
         self._changed |= {index: joined(pose) for index, pose in poses.items() if pose.map == own}
 
-        def part(number: int, segment: int) -> Part:
-            return (earlier.map if number == own else number), segment
+        def part(number: int, lost_before: int) -> Part:
+            return (earlier.map if number == own else number), lost_before
 
-        pairs = [((earlier.map, earlier.segment), (own, after.segment)), *self._relocalised]
+        pairs = [((earlier.map, earlier.lost_before), (own, after.lost_before)), *self._relocalised]
         self._relocalised = {(part(*one), part(*other)) for one, other in pairs}
         if self._backend is not None:
             self._backend.replace_tracked(joined)
@@ -344,7 +344,7 @@ class Mapper:
         def number(pose: TrackedPose) -> int:
             # A part without a keyframe is in the map that it was aligned to.
             aligned_to = self._tracked.get(pose.keyframe, pose)
-            return maps.get((pose.map, pose.segment), maps.get((aligned_to.map, aligned_to.segment), pose.map))
+            return maps.get((pose.map, pose.lost_before), maps.get((aligned_to.map, aligned_to.lost_before), pose.map))
 
         before = {pose.map for pose in self._tracked.values()}
         self._tracked = {index: pose._replace(map=number(pose)) for index, pose in self._tracked.items()}
@@ -383,10 +383,10 @@ class Mapper:
         """Return the poses of all tracked frames by their numbers; after the last frame they are read once."""
         if self._read is None:
             found = self._rows.read()
-            numbers = (found[name].tolist() for name in ("index", "map", "keyframe", "segment"))
+            numbers = (found[name].tolist() for name in ("index", "map", "keyframe", "lost_before"))
             self._read = {
-                index: TrackedPose(number, keyframe, T, segment)
-                for index, number, keyframe, segment, T in zip(*numbers, found["T_world_camera"], strict=True)
+                index: TrackedPose(number, keyframe, T, lost_before)
+                for index, number, keyframe, lost_before, T in zip(*numbers, found["T_world_camera"], strict=True)
             }
         return self._read | self._changed
 

@@ -66,7 +66,7 @@ _MAX_LOG_SCALE = 1.0  # by hand: between maps of one video
 _MIN_COMMON = 20
 
 Part = tuple[int, int]
-"""A part of a map between two losses: number of the map, and segment as in `TrackedPose`."""
+"""A part of a map between two losses: number of the map, and `TrackedPose.lost_before`."""
 
 
 class PoseGraph(NamedTuple):
@@ -232,8 +232,8 @@ def split_maps(
     tracked : poses of the K keyframes. pairs : (N, 2) int, keyframes that observe the same point. relocalised : pairs
     of parts between which features found the camera again. The first part of a map keeps its number.
     """
-    parts = list(dict.fromkeys((pose.map, pose.segment) for pose in tracked))
-    part_of = np.array([parts.index((pose.map, pose.segment)) for pose in tracked], dtype=int)
+    parts = list(dict.fromkeys((pose.map, pose.lost_before) for pose in tracked))
+    part_of = np.array([parts.index((pose.map, pose.lost_before)) for pose in tracked], dtype=int)
     common = np.zeros((len(parts), len(parts)), int)
     np.add.at(common, tuple(part_of[pairs].T), 1)
     common += common.T
