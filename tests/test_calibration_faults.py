@@ -84,8 +84,7 @@ def test_bombs(bomb: str, tmp_path: Path) -> None:
     message = refused(tmp_path / "bomb")
     assert "bomb" in message
     named = {"entities": "entities", "brackets": "deep", "dashes": "deep"}
-    # Newer readers of YAML have a limit of their own: "maximum nesting depth".
-    assert named.get(bomb, "") in message or "nesting depth" in message
+    assert named.get(bomb, "") in message
 
 
 def test_a_large_file_is_not_read(tmp_path: Path) -> None:

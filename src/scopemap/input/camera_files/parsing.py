@@ -247,6 +247,8 @@ def _yaml(text: str) -> Any:
                 break  # a recorded topic repeats itself
         return next(yaml.load_all(text, Loader=_YamlLoader), None)
     except yaml.YAMLError as error:
+        if "nesting" in str(getattr(error, "problem", "")):  # newer parsers have a limit of their own
+            raise ValueError("it is nested deeper than any calibration") from None
         mark = getattr(error, "problem_mark", None)
         where = f": line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         raise ValueError(f"it is no YAML that can be read{where}") from None
