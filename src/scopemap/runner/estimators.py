@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scopemap.engine.config import Config
+from scopemap.engine.config import PRESETS, Config
 from scopemap.engine.depth import perceptual
 from scopemap.engine.depth.anchor import max_depth_mm
 from scopemap.engine.depth.estimate import DepthEstimator
@@ -45,9 +45,8 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
     if config.networks.device != "auto":
         device.choose_device(config.networks.device)  # also where no network would run there
     own = own or CustomEstimators()
-    if own == CustomEstimators() and len(lacking := missing_weights(config)) > 1:
-        pulls = " && ".join(f"scopemap models pull {name}" for name in lacking)
-        raise WeightsError(f"weights are missing: {pulls}; `scopemap models list` says where they are looked for")
+    if own == CustomEstimators():
+        _need_weights(config)
     networks, folder = config.networks, files_folder(config.depth)
     in_input = folder is not None and folder.resolve() == sequence.path.resolve()
     depth = own.depth or create_depth(
@@ -76,6 +75,21 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
         tracker,
     )
+
+
+def _need_weights(config: Config) -> None:
+    """Raise `WeightsError` where several weights are missing, or those of an anchor that only the preset asks for."""
+    lacking, preset = missing_weights(config), PRESETS[config.preset]
+    anchor, backend = config.depth.anchor, config.depth.backend
+    # With another depth than its own the preset's anchor is easily overlooked.
+    of_preset = anchor == "depth-pro" == preset.get("depth.anchor") and backend != preset["depth.backend"]
+    replaceable = of_preset and backend != "depth-pro" and (config.depth.anchor_model or "depth-pro") in lacking
+    if len(lacking) < 2 and not replaceable:
+        return
+    pulls = " && ".join(f"scopemap models pull {name}" for name in lacking)
+    fault = f"weights are missing: {pulls}; `scopemap models list` says where they are looked for"
+    advice = f"; --set depth.anchor=auto does without depth-pro, the metric anchor of the preset {config.preset}"
+    raise WeightsError(fault + advice if replaceable else fault)
 
 
 def _files_of(sequence: Sequence) -> FilesOfInput:
