@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from scopemap import Config, open_sequence, reconstruct
+from scopemap import Config, ScopemapError, open_sequence, reconstruct
 from scopemap_bench import PhantomSpec, write_phantom
 
 
@@ -25,10 +25,13 @@ def main(source: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "result"))
-    else:
-        with tempfile.TemporaryDirectory() as temporary:
-            phantom = Path(temporary) / "phantom"
-            write_phantom(PhantomSpec(frames=8, width=160, height=128), phantom)
-            main(phantom, Path(temporary) / "run")
+    try:
+        if len(sys.argv) > 1:
+            main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "result"))
+        else:
+            with tempfile.TemporaryDirectory() as temporary:
+                phantom = Path(temporary) / "phantom"
+                write_phantom(PhantomSpec(frames=8, width=160, height=128), phantom)
+                main(phantom, Path(temporary) / "run")
+    except ScopemapError as error:
+        sys.exit(str(error))

@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from scopemap import evaluate_poses, open_sequence, read_trajectory, reconstruct
+from scopemap import ScopemapError, evaluate_poses, open_sequence, read_trajectory, reconstruct
 from scopemap_bench import PhantomSpec, write_phantom
 
 
@@ -27,11 +27,14 @@ def main(run: Path, truth: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:
-        main(Path(sys.argv[1]), Path(sys.argv[2]))
-    else:
-        with tempfile.TemporaryDirectory() as temporary:
-            phantom, run = Path(temporary) / "phantom", Path(temporary) / "run"
-            write_phantom(PhantomSpec(frames=8, width=160, height=128), phantom)
-            reconstruct(open_sequence(phantom), out=run)
-            main(run, phantom)
+    try:
+        if len(sys.argv) == 3:
+            main(Path(sys.argv[1]), Path(sys.argv[2]))
+        else:
+            with tempfile.TemporaryDirectory() as temporary:
+                phantom, run = Path(temporary) / "phantom", Path(temporary) / "run"
+                write_phantom(PhantomSpec(frames=8, width=160, height=128), phantom)
+                reconstruct(open_sequence(phantom), out=run)
+                main(run, phantom)
+    except ScopemapError as error:
+        sys.exit(str(error))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap import Config, open_sequence, reconstruct
+from scopemap import Config, ScopemapError, open_sequence, reconstruct
 from scopemap_bench import PhantomSpec, write_phantom
 
 
@@ -36,11 +36,14 @@ def main(frames: Path, depth: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:
-        main(Path(sys.argv[1]), Path(sys.argv[2]))
-    else:
-        with tempfile.TemporaryDirectory() as temporary:
-            phantom, depth = Path(temporary) / "phantom", Path(temporary) / "depth"
-            write_phantom(PhantomSpec(frames=8, width=160, height=128), phantom)
-            write_depth(phantom, depth)
-            main(phantom, depth)
+    try:
+        if len(sys.argv) == 3:
+            main(Path(sys.argv[1]), Path(sys.argv[2]))
+        else:
+            with tempfile.TemporaryDirectory() as temporary:
+                phantom, depth = Path(temporary) / "phantom", Path(temporary) / "depth"
+                write_phantom(PhantomSpec(frames=8, width=160, height=128), phantom)
+                write_depth(phantom, depth)
+                main(phantom, depth)
+    except ScopemapError as error:
+        sys.exit(str(error))

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap import Result, open_sequence, reconstruct
+from scopemap import Result, ScopemapError, open_sequence, reconstruct
 from scopemap_bench import PhantomSpec, write_phantom
 
 
@@ -39,10 +39,13 @@ def main(result: Result, video: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:
-        main(Result(sys.argv[1]), Path(sys.argv[2]))
-    else:
-        with tempfile.TemporaryDirectory() as temporary:
-            phantom, run = Path(temporary) / "phantom", Path(temporary) / "run"
-            write_phantom(PhantomSpec(frames=16, width=160, height=128), phantom)
-            main(reconstruct(open_sequence(phantom, frames=":12"), out=run), phantom)
+    try:
+        if len(sys.argv) == 3:
+            main(Result(sys.argv[1]), Path(sys.argv[2]))
+        else:
+            with tempfile.TemporaryDirectory() as temporary:
+                phantom, run = Path(temporary) / "phantom", Path(temporary) / "run"
+                write_phantom(PhantomSpec(frames=16, width=160, height=128), phantom)
+                main(reconstruct(open_sequence(phantom, frames=":12"), out=run), phantom)
+    except ScopemapError as error:
+        sys.exit(str(error))

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap import Config, Frame, open_sequence
+from scopemap import Config, Frame, ScopemapError, open_sequence
 from scopemap.engine.depth.mapis import FILTER_SIGMA_MM
 from scopemap.engine.depth.pseudo_stereo import AffineDisparity, fit_baseline_lbfgsb
 from scopemap.engine.estimators import Estimators
@@ -141,10 +141,13 @@ def main(source: Path, settings: dict[str, object]) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        main(Path(sys.argv[1]), {})
-    else:
-        with tempfile.TemporaryDirectory() as temporary:
-            phantom = Path(temporary) / "phantom"
-            write_phantom(PhantomSpec(frames=6, width=160, height=128), phantom)
-            main(phantom, stand_ins(phantom, Path(temporary) / "disparity"))
+    try:
+        if len(sys.argv) > 1:
+            main(Path(sys.argv[1]), {})
+        else:
+            with tempfile.TemporaryDirectory() as temporary:
+                phantom = Path(temporary) / "phantom"
+                write_phantom(PhantomSpec(frames=6, width=160, height=128), phantom)
+                main(phantom, stand_ins(phantom, Path(temporary) / "disparity"))
+    except ScopemapError as error:
+        sys.exit(str(error))

@@ -84,7 +84,7 @@ def saved(pair: tuple[Any, Any], folder: Path) -> Path:
 
 
 def write_weights(folder: Path) -> Path:
-    """Write weights for every network of the preset "paper"; `use_weights` lets them be found.
+    """Write weights for every network of the presets "paper" and "paper-strict"; `use_weights` lets them be found.
 
     Disparity is 1 +- some tenths, metric depth some 25 mm: a scene of which something is known.
     """
@@ -95,7 +95,8 @@ def write_weights(folder: Path) -> Path:
     with torch.no_grad():
         anything[0].head.conv3.weight.mul_(1e7)
         pro[0].head.layers[-2].weight.mul_(0.02)
-    saved(anything, folder / "depth-anything")
+    for place in ("depth-anything", "LiheYoung--depth-anything-small-hf"):
+        saved(anything, folder / place)
     saved(pro, folder / "depth-pro")
     torch.manual_seed(9)
     torch.save(raft_large().state_dict(), folder / REGISTRY["raft-large"].place)

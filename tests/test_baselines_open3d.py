@@ -150,5 +150,7 @@ def test_without_open3d_the_error_says_what_to_install(monkeypatch: pytest.Monke
         raise OSError(f"libusb-1.0.so.0: cannot open shared object file ({name})")
 
     monkeypatch.setattr(baselines.importlib, "import_module", missing)
-    with pytest.raises(SettingsError, match=r"libusb-1\.0\.so\.0.*pip install -e '\./bench\[baselines\]'.*libgl1"):
+    with pytest.raises(
+        SettingsError, match=r"libusb-1\.0\.so\.0.*pip install -c constraints\.txt -e '\./bench\[baselines\]'.*libgl1"
+    ):
         Open3dTracker("park")

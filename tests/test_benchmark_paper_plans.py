@@ -28,7 +28,7 @@ from scopemap_bench.result import RunResult
 from scopemap_bench.runner import run_entry, run_plan
 from scopemap_bench.tables import published_rows
 
-OURS = ("scopemap", "scopemap, paper's depth", "paper's preset", "MDE (per-frame Depth Pro)")
+OURS = ("scopemap", "scopemap, paper's depth", "paper's preset", "paper's preset, strict", "MDE (per-frame Depth Pro)")
 BASELINES = ("EDAM", "Park", "SB", "Po2Pl", "Po2Po")
 # Open3D is an extra: without it these rows say so, and the plan goes on.
 WITHOUT_OPEN3D = {f"{name}{depth}" for name in BASELINES[1:] for depth in ("", ", paper's depth")}
@@ -186,7 +186,7 @@ def test_the_row_without_the_blend_is_the_depth_of_the_baseline(
     methods = [m.model_copy(update={"settings": {"networks.flow": "dis"} | m.settings}) for m in plan.method]
     rows, _ = run(plan.model_copy(update={"method": tuple(methods)}), data / "hamlyn", tmp_path, monkeypatch)
     found = {row.method: row for row in rows}
-    assert [*found] == ["scopemap", "paper's preset", "MDE (per-frame Depth Pro)", "without the blend"]
+    assert [*found] == ["scopemap", *OURS[2:], "without the blend"]
     assert {row.status for row in rows} == {"done"}
     blended, plain = (found[name] for name in ("paper's preset", "without the blend"))
     assert blended.facts["depth"] == plain.facts["depth"] == PAPERS_DEPTH
@@ -207,12 +207,13 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
 ) -> None:
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path))
     monkeypatch.setattr(runner, "measured_pace", lambda: Pace(once_s=30.0, ratio=2.0))
+    monkeypatch.setattr("scopemap_bench.methods.method.find_spec", lambda name: name)  # as if Open3D were installed
     refused = tmp_path / REGISTRY["raft-large"].place
     refused.write_bytes(b"half a download")
     assert call("bench", "scared", "--data", data / "scared", "--dry-run") == 0
     lines = capfd.readouterr().out.splitlines()
     assert lines[:3] == [
-        "SCARED: 2 sequences, 6 frames, 18 methods",
+        "SCARED: 2 sequences, 6 frames, 19 methods",
         "  dataset_1/keyframe_1: 3 frames",
         "  dataset_2/keyframe_3: 3 frames",
     ]
@@ -225,8 +226,13 @@ def test_a_dry_run_lists_rows_missing_weights_and_hours(
     )
     assert rows["paper's preset"].startswith("needs weights: depth-anything, depth-pro, raft-large (damaged), alexnet")
     assert rows["OneSLAM"].count(" min; not supplied: ") == 1
-    assert "weights that are missing or damaged: alexnet, depth-anything, depth-pro, raft-large (damaged)" in lines
-    assert lines[-1].startswith("36 runs: 0 done, 21 missing, 15 to run in about ")
+    strict = "LiheYoung/depth-anything-small-hf"
+    assert rows["paper's preset, strict"].startswith(
+        f"needs weights: {strict}, depth-pro, raft-large (damaged), alexnet"
+    )
+    lacking = f"{strict}, alexnet, depth-anything, depth-pro, raft-large (damaged)"
+    assert f"weights that are missing or damaged: {lacking}" in lines
+    assert lines[-1].startswith("38 runs: 0 done, 23 missing, 15 to run in about ")
     assert "on this machine's processors, with what is missing " in lines[-1]
     assert list(tmp_path.iterdir()) == [refused]
     copy = Path(shutil.copytree(data / "scared", tmp_path / "scared"))

@@ -153,6 +153,21 @@ def test_plans_that_come_along_name_methods_that_exist(name: str, tmp_path: Path
         read_plan(tmp_path / "none.toml")
 
 
+@pytest.mark.parametrize("name", shipped_plans())
+def test_where_the_papers_preset_is_a_method_its_text_alone_is_one_too(name: str) -> None:
+    """Ablations change the preset; RAFT small is the same method on a machine without a GPU."""
+    own: dict[str | None, list[dict[str, object]]] = {"paper": [], "paper-strict": []}
+    for method in read_plan(name).method:
+        if (
+            method.use == "scopemap"
+            and method.preset in own
+            and method.settings in ({}, {"networks.flow": "raft-small"})
+        ):
+            own[method.preset].append(method.settings)
+    assert own["paper"] == own["paper-strict"]
+    assert bool(own["paper"]) == any(method.preset == "paper" for method in read_plan(name).method)
+
+
 def test_two_sequences_of_one_name_or_an_unknown_method_are_refused_before_anything_runs(tmp_path: Path) -> None:
     (tmp_path / "clips" / "c1").mkdir(parents=True)
     twice = SMALL.replace("[[method]]", '[[sequence]]\npath = "clips/c1"\n\n[[method]]', 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,28 @@ def test_no_table_is_made_of_code_that_is_not_committed_or_by_a_command_that_fai
     with pytest.raises(SystemExit, match="commit first"):
         record.make(["printed"], project)
     assert not record.RESULTS.exists()
+
+
+@pytest.mark.parametrize("name", [name for name, (command, _) in record.TABLES.items() if record.PLAN in command])
+def test_no_table_is_made_of_a_plan_whose_rows_lack_packages_weights_or_sequences(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of these would be rows without figures, and nothing in the table's file would fail."""
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", "")  # which is restored
+    monkeypatch.setattr(record, "git", lambda *arguments: "")
+    monkeypatch.setattr(record, "record", lambda *arguments: pytest.fail("a table was made"))
+    for package in ("open3d", "torch", "lpips"):  # a module of None cannot be found
+        monkeypatch.setitem(sys.modules, package, None)
+    # A folder is enough where a row lacks what its sequence does not tell.
+    (tmp_path / "endoscopy/c3vd/cecum_t1_a").mkdir(parents=True)
+    with pytest.raises(SystemExit) as refused:
+        record.make([name], tmp_path)
+    said = str(refused.value)
+    assert said.startswith(f"record: the table {name} would have rows without figures: ")
+    assert "needs torch and lpips: pip install -c constraints.txt -e '.[networks]'; needs weights: " in said
+    assert ("needs Open3D: pip install -c constraints.txt -e './bench[baselines]'" in said) == (name == "methods")
+    with pytest.raises(SystemExit, match=f"the table {name} .*cecum_t1_a: nothing like that in {tmp_path / 'none'}"):
+        record.make([name], tmp_path / "none")
 
 
 def test_the_tables_are_thirteen_and_what_is_kept_is_theirs() -> None:

@@ -118,7 +118,7 @@ def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -
 
 
 def test_a_plan_needs_a_folder_and_its_data(tmp_path: Path) -> None:
-    assert "c3vd-rgbd: C3VD, ten clips, true depth, 8 methods" in run("bench").output
+    assert "c3vd-rgbd: C3VD, ten clips, true depth, 9 methods" in run("bench").output
     assert "--out" in run("bench", "scared", code=2).output
     error = run("bench", "scared", "--out", tmp_path / "out", "--data", tmp_path, code=1).exception
     assert isinstance(error, InputError)

@@ -20,6 +20,7 @@ from scopemap_bench.climb import figures as climb
 from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures, climb_score
 from scopemap_bench.trajectories.climb import read_climb_reference, read_submap, write_submap
 
+NAN = float("nan")
 QUARTER_TURN = Similarity(10.0, so3_exp(np.array([0, 0, np.pi / 2])), np.array([5.0, -3.0, 2.0]))
 
 
@@ -85,7 +86,12 @@ def test_a_case_worked_out_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (4.0, 2.0, 80.0, 1.5, (4.0 * 1.1 * 1.25, 2.0 * 1.1 * 1.25)),
         (8.0, 5.0, 60.0, 3.0, (8.0 * 1.2 * 1.5, 5.0 * 1.2 * 1.5)),
         (1.0, 1.0, 50.0, 0.5, (56.25, 45.0)),
-        (float("nan"), float("nan"), 0.0, 1.0, (56.25, 45.0)),
+        (NAN, NAN, 0.0, 1.0, (56.25, 45.0)),
+        # An ATE that is no number fails the clip; a rotation error counts 20 degrees, an unknown time the full W_t.
+        (NAN, 2.0, 100.0, 0.5, (56.25, 45.0)),
+        (float("inf"), 2.0, 100.0, 0.5, (56.25, 45.0)),
+        (4.0, NAN, 80.0, 0.5, (4.0 * 1.1, 20.0 * 1.1)),
+        (4.0, 2.0, 80.0, NAN, (4.0 * 1.1 * 1.5, 2.0 * 1.1 * 1.5)),
     ],
 )
 def test_the_scores_are_those_made_by_hand(
@@ -168,6 +174,23 @@ def test_submaps_count_with_enough_frames_that_are_their_own() -> None:
     assert climb_figures(lost, frames_of(true))["submaps"] == 0
 
 
+@pytest.mark.parametrize("entry", [(0, 0), (0, 3), (2, 2), (slice(None), slice(None))])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("whose", ["estimate", "reference"])
+def test_a_frame_whose_pose_is_not_finite_is_lost(
+    entry: tuple[int | slice, int | slice], value: float, whose: str
+) -> None:
+    true = path_of(LEAST_FRAMES + 20)
+    broken = frames_of(true.copy())
+    broken.T_world_camera[7][entry] = value
+    lost = replace(frames_of(true), status=np.where(np.arange(len(true)) == 7, "lost", "ok"))
+    pairs = [(one, frames_of(true)) if whose == "estimate" else (frames_of(true), one) for one in (broken, lost)]
+    found, expected = (climb_figures(*pair) for pair in pairs)
+    assert found == expected
+    assert np.isfinite(list(found.values())).all()
+    assert found["matched_poses"] == LEAST_FRAMES + 19
+
+
 # ---- files
 
 
@@ -214,7 +237,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         ("0,image.png,0,0,0,1,0,0,0", "'image.png' must begin"),
         ("0,1_v2.png,0,0,0,1,0,0,0", "'1_v2.png' must begin"),
         ("0,000002.png,a,0,0,1,0,0,0", "line 2: expected numbers"),
-        ("0,000002.png,0,0,0,nan,0,0,0", "line 2: the quaternion has length nan"),
+        ("0,000002.png,0,0,0,nan,0,0,0", "it holds no pose"),
         ("0,000002.png,0,0,0,1,1,0,0", "line 2: the quaternion has length 1.41"),
         ("0,000002.png,0,0,0,1,0,0,0\n1,2.png,0,0,0,1,0,0,0", "line 3: frame 2 is repeated"),
         ("0,000002.png,nan,0,0,1,0,0,0", "it holds no pose"),

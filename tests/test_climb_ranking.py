@@ -13,8 +13,11 @@ from drawn_inputs import picture
 from drawn_video_sets import write_frames
 from front_door import call
 
-from scopemap_bench.climb.ranking import ranking_of
+from scopemap_bench.climb.figures import ClimbScore
+from scopemap_bench.climb.ranking import ranked, ranking_of
 from scopemap_bench.climb.submission import submission_problems
+from scopemap_bench.result import RunResult
+from scopemap_bench.tables import benchmark_tables
 
 FRAMES = 300  # 6 s at 50 frames a second
 
@@ -59,6 +62,87 @@ def test_a_run_without_its_time_is_a_failed_one(truths: Path, tmp_path: Path) ->
     assert ranking_of(out, truths).failed == ("Seq_001_a", "Seq_002_a")
     (out / "Seq_000_a" / "3" / "runtime.txt").unlink()
     assert "Seq_000_a" in ranking_of(out, truths).failed
+
+
+@pytest.mark.parametrize("column", ["timestamp", "tx", "tz", "qw", "qz"])
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_a_number_that_is_none_costs_its_frame_and_no_more(
+    column: str, value: str, truths: Path, tmp_path: Path
+) -> None:
+    """In a run of 300 frames, one of which is lost where the pose is not known; the challenge reads no time stamp."""
+    out = tmp_path / "submission"
+    write_runs(out / "Seq_000_a", path_of(FRAMES, 0), [1.0] * 5)
+    whole = ranking_of(out, truths).clips["Seq_000_a"]
+    for number in "12345":
+        file = out / "Seq_000_a" / number / "camera_trajectory" / "cam_traj_map_000.txt"
+        head, *lines = file.read_text().splitlines()
+        fields = lines[100].split(", ")
+        fields[head.removeprefix("# ").split(", ").index(column)] = value
+        lines[100] = ", ".join(fields)
+        file.write_text("\n".join([head, *lines]) + "\n")
+    found = ranking_of(out, truths)
+    assert "Seq_000_a" not in found.failed
+    one, lost = found.clips["Seq_000_a"], 0 if column == "timestamp" else 1
+    # W_rtf of a frame that is lost; the others' mean error hardly changes.
+    assert one.ate == pytest.approx(whole.ate * (1 + 0.5 * lost / FRAMES), rel=5e-3)
+    assert one.rotation == pytest.approx(whole.rotation * (1 + 0.5 * lost / FRAMES), abs=1e-3)
+
+
+@pytest.mark.parametrize(("stamp", "weight"), [("0", 1.5), ("nan", 1.5), ("inf", 1.5), (None, 1.0)])
+def test_time_stamps_that_tell_no_interval_cost_the_whole_weight_of_the_time(
+    stamp: str | None, weight: float, truths: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "submission"
+    write_runs(out / "Seq_000_a", path_of(FRAMES, 0), [1.0] * 5)
+    whole = ranking_of(out, truths).clips["Seq_000_a"]
+    for file in out.rglob("cam_traj_map_000.txt") if stamp else []:
+        head, *lines = file.read_text().splitlines()
+        file.write_text("\n".join([head, *(", ".join([stamp, *line.split(", ")[1:]]) for line in lines)]) + "\n")
+    assert ranking_of(out, truths).clips["Seq_000_a"].ate == pytest.approx(weight * whole.ate)
+
+
+def test_a_first_map_of_one_pose_changes_no_score(truths: Path, tmp_path: Path) -> None:
+    true, out = path_of(FRAMES, 0), tmp_path / "submission"
+    for number in "12345":
+        run = write_foreign_run(out / "Seq_000_a" / number, (true[:1], [1]), (true, [*range(1, FRAMES + 1)]))
+        (run / "runtime.txt").write_text("init_seconds=0.5\nprocessing_seconds=3.0\n")
+    assert ranking_of(out, truths).clips["Seq_000_a"].ate == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("finals", "order"),
+    [
+        ({"a": (4.0, 1.0), "b": (3.0, 9.0)}, "ba"),
+        ({"a": (4.0, 3.0), "b": (4.2, 2.0)}, "ba"),  # exactly 5 %
+        ({"a": (4.0, 3.0), "b": (4.21, 2.0)}, "ab"),
+        # b ties with a and c, but c not with a: a's group is a and b.
+        ({"a": (4.0, 3.0), "b": (4.15, 2.0), "c": (4.3, 1.0)}, "bac"),
+        ({"c": (56.25, 45.0), "a": (0.0, 1.0), "b": (0.0, 0.5), "d": (56.25, 45.0)}, "bacd"),
+        ({}, ""),
+    ],
+)
+def test_scores_within_5_percent_are_ordered_by_rotation(finals: dict[str, tuple[float, float]], order: str) -> None:
+    assert "".join(ranked({name: ClimbScore(*scores) for name, scores in finals.items()})) == order
+
+
+def test_a_benchmark_ranks_its_methods_by_the_rule() -> None:
+    scores = {"first": [(4.0, 3.0), (4.0, 3.0)], "tied": [(4.1, 2.0), (4.2, 2.0)], "half": [(1.0, 1.0)], "untimed": []}
+    rows = []
+    for method, found in scores.items():
+        for clip in range(2):
+            named = dict(zip(("climb_score", "climb_rotation_score"), found[clip], strict=True)) if found[clip:] else {}
+            figures = {"climb": {"climb_ate_mean_mm": 2.0} | named}
+            status = "failed" if method == "half" and clip else "done"
+            rows.append(RunResult(f"clip {clip}", method, status=status, figures={} if status == "failed" else figures))
+    (table,) = (table for table in benchmark_tables(rows) if table.name == "climb-ranking")
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.markdown().splitlines()[2:5]]
+    # A failed clip is 56.25 and 45.
+    assert lines == [
+        ["1", "tied", "2 of 2", "4.150", "2.000"],
+        ["2", "first", "2 of 2", "4.000", "3.000"],
+        ["3", "half", "1 of 2", "28.625", "23.000"],
+    ]
+    assert "untimed" not in table.markdown()
 
 
 def test_the_command_scores(truths: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -116,6 +116,7 @@ BROKEN: list[tuple[Edit, str]] = [
     (_text(TRAJECTORY, "# no pose\n"), "it holds no pose"),
     (_also(TRAJECTORY, "0,000000.png,0,0,0,1,0,0,0\n"), "from 1"),
     (_also(TRAJECTORY, "0,000090.png,0,0,0,1,0,0\n"), "found 8 fields"),
+    (_also(TRAJECTORY, "0,000090.png,0,0,0,1,nan,0,0\n"), "line 14: a rotation is not finite"),
 ]
 
 

@@ -44,4 +44,6 @@ def test_a_video_that_colmap_makes_no_model_of_is_a_failed_row(tmp_path: Path) -
 
 def test_without_pycolmap_the_row_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap_bench.methods.colmap.find_spec", lambda name: None)
-    assert create_method(COLMAP, None).missing({}) == "needs pycolmap: pip install -e './bench[colmap]'"
+    assert (
+        create_method(COLMAP, None).missing({}) == "needs pycolmap: pip install -c constraints.txt -e './bench[colmap]'"
+    )

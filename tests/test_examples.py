@@ -24,7 +24,13 @@ PROMISED = {
 
 
 def _run(name: str, *arguments: object, weights: Path) -> str:
-    done = subprocess.run(
+    done = _ended(name, *arguments, weights=weights)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def _ended(name: str, *arguments: object, weights: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
         [sys.executable, str(EXAMPLES / name), *map(str, arguments)],
         env=os.environ | {"SCOPEMAP_WEIGHTS_DIR": str(weights), "HF_HUB_OFFLINE": "1"},
         capture_output=True,
@@ -32,8 +38,6 @@ def _run(name: str, *arguments: object, weights: Path) -> str:
         timeout=240,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def test_every_example_is_tested() -> None:
@@ -53,6 +57,19 @@ def test_examples_with_arguments(tmp_path: Path) -> None:
     assert "9 of 9 frames tracked" in _run("02_evaluate.py", run, phantom, weights=tmp_path / "none")
     # A run's own depth folder is depth from files, too.
     assert "9 files" in _run("03_depth_from_files.py", phantom, run / "depth", weights=tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", sorted(PROMISED))
+def test_an_example_that_cannot_go_on_ends_with_one_sentence(name: str, tmp_path: Path) -> None:
+    ended = _ended(name, tmp_path / "none", tmp_path / "none", weights=tmp_path)
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (1, "", 1), ended.stderr
+    assert str(tmp_path / "none") in ended.stderr
+
+
+def test_the_paper_without_weights_names_all_of_them_in_one_sentence(tmp_path: Path) -> None:
+    ended = _ended("05_the_paper_frame_by_frame.py", write_tiny(tmp_path / "phantom"), weights=tmp_path / "none")
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (1, "", 1), ended.stderr
+    assert ended.stderr.startswith("weights are missing: scopemap models pull LiheYoung/depth-anything-small-hf && ")
 
 
 def test_the_notebook_runs_and_is_kept_without_outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,7 +134,7 @@ def test_every_tenth_frame_is_compared_with_the_surface_of_the_others(
     assert figures["nearest_frame"]["coverage_mean"] > 0.8
     lacking = f"needs the weights alexnet or alexnet-features in {tmp_path}"
     if find_spec("torch") is None:
-        lacking = "LPIPS needs torch and torchvision and lpips: pip install -e '.[networks]'"
+        lacking = "LPIPS needs torch and torchvision and lpips: pip install -c constraints.txt -e '.[networks]'"
     assert figures["lpips"] == f"left out: {lacking}"
     rows = pd.read_csv(run_folder / "against_video" / "frames.csv")
     assert rows.loc[rows["fused"] == 0, "index"].tolist() == [5]

@@ -64,7 +64,7 @@ def test_what_needs_the_extra_names_it(
     with pytest.raises(SettingsError) as caught:
         ask()
     assert str(caught.value).startswith(fault)
-    assert str(caught.value).endswith(": pip install -e '.[networks]'")
+    assert str(caught.value).endswith(": pip install -c constraints.txt -e '.[networks]'")
 
 
 def test_a_run_needs_none_of_its_packages(tmp_path: Path) -> None:

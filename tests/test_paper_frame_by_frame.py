@@ -17,7 +17,7 @@ from scopemap.runner.estimators import create_estimators
 
 FILE = Path(__file__).resolve().parents[1] / "examples" / "05_the_paper_frame_by_frame.py"
 EQUATIONS = 13
-MOST_LINES = 150
+MOST_LINES = 155
 
 
 def page() -> ModuleType:

@@ -7,15 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from front_door import refused
 from tiny_phantom import FRAMES, with_true_depth, write_tiny
 
-from scopemap.engine.config import Config
+from scopemap.engine.config import PRESETS, Config
 from scopemap.engine.depth.anchor import max_depth_mm
 from scopemap.engine.depth.mapis import Mapis
-from scopemap.engine.errors import InputError
+from scopemap.engine.errors import InputError, WeightsError
 from scopemap.engine.pipeline import Pipeline
 from scopemap.input.opening import open_sequence
-from scopemap.runner.estimators import create_estimators
+from scopemap.runner.estimators import create_estimators, missing_weights
 from scopemap.runner.provenance import estimators_provenance
 from scopemap.runner.reconstruct import reconstruct
 
@@ -91,3 +92,42 @@ def test_frames_are_read_without_their_truth(folder: Path, monkeypatch: pytest.M
 def test_a_stated_farthest_tissue_is_believed() -> None:
     assert max_depth_mm(Config.load().depth) == 300.0
     assert max_depth_mm(Config.load(settings={"depth.near_far_mm": (50, 400)}).depth) == 400.0
+
+
+PAPER = [name for name, values in PRESETS.items() if "depth.anchor" in values]
+ONLY_DEPTH_PRO = {"networks.flow": "dis", "networks.perceptual": "structure"}
+
+
+@pytest.mark.parametrize("preset", PAPER)
+@pytest.mark.parametrize(
+    ("depth", "others"),
+    [
+        *((depth, others) for depth in ("scopenet", "shading", "files") for others in ({}, ONLY_DEPTH_PRO)),
+        *((depth, {}) for depth in ("depth-anything", "depth-pro")),
+    ],
+)
+def test_another_depth_than_the_presets_names_the_anchor_that_is_left(
+    preset: str, others: dict[str, str], depth: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path / "none"))
+    chosen = others | {"depth.backend": f"files:{folder}" if depth == "files" else depth}
+    config = Config.load(preset, settings=chosen)  # type: ignore[arg-type]
+    with pytest.raises(WeightsError) as caught:
+        create_estimators(config, open_sequence(folder))
+    error, advised = str(caught.value), depth not in ("depth-pro", PRESETS[preset]["depth.backend"])
+    assert ("--set depth.anchor=auto" in error) == advised
+    assert "scopemap models pull depth-pro" in error
+    assert others or "scopemap models pull raft-large && scopemap models pull alexnet" in error
+    if advised:
+        followed = Config.load(preset, settings=chosen | {"depth.anchor": "auto"})  # type: ignore[arg-type]
+        assert missing_weights(followed) == ([] if others else ["raft-large", "alexnet"])
+
+
+@pytest.mark.parametrize("preset", PAPER)
+def test_the_command_says_so_in_one_sentence(
+    preset: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", str(tmp_path / "none"))
+    words = ("run", folder, "--out", tmp_path / "out", "--quiet", "--preset", preset, "--depth", "scopenet")
+    error = refused(capfd, *words)
+    assert f"--set depth.anchor=auto does without depth-pro, the metric anchor of the preset {preset}\n" in error

@@ -20,8 +20,8 @@ class RunResult:
     """One row of a benchmark.
 
     sequence, method, seed : what was run; names as in the plan.
-    status : "failed" where the method died, "missing" without its weights or trajectory; `error` is the reason in a
-    line.
+    status : "failed" where the method died, "missing" without its packages, weights or trajectory; `error` is the
+    reason in a line.
     figures : by group: "poses" (`pose_report`), "paper" (`paper_figures`), "depth", "consistency", "surface", and named
     protocols; what could not be measured is absent, or NaN (null in the file).
     timing : "ms_per_frame", "track_ms_per_frame", "seconds_STAGE", "peak_memory_mb"; not the same in two runs.

@@ -32,7 +32,7 @@ from scopemap.input.sequence import Sequence
 from scopemap.runner.estimators import missing_weights
 from scopemap_bench.entry import Entry, entries_of, worker_command
 from scopemap_bench.forecast import measured_pace
-from scopemap_bench.methods.method import Method, PipelineMethod, create_method
+from scopemap_bench.methods.method import Method, PipelineMethod, create_method, what_networks_lack
 from scopemap_bench.plan import Plan, found_sequences, spec_of
 from scopemap_bench.result import FILE_NAME, RunResult
 from scopemap_bench.scoring import score
@@ -224,8 +224,8 @@ def what_is_missing(entry: Entry) -> str:
     """Return what an entry needs and this machine does not have, in one line; "" where it can run."""
     try:
         flows = [entry.protocol.flow] * entry.protocol.consistency
-        if names := missing_weights(Config(), *flows, verified=True):
-            return f"its measure needs weights: {', '.join(names)} (scopemap models pull NAME)"
+        if lacking := what_networks_lack(Config(), *flows):
+            return f"its measure {lacking}"
         return method_of(entry).missing(entry.shared_settings())
     except ScopemapError:  # the run reports it
         return ""

@@ -18,6 +18,8 @@ from typing import Any, Literal
 import pandas as pd
 
 from scopemap.engine.errors import InputError
+from scopemap_bench.climb.figures import ClimbScore, climb_score
+from scopemap_bench.climb.ranking import ranked
 from scopemap_bench.result import RunResult
 from scopemap_bench.table import SPREAD, Figure, Table, escape_markdown, joined, of_frames, summarise
 
@@ -26,6 +28,7 @@ PublishedTable = Literal["table1_pose_scared", "table2_methods_scared", "table3_
 _SECTIONS = {"tracking": "poses", "consistency": "consistency", "depth": "depth", "surface": "surface"}
 _OWN_GROUPS = {"paper", *_SECTIONS.values()}
 _JOINED = ("alignment", "path", "turn", "depth")
+_CLIMB_SCORES = ("climb.climb_score", "climb.climb_rotation_score")
 _FACTS = ("machine", "device", "commit", "versions", "truth")
 _UNITS = {"_mm": "mm", "_deg": "deg", "_rad": "rad", "_percent": "%", "_px": "px", "_s": "s"}
 
@@ -45,6 +48,7 @@ def benchmark_tables(results: Iterable[RunResult], *, paper_units: bool = False)
         *_paper_tables(short, paper_units),
         *(read_table(name, short).without_empty() for name, group in _SECTIONS.items() if group in groups),
         *(_protocol_table(group, short, results) for group in groups if group not in _OWN_GROUPS),
+        *_climb_ranking(rows),
         _times(short),
     )
 
@@ -160,6 +164,22 @@ def _protocol_table(group: str, rows: pd.DataFrame, results: Sequence[RunResult]
     caption += " Not to be compared with figures of another protocol. Over several seeds: median."
     texts = ("sequence", "figure", "unit", *dict.fromkeys(rows["method"]))
     return Table(f"protocol-{group}", f"Protocol {group}", caption, texts, (), table)
+
+
+def _climb_ranking(rows: pd.DataFrame) -> Iterator[Table]:
+    """Yield the order of the methods that have CLiMB's score on any clip; a clip without one counts as failed."""
+    ate, rotation = _CLIMB_SCORES
+    if ate not in rows:
+        return
+    scored = rows.groupby("method", sort=False)[ate].count()
+    failed = climb_score(math.nan, math.nan, 0.0, math.inf)
+    whole = rows.fillna({ate: failed.ate, rotation: failed.rotation})
+    means = whole.groupby("method", sort=False)[[ate, rotation]].mean()[scored > 0]
+    order = ranked({name: ClimbScore(*scores) for name, *scores in means.itertuples()})
+    clips = [f"{scored[name]} of {rows['sequence'].nunique()}" for name in order]
+    places = [str(place) for place in range(1, len(order) + 1)]
+    words = {"rank": places, "clips with a score": clips, "failure": "", "competes": False}
+    yield read_table("climb-ranking", means.loc[order].reset_index().assign(**words))
 
 
 def _times(rows: pd.DataFrame) -> Table:

@@ -8,19 +8,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scopemap.engine.config import Config
+from scopemap.engine.config import PRESETS, Config
+from scopemap.engine.depth import perceptual
 from scopemap.engine.depth.anchor import max_depth_mm
 from scopemap.engine.depth.estimate import DepthEstimator
-from scopemap.engine.depth.perceptual import CHECKPOINTS as PERCEPTUAL_CHECKPOINTS
-from scopemap.engine.depth.perceptual import create_perceptual
 from scopemap.engine.errors import WeightsError
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.flow.flows import create_flow
 from scopemap.engine.mapping.bundle_problem import TRACKED
 from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
-from scopemap.engine.models import weights
-from scopemap.engine.models.device import choose_device
+from scopemap.engine.models import device, weights
 from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.features import SiftFeatures
 from scopemap.input.mask_files import create_masks
@@ -45,11 +43,10 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
     own : replace those of the settings; a flow must then be safe in several threads.
     """
     if config.networks.device != "auto":
-        choose_device(config.networks.device)  # also where no network would run there
+        device.choose_device(config.networks.device)  # also where no network would run there
     own = own or CustomEstimators()
-    if own == CustomEstimators() and len(lacking := missing_weights(config)) > 1:
-        pulls = " && ".join(f"scopemap models pull {name}" for name in lacking)
-        raise WeightsError(f"weights are missing: {pulls}; `scopemap models list` says where they are looked for")
+    if own == CustomEstimators():
+        _need_weights(config)
     networks, folder = config.networks, files_folder(config.depth)
     in_input = folder is not None and folder.resolve() == sequence.path.resolve()
     depth = own.depth or create_depth(
@@ -73,11 +70,26 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         own.flow or create_flow(networks.flow, networks.device),
         corner_flow,
         own.flow or create_flow(networks.keyframe_flow, networks.device),
-        create_perceptual(networks.perceptual, networks.device),
+        perceptual.create_perceptual(networks.perceptual, networks.device),
         create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers),
         AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
         tracker,
     )
+
+
+def _need_weights(config: Config) -> None:
+    """Raise `WeightsError` where several weights are missing, or those of an anchor that only the preset asks for."""
+    lacking, preset = missing_weights(config), PRESETS[config.preset]
+    anchor, backend = config.depth.anchor, config.depth.backend
+    # With another depth than its own the preset's anchor is easily overlooked.
+    of_preset = anchor == "depth-pro" == preset.get("depth.anchor") and backend != preset["depth.backend"]
+    replaceable = of_preset and backend != "depth-pro" and (config.depth.anchor_model or "depth-pro") in lacking
+    if len(lacking) < 2 and not replaceable:
+        return
+    pulls = " && ".join(f"scopemap models pull {name}" for name in lacking)
+    fault = f"weights are missing: {pulls}; `scopemap models list` says where they are looked for"
+    advice = f"; --set depth.anchor=auto does without depth-pro, the metric anchor of the preset {config.preset}"
+    raise WeightsError(fault + advice if replaceable else fault)
 
 
 def _files_of(sequence: Sequence) -> FilesOfInput:
@@ -91,23 +103,46 @@ def missing_weights(config: Config, *other_flows: str, verified: bool = False) -
 
     other_flows : names of flows that are needed besides. verified : also "NAME (damaged)" where a hash is wrong.
     """
+    needed = [names for _, names in _networks(config, other_flows) if names]
+    if verified:
+        return [fault for names in needed if (fault := weights.fault(*names))]
+    return [names[0] for names in needed if not weights.is_present(*names)]
+
+
+def missing_packages(config: Config, *other_flows: str) -> str:
+    """Return "needs PACKAGES: COMMAND" for the packages that networks need and this machine does not have, or "".
+
+    other_flows : names of flows that are needed besides.
+    """
+    packages = dict.fromkeys(package for of_network, _ in _networks(config, other_flows) for package in of_network)
+    return device.missing_packages("", *packages)
+
+
+def _networks(config: Config, other_flows: tuple[str, ...]) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Return the packages of each network that the settings need, and its weights, of which any will do.
+
+    No weights are named where the settings name their folder.
+    """
     depth, networks = config.depth, config.networks
     models = {depth.backend: depth.model} if depth.backend in ("depth-anything", "depth-pro") else {}
     if depth.anchor == "depth-pro":
         models.setdefault("depth-pro", depth.anchor_model)
-    needed: list[tuple[str, ...]] = [
-        (model or name,) for name, model in models.items() if not (model and Path(model).is_dir())
-    ]
+    needed: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
+    if networks.device not in ("auto", "cpu"):
+        needed.append((("torch",), ()))
+    if models:
+        from scopemap.engine.depth.pretrained import PACKAGES
+
+        named = {name: () if model and Path(model).is_dir() else (model or name,) for name, model in models.items()}
+        needed += [(PACKAGES, names) for names in named.values()]
     flows = {networks.flow, networks.keyframe_flow, *other_flows}
     if flows & {"raft-small", "raft-large"}:
-        from scopemap.engine.flow.raft import CHECKPOINTS as RAFT_CHECKPOINTS
+        from scopemap.engine.flow import raft
 
-        needed += [names for size, names in RAFT_CHECKPOINTS.items() if f"raft-{size}" in flows]
+        needed += [(raft.PACKAGES, names) for size, names in raft.CHECKPOINTS.items() if f"raft-{size}" in flows]
     if networks.perceptual == "lpips":
-        needed.append(PERCEPTUAL_CHECKPOINTS)
-    if verified:
-        return [fault for names in needed if (fault := weights.fault(*names))]
-    return [names[0] for names in needed if not weights.is_present(*names)]
+        needed.append((perceptual.PACKAGES, perceptual.CHECKPOINTS))
+    return needed
 
 
 def largest_depth_mm(config: Config, estimators: Estimators) -> float:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from scopemap.engine.errors import InputError
 from scopemap.terminal.figures import print_json
 from scopemap.terminal.options import AsJson, Quiet
 
@@ -38,7 +40,7 @@ def bench(
     data: Annotated[Path | None, typer.Option(help="Folder that the plan's paths refer to.")] = None,
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="Only print sequences, rows, missing weights and expected hours."),
+        typer.Option("--dry-run", help="Only print sequences, rows, missing packages and weights, and expected hours."),
     ] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Run failed rows again.")] = False,
     timeout_s: Annotated[
@@ -64,7 +66,10 @@ def bench(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Run or resume a benchmark plan, or time the stages of a run."""
+    """Run or resume a benchmark plan, or time the stages of a run.
+
+    The exit code is 1 if no row of the plan is done.
+    """
     of_plans = {"--out": out, "--data": data, "--timeout": timeout_s}
     of_plans |= {"--dry-run": dry_run or None, "--retry": retry or None, "--paper-units": paper_units or None}
     of_speed = {"VIDEO": video, "--frames": frames, "--compare": compare, "--preset": preset, "--whole": whole or None}
@@ -107,6 +112,17 @@ def bench(
         print_json([asdict(result) for result in benchmark.results])
     elif not quiet:
         typer.echo(f"{len(files)} tables and figures in {out}; results.md holds the tables")
+    _need_a_row(benchmark.results)
+
+
+def _need_a_row(results: list[RunResult]) -> None:
+    """Raise `InputError`, with the reason of the first row, where no row is done: the tables hold no figure."""
+    if any(result.status == "done" for result in results):
+        return
+    counts = Counter(result.status for result in results)
+    found = " and ".join(f"{count} {status}" for status, count in counts.items())
+    first = results[0]
+    raise InputError(f"no row is done ({found}); the first, {first.sequence} by {first.method}: {first.error}")
 
 
 def _print_speed(

@@ -31,14 +31,14 @@ def climb_figures(estimate: Trajectory, reference: Trajectory) -> dict[str, floa
     """Return ATE, RPE, TFR and counts of the estimate and its other submaps; errors are NaN where no submap counts.
 
     A submap takes the reference frames that no earlier one has, and counts with at least `LEAST_FRAMES` of them. Errors
-    are means over the submaps, weighted by these frames. Raises `AlignmentError` for a submap that stands still or on a
-    line.
+    are means over the submaps, weighted by these frames. A frame whose pose is not finite is lost. Raises
+    `AlignmentError` for a submap that stands still or on a line.
     """
-    known = free = reference.rows(reference.tracked)
+    known = free = _with_pose(reference)
     errors: list[list[float]] = []
     matched: list[int] = []
     for submap in (estimate, *estimate.others):
-        own = submap.rows(submap.tracked)
+        own = _with_pose(submap)
         rows, rows_free = associate(own, free)
         if len(rows) < LEAST_FRAMES:
             continue
@@ -52,6 +52,10 @@ def climb_figures(estimate: Trajectory, reference: Trajectory) -> dict[str, floa
         "matched_poses": float(sum(matched)),
         "reference_poses": float(len(known)),
     }
+
+
+def _with_pose(trajectory: Trajectory) -> Trajectory:
+    return trajectory.rows(trajectory.tracked & np.isfinite(trajectory.T_world_camera).all(axis=(1, 2)))
 
 
 @dataclass(frozen=True)
@@ -69,13 +73,21 @@ def climb_score(ate_mean_mm: float, rpe_40_deg: float, tfr_percent: float, durat
     """Return the scores of a clip: ATE, and rotational RPE over 40 frames, times W_rtf W_t.
 
     duration_share : processing time over the clip's duration, T x fps. W_rtf = 1 + 0.5 (1 - RTF), RTF the TFR as a
-    fraction; W_t = 1 + 0.5 min(1, max(0, T fps - 1)). A clip with a TFR of 50 % or less, or without a valid map, enters
-    with ATE 25 mm, 20 degrees, RTF 0 and W_t 1.5. Source: README.md, "Final score and ranking".
+    fraction; W_t = 1 + 0.5 min(1, max(0, T fps - 1)). A failed clip enters with ATE 25 mm, 20 degrees, RTF 0 and W_t
+    1.5. A rotation error that was not measured (NaN) counts 20 degrees: 0, the challenge's code, would win each tie. A
+    share that is not known (NaN) counts W_t 1.5. Source: README.md, "Final score and ranking".
     """
-    if not tfr_percent > _LEAST_TFR_PERCENT:
+    if is_failed(ate_mean_mm, tfr_percent):
         ate_mean_mm, rpe_40_deg, tfr_percent, duration_share = _FAILED_MM, _FAILED_DEG, 0.0, np.inf
+    rpe_40_deg = rpe_40_deg if np.isfinite(rpe_40_deg) else _FAILED_DEG
+    duration_share = np.inf if np.isnan(duration_share) else duration_share
     weights = 1 + _MOST_ADDED * np.array([1 - tfr_percent / 100, np.clip(duration_share - 1, 0, 1)])
     return ClimbScore(float(ate_mean_mm * weights.prod()), float(rpe_40_deg * weights.prod()))
+
+
+def is_failed(ate_mean_mm: float, tfr_percent: float) -> bool:
+    """Return whether a clip counts as failed: its TFR is 50 % or less, or its ATE is no number."""
+    return not (tfr_percent > _LEAST_TFR_PERCENT and np.isfinite(ate_mean_mm))
 
 
 def _errors(estimated: np.ndarray, reference: np.ndarray, frames: np.ndarray) -> list[float]:

@@ -7,6 +7,7 @@ as failed, and is not left out. Source: EndoCartoScope/climb-challenge, README.m
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from scopemap.engine.errors import AlignmentError, InputError
-from scopemap_bench.climb.figures import ClimbScore, climb_figures, climb_score
+from scopemap_bench.climb.figures import ClimbScore, climb_figures, climb_score, is_failed
 from scopemap_bench.climb.submission import RUNS, with_score
 from scopemap_bench.trajectories.climb import read_climb, read_climb_reference
 
+_TIE = 1.05  # scores that differ by at most 5 % are ordered by rotation
 _FIGURES = ("ate_mean_mm", "rpe_40_mean_deg", "tfr_percent", "duration_share")
 
 
@@ -39,6 +41,20 @@ class Ranking:
         return ClimbScore(*(float(np.mean([getattr(one, name) for one in scores])) for name in ("ate", "rotation")))
 
 
+def ranked(finals: Mapping[str, ClimbScore]) -> list[str]:
+    """Return the names of methods from the best to the worst, by their final scores.
+
+    The best by ATE and all that are at most 5 % above it are ordered by rotation, then the best of the others and those
+    at most 5 % above that, and so on. The rule alone has no order where A ties with B, and B with C, but A not with C.
+    """
+    left, order = sorted(finals, key=lambda name: finals[name].ate), list[str]()
+    while left:
+        tied = [name for name in left if finals[name].ate <= _TIE * finals[left[0]].ate]
+        order += sorted(tied, key=lambda name: finals[name].rotation)
+        left = left[len(tied) :]
+    return order
+
+
 def ranking_of(submission: Path, references: Path) -> Ranking:
     """Return the scores of a submission against the references in a folder, CLIP/results_txt/images.txt.
 
@@ -48,7 +64,7 @@ def ranking_of(submission: Path, references: Path) -> Ranking:
     if not clips:
         raise InputError(f"scoring {submission}: no reference in {references} (CLIP/results_txt/images.txt)")
     found = {clip.name: _means_over_runs(submission / clip.name, clip) for clip in clips}
-    failed = tuple(name for name, (_, _, tfr_percent, _) in found.items() if not tfr_percent > 50)
+    failed = tuple(name for name, (ate_mm, _, tfr_percent, _) in found.items() if is_failed(ate_mm, tfr_percent))
     return Ranking({name: climb_score(*means) for name, means in found.items()}, failed)
 
 

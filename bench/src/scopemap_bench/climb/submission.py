@@ -26,7 +26,7 @@ from scopemap.input.video import VideoFile
 from scopemap.result.result import Result
 from scopemap.result.trajectory_folders import read_run, submap_folders
 from scopemap_bench.climb.figures import climb_score
-from scopemap_bench.trajectories.climb import read_submap, write_submap
+from scopemap_bench.trajectories.climb import read_submap, submap_rows, write_submap
 
 RUNS = ("1", "2", "3", "4", "5")
 RUNTIME_KEYS = ("init_seconds", "processing_seconds")
@@ -62,7 +62,8 @@ def with_score(figures: dict[str, float], run: Path, estimate: Trajectory, refer
     """Return the protocol's figures with "climb_score" and "climb_rotation_score", where the folder says how long its
     run took; "climb_duration_share" is that time over the clip's duration.
 
-    The clip is as long as the frames of both trajectories, at the intervals of the estimate's time stamps.
+    The clip is as long as the frames of both trajectories, at the intervals of the estimate's time stamps. Where these
+    tell no interval, the share is infinite, and W_t the largest: the challenge, which knows the clip, reads no stamps.
     """
     try:
         file = run / "runtime.txt"
@@ -70,8 +71,10 @@ def with_score(figures: dict[str, float], run: Path, estimate: Trajectory, refer
     except (InputError, LookupError, ValueError, TypeError, AttributeError):
         return figures
     frames = np.concatenate([one.indices for one in (estimate, *estimate.others, reference)])
-    frame_s = float(np.median(np.diff(estimate.times_s) / np.diff(estimate.indices)))
-    share = processing_s / ((np.ptp(frames) + 1) * frame_s)
+    timed = [one.rows(np.isfinite(one.times_s)) for one in (estimate, *estimate.others)]
+    steps_s = np.concatenate([np.diff(one.times_s) / np.diff(one.indices) for one in timed])
+    frame_s = float(np.median(steps_s)) if steps_s.size else 0.0
+    share = processing_s / ((np.ptp(frames) + 1) * frame_s) if frame_s > 0 else math.inf
     named = (figures["climb_ate_mean_mm"], figures["climb_rpe_40_mean_deg"], figures["climb_tfr_percent"])
     score = climb_score(*named, share)
     scores = {"climb_score": score.ate, "climb_rotation_score": score.rotation, "climb_duration_share": share}
@@ -169,7 +172,7 @@ def _run_problems(run: Path) -> Iterator[str]:
         if file in expected:
             yield f"{maps / name}: another map has this number"
         expected.add(file)
-        checks += [(_check_points, maps / name / "points3D.txt"), (read_submap, file)]
+        checks += [(_check_points, maps / name / "points3D.txt"), (_check_poses, file)]
     unpaired = sorted({*trajectories.glob("cam_traj_map_*")} - expected)
     yield from (f"{file}: no map in 3D_maps has this number of three digits" for file in unpaired)
     for check, file in checks:
@@ -189,6 +192,17 @@ def stated_s(file: Path) -> dict[str, float]:
             raise InputError(f"{file}: expected a line {key}=<seconds>")
         stated[key] = float(found[0].partition("=")[2])
     return stated
+
+
+def _check_poses(file: Path) -> None:
+    """Raise `InputError` for what `read_submap` refuses, and for a position without a rotation.
+
+    The challenge leaves out positions that are not finite, and averages rotations as they are.
+    """
+    read_submap(file)
+    for _, row, place in submap_rows(file):
+        if np.isfinite(row[1:4]).all() and not np.isfinite(row[4:]).all():
+            raise InputError(f"{place}: a rotation is not finite; leave out the row, or all rotation errors are NaN")
 
 
 def _check_points(file: Path) -> None:

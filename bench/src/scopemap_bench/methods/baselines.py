@@ -42,6 +42,11 @@ ICP_METHODS = {
     "point-to-plane": "TransformationEstimationPointToPlane",
 }
 """Open3D's classes by the name of the method."""
+OPEN3D_METHODS = (*RGBD_METHODS, *ICP_METHODS)
+INSTALL_OPEN3D = (
+    "pip install -c constraints.txt -e './bench[baselines]', and on Debian apt install libusb-1.0-0 libgl1 libx11-6 "
+    "libegl1"
+)
 
 SETTINGS = TrackingSettings(
     keyframe_every=2,
@@ -184,8 +189,7 @@ def load_open3d() -> Any:
         return importlib.import_module("open3d")
     except (ImportError, OSError) as error:
         raise SettingsError(
-            f"an odometry of Open3D cannot run: Open3D cannot be imported ({_last_line(str(error))}); pip install -e "
-            "'./bench[baselines]', and on Debian apt install libusb-1.0-0 libgl1 libx11-6 libegl1"
+            f"an odometry of Open3D cannot run: Open3D cannot be imported ({_last_line(str(error))}); {INSTALL_OPEN3D}"
         ) from None
 
 

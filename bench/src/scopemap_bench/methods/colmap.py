@@ -35,7 +35,7 @@ class Colmap:
 
     def missing(self, settings: Mapping[str, Any]) -> str:
         """Return what to install where pycolmap is not there."""
-        return "" if find_spec("pycolmap") else "needs pycolmap: pip install -e './bench[colmap]'"
+        return "" if find_spec("pycolmap") else "needs pycolmap: pip install -c constraints.txt -e './bench[colmap]'"
 
     def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
         """Write the trajectory as a run's folder, and return its times; `InputError` where no model was found."""

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,15 @@ from scopemap.engine.errors import SettingsError
 from scopemap.engine.odometry import Step
 from scopemap.engine.tracking.track import FrameTracker
 from scopemap.input.sequence import Sequence
-from scopemap.runner.estimators import missing_weights
+from scopemap.runner.estimators import missing_packages, missing_weights
 from scopemap.runner.reconstruct import reconstruct
-from scopemap_bench.methods.baselines import Open3dTracker, StandingStill, create_endo_depth_and_motion
+from scopemap_bench.methods.baselines import (
+    INSTALL_OPEN3D,
+    OPEN3D_METHODS,
+    Open3dTracker,
+    StandingStill,
+    create_endo_depth_and_motion,
+)
 from scopemap_bench.methods.colmap import Colmap
 from scopemap_bench.methods.imported import ImportedTrajectory
 from scopemap_bench.plan import MethodPlan
@@ -31,13 +38,20 @@ PLAIN = {
 
 BASELINES: dict[str, Callable[[], FrameTracker]] = {
     "endo-depth-and-motion": create_endo_depth_and_motion,
-    "steinbruecker": partial(Open3dTracker, "steinbruecker"),
-    "park": partial(Open3dTracker, "park"),
-    "point-to-point": partial(Open3dTracker, "point-to-point"),
-    "point-to-plane": partial(Open3dTracker, "point-to-plane"),
+    **{name: partial(Open3dTracker, name) for name in OPEN3D_METHODS},
     "standing-still": StandingStill,
 }
 """Makers of the baselines' trackers; those of Open3D raise `SettingsError` where it cannot be imported."""
+
+
+def what_networks_lack(config: Config, *flows: str) -> str:
+    """Return the packages and weights of networks that this machine does not have; "" where it has all.
+
+    flows : names of flows that are needed besides those of the settings.
+    """
+    names = missing_weights(config, *flows, verified=True)
+    weights = f"needs weights: {', '.join(names)} (scopemap models pull NAME)" if names else ""
+    return "; ".join(filter(None, [missing_packages(config, *flows), weights]))
 
 
 @dataclass(frozen=True)
@@ -52,9 +66,10 @@ class PipelineMethod:
         return Config.load(self.plan.preset, settings={**settings, **self.plan.settings, **plain})
 
     def missing(self, settings: Mapping[str, Any]) -> str:
-        """Return the weights that are not on this machine, or damaged."""
-        names = missing_weights(self.config(settings), verified=True)
-        return f"needs weights: {', '.join(names)} (scopemap models pull NAME)" if names else ""
+        """Return the packages and weights that are not on this machine, or damaged, and how to get them."""
+        lacks_open3d = self.plan.use in OPEN3D_METHODS and find_spec("open3d") is None
+        needs = [f"needs Open3D: {INSTALL_OPEN3D}" if lacks_open3d else "", what_networks_lack(self.config(settings))]
+        return "; ".join(filter(None, needs))
 
     def run(self, sequence: Sequence, settings: Mapping[str, Any], out: Path) -> dict[str, float]:
         """Reconstruct into `out` and return the times of the run's own clock; raises what the pipeline raises.

@@ -10,6 +10,7 @@ A table is outdated where `src/` or `bench/src/` has changed since its commit. `
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import shlex
 import subprocess
@@ -19,6 +20,9 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
+from scopemap.engine.errors import ScopemapError
+from scopemap_bench.plan import read_plan
+from scopemap_bench.runner import planned, what_is_missing
 from scopemap_bench.scripts.measuring import options_of
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -92,10 +96,29 @@ def outdated() -> list[str]:
     return found
 
 
+def lacking(name: str, data: Path) -> list[str]:
+    """Return what the plan of a table needs and this machine does not have: sequences, packages, weights, files.
+
+    Scripts need nothing but scopemap-bench, and phantoms or `data`.
+    """
+    plan = re.match(rf"{re.escape(PLAN)} (\S+)", TABLES[name][0])
+    if plan is None:
+        return []
+    os.environ["SCOPEMAP_WEIGHTS_DIR"] = str(data / "weights")  # where the command looks
+    try:
+        entries, notes = planned(read_plan(plan[1]), data, data)
+    except ScopemapError as error:
+        return [str(error)]
+    return [*notes, *dict.fromkeys(filter(None, map(what_is_missing, entries)))]
+
+
 def make(names: list[str], data: Path) -> None:
-    """Make tables at the present commit; raises `SystemExit` where it is not whole."""
+    """Make tables at the present commit; raises `SystemExit` where it is not whole, or a plan lacks something."""
     if git("status", "--porcelain", "--", *MEASURED):
         sys.exit("record: the sources differ from the last commit; commit first: a table names what made it")
+    for name in names:
+        if lacks := lacking(name, data.resolve()):
+            sys.exit(f"record: the table {name} would have rows without figures: {'; '.join(lacks)}")
     commit = git("rev-parse", "--short", "HEAD")
     with tempfile.TemporaryDirectory() as out:
         for name in names:

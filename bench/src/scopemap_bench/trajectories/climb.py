@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -70,14 +71,10 @@ def read_submap(file: Path, unit: Unit = "mm") -> Trajectory:
     """Return the finite poses of a submap; `InputError`, with the line, for a row that the evaluation cannot score."""
     rows: dict[int, list[float]] = {}
     where: list[str] = []
-    for number, line in enumerate(text_lines(file), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        place = f"{file}, line {number}"
-        frame, row = _row(line, place)
+    for frame, row, place in submap_rows(file):
         if frame in rows:
             raise InputError(f"{place}: frame {frame} is repeated")
-        if np.isfinite(row[1:4]).all():
+        if np.isfinite(row[1:]).all():
             rows[frame] = row
             where.append(place)
     if not rows:
@@ -87,6 +84,14 @@ def read_submap(file: Path, unit: Unit = "mm") -> Trajectory:
     order = np.argsort(frames)
     source = f"CLiMB submission, camera-to-world, {unit} (assumed)"
     return stamped(T[order], frames[order] - 1, values[order, 0], source)
+
+
+def submap_rows(file: Path) -> Iterator[tuple[int, list[float], str]]:
+    """Yield frame, from 1, the numbers timestamp tx ty tz qw qx qy qz, finite or not, and the place of each row."""
+    for number, line in enumerate(text_lines(file), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            place = f"{file}, line {number}"
+            yield *_row(line, place), place
 
 
 def _row(line: str, where: str) -> tuple[int, list[float]]:

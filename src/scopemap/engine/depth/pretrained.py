@@ -16,6 +16,7 @@ from scopemap.engine.models.weights import REGISTRY
 if TYPE_CHECKING:
     from transformers import BaseImageProcessor, PreTrainedModel
 
+PACKAGES = ("torch", "torchvision", "transformers", "safetensors")
 MM_PER_M = 1000.0  # a unit
 
 
@@ -69,7 +70,7 @@ def load_pretrained(class_name: str, model: str, name: str) -> tuple[Any, Any, d
     "": `name`, that of the estimator. The latter two must have been pulled: nothing is downloaded, and only safetensors
     are read. Raises `WeightsError` if they are missing, damaged, of another model, or leave a parameter unset.
     """
-    need_packages(f"depth by {name}", "torch", "torchvision", "transformers", "safetensors")
+    need_packages(f"depth by {name}", *PACKAGES)
     import torch
     import transformers
     from safetensors import SafetensorError

@@ -23,6 +23,7 @@ CHECKPOINTS: dict[Size, tuple[str, ...]] = {
     "small": ("raft-small", "raft-small-authors"),
     "large": ("raft-large", "raft-things"),
 }
+PACKAGES = ("torch", "torchvision")
 _STRIDE_PX = 8  # RAFT's: both sides are multiples (Teed and Deng 2020)
 _MIN_SIDE_PX = 128  # guard: its pyramid of four levels needs so many px
 
@@ -59,7 +60,7 @@ class RaftFlow(FlowEstimator):
         self, size: Size = "small", *, iterations: int = 12, device: str = "auto", checkpoint: Path | None = None
     ) -> None:
         self.name = f"raft-{size}"
-        need_packages(f"the flow {self.name}", "torch", "torchvision")
+        need_packages(f"the flow {self.name}", *PACKAGES)
         import torch
         from torchvision.models import optical_flow
 

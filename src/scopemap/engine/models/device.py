@@ -34,9 +34,13 @@ def open_network(content: bytes, threads: int = 0) -> onnxruntime.InferenceSessi
 
 
 def missing_packages(what: str, *packages: str) -> str:
-    """Return which of the packages that `what` needs are not installed and how to install them; "" where all are."""
+    """Return which of the packages that `what` needs are not installed and how to install them; "" where all are.
+
+    what : "" for words that begin with "needs".
+    """
     missing = [package for package in packages if find_spec(package) is None]
-    return f"{what} needs {' and '.join(missing)}: pip install -e '.[networks]'" if missing else ""
+    install = "pip install -c constraints.txt -e '.[networks]'"
+    return f"{what} needs {' and '.join(missing)}: {install}".lstrip() if missing else ""
 
 
 def need_packages(what: str, *packages: str) -> None:
