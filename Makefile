@@ -18,10 +18,11 @@ lint:
 	mypy
 	lint-imports --no-cache
 
-# The pages that are written from the code, then the site, in site/.
+# The pages and the diagram that are written from the code, then the site, in site/.
 docs:
 	python docs/settings_page.py
 	python docs/api_page.py
+	python docs/method_picture.py
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 
 # Every table of BENCHMARK.md, from phantoms and the real data in DATA: hours.

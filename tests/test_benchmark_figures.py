@@ -86,7 +86,8 @@ def test_depth_changes_share_one_scale(tmp_path: Path) -> None:
     flat = np.full((40, 60), 30.0)
     jumpy, unknown = (flat, flat + np.linspace(0, 10, 60)), (flat, np.full_like(flat, NAN))
     depths = {"MAPIS": (flat, flat), "plain": jumpy, "lost": unknown}
-    draw_depth_change({"frame 1": image, "frame 2": image}, depths, tmp_path / "depth.png")
+    tissue = (np.ones(flat.shape, bool),) * 2
+    draw_depth_change({"frame 1": image, "frame 2": image}, tissue, depths, tmp_path / "depth.png")
     picture = read(tmp_path / "depth.png")
     frame_px = is_colour(picture, "#fa00fa").sum() / 2
     turbo = cv2.applyColorMap(np.array([[0, 255]], np.uint8), cv2.COLORMAP_TURBO)[0, :, ::-1]

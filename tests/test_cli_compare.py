@@ -7,6 +7,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from sample_trajectories import as_trajectory, vector_a, write_c3vd, write_run
@@ -15,8 +16,11 @@ from typer.testing import CliRunner
 
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.cli.app import app
+from scopemap.engine.config import MaskSettings
 from scopemap.engine.errors import InputError
+from scopemap.engine.masking.masker import Masker
 from scopemap.input.trajectory.trajectory import write_kitti
+from scopemap.report.depth_figures import MASKED_GREY
 from scopemap_bench.result import RunResult
 
 
@@ -115,6 +119,43 @@ def test_runs_on_a_phantom_are_drawn_with_mesh_depth_and_paths(tmp_path: Path) -
     assert all(np.isfinite(float(row["TAE, true poses [%]"])) for row in consistency)
     assert "## Consistency in time" in (out / "results.md").read_text()
     assert "<title>one, phantom, two, phantom" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_what_the_mask_leaves_out_is_neither_counted_nor_drawn(tmp_path: Path) -> None:
+    """No figure and no number of consistency may depend on the depth of highlights or outside the field of view."""
+    truth = write_tiny(tmp_path / "phantom", frames=3)
+    for file in truth.glob("*_color.png"):
+        picture = cv2.imread(str(file))
+        picture[:, :30] = 0
+        cv2.circle(picture, (100, 60), 12, (255, 255, 255), cv2.FILLED)
+        cv2.imwrite(str(file), picture)
+    light = {"networks.flow": "dis", "networks.perceptual": "structure", "fusion.voxel_mm": 2.0}
+    reconstruct(open_sequence(truth), Config.load(settings=light), out=tmp_path / "as-it-is" / "run")
+    masker, masked = Masker(MaskSettings()), []
+    shutil.copytree(tmp_path / "as-it-is", tmp_path / "rubbish")
+    for frame in open_sequence(truth).frames():
+        file = tmp_path / "rubbish" / "run" / "depth" / f"{frame.index:06d}.png"
+        units, outside = cv2.imread(str(file), cv2.IMREAD_UNCHANGED), ~masker(frame).valid
+        assert (units[outside] > 0).any()
+        units[outside] = 60_000 - 10_000 * frame.index
+        cv2.imwrite(str(file), units)
+        masked.append(outside)
+    for file in truth.glob("*_depth.*"):  # the one scale of the sequence is that of all true depth
+        file.unlink()
+    shown = {}
+    for name in ("as-it-is", "rubbish"):
+        out = tmp_path / name / "out"
+        run("compare", tmp_path / name / "run", "--truth", truth, "--consistency", "--out", out)
+        files = [*(out / "figures").iterdir(), out / "tables" / "consistency.csv"]
+        shown[name] = {file.name: file.read_bytes() for file in files}
+    assert {"depth_change_phantom.png", "clouds_phantom.png", "orb_points_phantom.png"} < set(shown["rubbish"])
+    different = [name for name, content in shown["rubbish"].items() if content != shown["as-it-is"][name]]
+    assert different == []
+    # Depth and difference of both frames are grey there, two thirds of three pictures in all.
+    drawn = cv2.imread(str(tmp_path / "rubbish" / "out" / "figures" / "depth_change_phantom.png"))
+    is_grey = (drawn == MASKED_GREY).all(axis=2).sum()
+    cell_px = (300 / masked[0].shape[1]) ** 2
+    assert is_grey == pytest.approx(3 * cell_px * np.mean([one.sum() for one in masked[1:]]), rel=0.15)
 
 
 def test_a_plan_needs_a_folder_and_its_data(tmp_path: Path) -> None:

@@ -110,6 +110,17 @@ def test_flicker_of_a_still_camera_has_its_closed_forms(e: float) -> None:
     assert report["tae_reference"]["percent"] == pytest.approx(200 * e / (1 - e**2), rel=1e-3)
 
 
+@pytest.mark.parametrize("poses", [STILL, FORWARD + FORWARD[-1:], [*TILTED_ASIDE, TILTED_ASIDE[-1]]])
+def test_the_largest_step_is_that_of_depth_at_one_frame_and_not_the_camera_motion(poses: list[np.ndarray]) -> None:
+    steady = measure(poses)["opw_reference"]
+    assert steady["largest_step_mm"] < 0.02
+    report = measure(poses, [1.0, 1.0, 1.0, 1.03])["opw_reference"]
+    last_mm = float(np.median(see(poses[-1]).depth_mm))
+    assert report["largest_step_mm"] == pytest.approx(0.03 * last_mm, rel=0.02)
+    # Means hide it among the pairs.
+    assert report["mean_mm"] < 0.4 * report["largest_step_mm"]
+
+
 # ---- scale, poses of the method's own
 
 
@@ -175,10 +186,14 @@ def test_what_is_masked_unknown_or_impossible_does_not_count() -> None:
 def test_change_of_two_maps_computed_by_hand() -> None:
     change = depth_change(np.array([[11.0, 20.1, np.nan]]), np.array([[10.0, 20.0, 5.0]]))
     assert (change["mean_mm"], change["relative"], change["rtc"]) == pytest.approx((0.55, (0.1 + 0.005) / 2, 0.5))
+    # One of three pixels at a depth edge is no step of the frame.
+    assert depth_change(np.array([[11.0, 20.1, 90.0]]), np.array([[10.0, 20.0, 5.0]]))["median_mm"] == pytest.approx(1)
     other = depth_change(np.array([[12.0]]), np.array([[10.0]]))
     nothing = depth_change(np.array([[np.nan]]), np.array([[10.0]]))
     mean = mean_change([change, nothing, other])
     assert (mean["pairs"], mean["mean_mm"], mean["rtc"]) == (2, pytest.approx((0.55 + 2) / 2), 0.25)
+    assert mean["largest_step_mm"] == pytest.approx(2)
+    assert np.isnan(mean_change([nothing])["largest_step_mm"])
     assert depth_change(np.array([[1.01]]), np.array([[1.0]]))["rtc"] == 0
 
 

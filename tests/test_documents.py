@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 import typer.main
@@ -13,9 +14,10 @@ import yaml
 import scopemap
 import scopemap_bench
 from docs.api_page import api_page
+from docs.method_picture import BANDS, FILE, LETTERS, lines_of, method_picture
 from scopemap import __version__
 from scopemap.cli.app import app
-from scopemap.engine.config import PRESETS, setting_names
+from scopemap.engine.config import PRESETS, Config, setting_names
 from scopemap.engine.models.weights import REGISTRY
 from scopemap.input.opening import readers
 from scopemap.result.frame_table import COLUMNS
@@ -64,6 +66,22 @@ def test_the_page_of_the_interface_is_the_generated_one_and_has_every_public_nam
     shown = re.findall(r"^### (\w+)$", _text("docs/api.md"), flags=re.MULTILINE)
     assert sorted(shown) == sorted([*scopemap._HOMES, *scopemap_bench.__all__])
     assert set(scopemap.__all__) == set(scopemap._HOMES) | {"__version__"}
+
+
+def test_the_diagram_of_the_method_is_the_drawn_one_and_fits_its_boxes() -> None:
+    """A setting of a preset without words in the diagram, or words that are no longer true, fail here."""
+    drawn = FILE.read_text(encoding="utf-8")
+    assert drawn == method_picture(), f"{FILE.name} is out of date: python docs/method_picture.py draws it"
+    paper, default = Config.load("paper-strict"), Config.load("default")
+    for box in (box for boxes in BANDS.values() for box in boxes):
+        lines = [text for text, _ in lines_of(box, box.words(paper), box.words(default))]
+        assert len(box.name) <= LETTERS
+        assert max(map(len, lines)) <= LETTERS, (box.name, lines)
+        assert len(lines) <= 4 * box.rows - 1 + (box.rows > 1), (box.name, lines)
+    shown = {element.text for element in ElementTree.fromstring(drawn).iter() if element.tag.endswith("text")}
+    assert {box.name for boxes in BANDS.values() for box in boxes} <= shown
+    named = [page for page in ("method.md", "reproduce.md") if f"pictures/{FILE.name}" in _text(f"docs/{page}")]
+    assert named == ["method.md", "reproduce.md"]
 
 
 def test_every_preset_and_all_weights_are_documented() -> None:

@@ -138,19 +138,21 @@ def _pair_medians(result: RunResult, poses: str) -> np.ndarray:
 def _two_frames(sequence: str, runs: Sequence[FinishedRun], frames: Frames, folder: Path) -> Iterator[Path]:
     """Draw two frames: their depth, their clouds by each method's poses, ORB's matches in space and as bars."""
     (previous, T_previous), (current, T_current) = frame_pair(frames, runs[0].figure.frame)
-    depths, own_poses = {}, {}
+    tissue, depths, own_poses = (previous.valid, current.valid), {}, {}
     for run in runs[:_MAX_DEPTHS]:
         reader, scale = DepthReader(run.folder), run.result.figure("consistency", "scale")
         before, now = reader.read(previous.index), reader.read(current.index)
         if before is not None and now is not None and before.shape == now.shape == previous.valid.shape:
-            depths[run.result.method] = (scale * before, scale * now)
+            # A run has depth of masked pixels, too: of highlights and the black surround, which show no tissue.
+            masked = [np.where(seen, mm, np.nan) for seen, mm in zip(tissue, (before, now), strict=True)]
+            depths[run.result.method] = (scale * masked[0], scale * masked[1])
             own_poses[run.result.method] = _poses_of(run, (previous.index, current.index), scale)
     if not depths:
         return
     name = folder_name(sequence)
     images = (previous.rgb, current.rgb)
     frames_shown = {f"frame {frame.index}": frame.rgb for frame in (previous, current)}
-    draw_depth_change(frames_shown, depths, folder / f"depth_change_{name}.png")
+    draw_depth_change(frames_shown, tissue, depths, folder / f"depth_change_{name}.png")
     yield folder / f"depth_change_{name}.png"
     posed = {method: poses for method, poses in own_poses.items() if poses is not None}
     if posed:

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.geometry.rendering import render_points
-from scopemap.report.depth_figures import colour_depth, percentiles
+from scopemap.report.depth_figures import MASKED_GREY, colour_depth, percentiles
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     TRUTH_COLOUR,
@@ -28,12 +28,16 @@ from scopemap_bench.pictures import BAR_COLOUR
 
 
 def draw_depth_change(
-    images: Mapping[str, np.ndarray], depths_mm: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path
+    images: Mapping[str, np.ndarray],
+    tissue: tuple[np.ndarray, np.ndarray],
+    depths_mm: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    file: Path,
 ) -> None:
     """Draw two consecutive frames by name, and each method's depth (H, W), mm, of both and its absolute difference.
 
-    The paper's experiments 1 and 2 (arXiv 2508.11282). Methods share the scales of depth and of difference, whose far
-    end is the 98th percentile; unknown is black.
+    The paper's experiments 1 and 2 (arXiv 2508.11282). tissue : (H, W) bool, the pixels of each frame that its mask
+    leaves; the others are grey. Their depth is to be NaN, as unknown depth is, which is black: neither counts. Methods
+    share the scales of depth and of difference, whose far end is the 98th percentile.
     """
     near_mm, far_mm = percentiles([depth for pair in depths_mm.values() for depth in pair])
     changes_mm = {method: np.abs(current - previous) for method, (previous, current) in depths_mm.items()}
@@ -45,8 +49,11 @@ def draw_depth_change(
         names = (f"{method}: previous", "current", f"|difference|: {mean}")
         pictures = [colour_depth(depth, near_mm, far_mm) for depth in depths]
         pictures.append(colour_depth(changes_mm[method], 0.0, most_mm))
+        for picture, seen in zip(pictures, (*tissue, tissue[0] & tissue[1]), strict=True):
+            picture[~seen] = MASKED_GREY
         rows.append(dict(zip(names, pictures, strict=True)))
-    scales = f"depth: blue {near_mm:.0f} to red {far_mm:.0f} mm; difference: blue 0 to red {most_mm:.1f} mm"
+    depth = f"depth: blue {near_mm:.0f} to red {far_mm:.0f} mm"
+    scales = f"{depth}; difference: blue 0 to red {most_mm:.1f} mm; black: unknown; grey: masked, not counted"
     picture_grid(rows, (300, 250), scales).save(file)
 
 

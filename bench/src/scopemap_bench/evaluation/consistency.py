@@ -205,25 +205,31 @@ def depth_change(other_mm: np.ndarray, current_mm: np.ndarray, counted: np.ndarr
     """Compare two depth maps (H, W), mm, NaN = unknown, where both are positive and `counted` (H, W) bool is True.
 
     pairs : 1, or 0 where no pixel counts; then all else is NaN.
-    mean_mm : mean |a - b|; relative : mean |a - b| / b, b of the current frame.
+    mean_mm, median_mm : of |a - b|; relative : mean |a - b| / b, b of the current frame.
     rtc : share of pixels, 0..1, with max(a/b, b/a) strictly below 1.01; higher is better.
     """
     both = (other_mm > 0) & (current_mm > 0)
     if counted is not None:
         both &= counted
     if not both.any():
-        return {"pairs": 0, **dict.fromkeys(_CHANGE, float("nan"))}
+        return {"pairs": 0, **dict.fromkeys((*_CHANGE, "median_mm"), float("nan"))}
     a, b = other_mm[both].astype(np.float64), current_mm[both].astype(np.float64)
     apart, near = np.abs(a - b), np.maximum(a, b) < _RTC_RATIO * np.minimum(a, b)
     figures = [float(np.mean(values)) for values in (apart, apart / b, near)]
-    return {"pairs": 1, **dict(zip(_CHANGE, figures, strict=True))}
+    return {"pairs": 1, **dict(zip(_CHANGE, figures, strict=True)), "median_mm": float(np.median(apart))}
 
 
 def mean_change(changes: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Return the mean of each figure of `depth_change` over the pairs of frames with a pixel, and their number."""
-    kept = np.array([[change[name] for name in _CHANGE] for change in changes if change["pairs"]])
-    means = kept.mean(axis=0).tolist() if len(kept) else [float("nan")] * len(_CHANGE)
-    return {"pairs": len(kept), **dict(zip(_CHANGE, means, strict=True))}
+    """Return what `depth_change` measured, over the pairs of frames with a pixel; NaN where there is none.
+
+    pairs : their number. mean_mm, relative, rtc : means over the pairs. largest_step_mm : the largest of their medians
+    of |a - b|, since a mean over a sequence hides one frame at which depth steps.
+    """
+    kept = [change for change in changes if change["pairs"]]
+    if not kept:
+        return {"pairs": 0, **dict.fromkeys((*_CHANGE, "largest_step_mm"), float("nan"))}
+    means = {name: float(np.mean([change[name] for change in kept])) for name in _CHANGE}
+    return {"pairs": len(kept), **means, "largest_step_mm": max(change["median_mm"] for change in kept)}
 
 
 def projected_depth(depth_mm: np.ndarray, camera: PinholeCamera, T_other_camera: np.ndarray) -> np.ndarray:
@@ -325,9 +331,10 @@ class ConsistencyMeter:
         scale, jitter : factor to mm, and its variation. same_pixel, along_flow : |D_t - D_{t-1}| at the same pixel,
         along the flow.
         opw : along the flow where the images have the same colour; its `rtc` is rTC. opw_reference, opw_estimated : the
-        same after moving the current depth into the previous camera by these poses. tae_reference, tae_estimated : TAE,
-        percent of depth; the public protocol is `reference`. orb_camera, orb_reference, orb_estimated : displacement of
-        points in their own cameras, and in the world.
+        same after moving the current depth into the previous camera by these poses; the largest depth step between
+        frames is their `largest_step_mm`. tae_reference, tae_estimated : TAE, percent of depth; the public protocol is
+        `reference`. orb_camera, orb_reference, orb_estimated : displacement of points in their own cameras, and in the
+        world.
         """
         figures: dict[str, Any] = {"frames": len(self._scales), "pairs": max(len(self._scales) - 1, 0)}
         figures |= {"scale": self._scale, "jitter": scale_jitter(np.array(self._scales))}
