@@ -18,7 +18,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp, se3_log
 from scopemap.engine.mapping import Backend, FrameCorrection, TrackedPose, hypotheses, judge
 from scopemap.engine.mapping.bundle_problem import Observations, Points
-from scopemap.engine.mapping.correction import KeyframeStep
+from scopemap.engine.mapping.correction import KeyframeCorrection, KeyframeStep
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
 from scopemap.engine.mapping.judge import LensTest, ShapeTest
 from scopemap.result.wording import text_of
@@ -141,7 +141,7 @@ def test_the_step_of_a_keyframe_that_was_moved_as_it_came_is_spread_over_the_fra
         mapper.add(
             _frame(number),
             tracked.setdefault(10 * number, TrackedPose(0, max(10 * number - 10, 0), true)),
-            step=KeyframeStep(drift, np.log(1.25)) if number else None,
+            step=KeyframeStep(drift, after=KeyframeCorrection(np.log(1.25))) if number else None,
         )
         if number:
             middle = POSES[number - 1] @ se3_exp(0.5 * se3_log(inverse(POSES[number - 1]) @ true))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,10 @@ from hypothesis import strategies as st
 
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.align import Similarity
+from scopemap.engine.geometry.se3 import se3
 from scopemap.engine.mapping import MAX_LOG_FACTOR, FrameCorrection
-from scopemap.engine.mapping.correction import FinalFrames
+from scopemap.engine.mapping.correction import FinalFrames, KeyframeCorrection, KeyframeStep, TrackedPose
 from scopemap.engine.mapping.depth_correction import COLUMNS, LEVELS, ROWS, DepthCorrectionField, fit_depth_correction
 
 HEIGHT, WIDTH = 120, 160
@@ -94,6 +97,22 @@ def test_a_frame_between_two_keyframes_interpolates_both_fields() -> None:
     assert correction.notice.values["depth_change"] == pytest.approx(0.2214, abs=1e-4)
 
 
+def test_what_a_field_has_multiplied_depth_by_is_found_again() -> None:
+    rng = np.random.default_rng(7)
+    field = DepthCorrectionField(rng.normal(0, 0.1, (ROWS, COLUMNS, LEVELS)), np.log(25), np.log(70))
+    depth_mm = _image(rng)  # nearer and farther than the levels, too
+    depth_mm[0] = np.nan
+    log = field.log_factor(depth_mm)
+    found = field.log_factor_before(depth_mm * np.exp(log))
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, log, atol=1e-4)
+    # Where a field folds depth over, another depth gives the same corrected one.
+    folded = DepthCorrectionField(rng.normal(0, 0.6, (ROWS, COLUMNS, LEVELS)), np.log(25), np.log(70))
+    corrected_mm = depth_mm * np.exp(folded.log_factor(depth_mm))
+    before = corrected_mm * np.exp(-folded.log_factor_before(corrected_mm))
+    np.testing.assert_allclose(before * np.exp(folded.log_factor(before)), corrected_mm, rtol=1e-3)
+
+
 def _bent(number: int) -> Frame:
     """View of the plane whose depth is wrong by up to 30 %, varying from left to right, as a network's is."""
     at_mm, turn_rad = (2.0 * number, 0.6 * number, 0.5 * number), (0.01 * number, -0.01 * number, 0.02 * number)
@@ -118,3 +137,37 @@ def test_distorted_depth_of_a_plane_seen_from_six_poses_is_corrected() -> None:
         results[step_sigma] = [_shape_error(f, correction.depth_factors(f.index, f.depth_mm)) for f in frames]
     assert min(results[0.0]) > 0.1
     assert max(results[0.1]) < 0.3 * min(results[0.0])
+
+
+def _field(rng: np.random.Generator) -> DepthCorrectionField:
+    """A field of some percent over 20 to 80 mm."""
+    return DepthCorrectionField(rng.normal(0, 0.05, (ROWS, COLUMNS, LEVELS)), np.log(20), np.log(80))
+
+
+@pytest.mark.parametrize("is_adjusted", [True, False])
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_depth_does_not_step_where_the_keyframe_changes(is_adjusted: bool, scale: float) -> None:
+    """Frames are stored with the correction of the keyframe that they were tracked against; the next one has its own.
+
+    The camera moves evenly over a wall, so that depth as estimated stays the same.
+    """
+    rng, keyframes, every = np.random.default_rng(4), 4, 10
+    own = [KeyframeCorrection(rng.normal(0, 0.05), _field(rng)) for _ in range(keyframes)]
+    tracked = {n: TrackedPose(0, max(n - 1, 0) // every * every, se3(np.eye(3), [n, 0, 0])) for n in range(31)}
+    number = np.arange(keyframes) * every
+    steps = [KeyframeStep(), *(KeyframeStep(before=a, after=b) for a, b in itertools.pairwise(own))]
+    worlds = {0: Similarity(scale, np.eye(3), np.zeros(3))}
+    T, log_scale = np.tile(np.eye(4), (keyframes, 1, 1)), rng.normal(0, 0.05, keyframes) * is_adjusted
+    fields = tuple(_field(rng) for _ in number) if is_adjusted else ()
+    correction = FrameCorrection(number, T, log_scale, depth_fields=fields, S_common_map=worlds, tracked=tracked)
+    correction = correction.with_steps([tracked[n] for n in number.tolist()], steps, worlds)
+    frame, final_mm = plane_scene.frame(np.eye(4)), []
+    frame = replace(frame, depth_mm=rng.uniform(20, 80, frame.valid.shape).astype(np.float32))
+    for index in tracked:
+        stored_mm = np.asarray(own[index // every].corrected(frame).depth_mm)
+        final_mm.append(stored_mm * correction.depth_factors(index, stored_mm))
+    log_depth = np.log(np.stack(final_mm))
+    change = np.abs(np.diff(log_depth[::every], axis=0)).mean(axis=(1, 2))
+    step = np.abs(np.diff(log_depth, axis=0)).mean(axis=(1, 2))
+    assert change.min() > 0.02
+    np.testing.assert_allclose(step.reshape(-1, every), np.repeat(change[:, None], every, 1) / every, rtol=0.1)

@@ -135,3 +135,24 @@ def test_frames_and_keyframes_that_fail_take_the_depth_of_the_keyframes_around_t
     assert all(one is not None for one in found)
     assert _error(found[MIDDLE].depth_mm) < 0.03
     assert np.median(np.abs(found[3].log_factor + _bias())[16:-16, 24:-24]) < 0.04
+
+
+@pytest.mark.parametrize("keyframes", [[0, 8, 16, 24, 32], [0, 4, 16, 21, 32], [7, 24]])
+def test_depth_does_not_step_where_the_keyframe_changes(keyframes: list[int]) -> None:
+    """The scale of the poses drifts by half a percent a frame, so that keyframes triangulate depths that differ."""
+    frames = np.arange(33)
+    true = [_pose(number - 12, 0.8) for number in frames]
+    poses = {number: T.copy() for number, T in enumerate(true)}
+    for T in poses.values():
+        T[0, 3] *= 1 + 0.0025 * T[0, 3] / 0.8
+    seen = [_seen(T) for T in true]
+    depths = KeyframeDepths(seen.__getitem__, poses, keyframes, CAMERA, DisFlow())
+    found = [depths.depth(number, seen[number][1]) for number in range(len(true))]
+    depths.close()
+    assert depths.notice.values["triangulated"] == len(keyframes)
+    factors = np.stack([one.log_factor[16:-16, 24:-24] for one in found])
+    steps = np.median(np.abs(np.diff(factors, axis=0)), axis=(1, 2))
+    change = np.ptp(np.median(factors, axis=(1, 2)))
+    assert change > 0.015
+    # A tenth or less from any frame to the next: between the nearest keyframes are five to seventeen of them.
+    assert steps.max() < 0.1 * change

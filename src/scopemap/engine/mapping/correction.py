@@ -40,17 +40,6 @@ class TrackedPose(NamedTuple):
     lost_before: int = 0
 
 
-class KeyframeStep(NamedTuple):
-    """By how much a keyframe was moved as it came; the frames before it, tracked against an earlier one, were not.
-
-    T_camera_arrived : (4, 4), pose as tracked in the camera as moved. log_scale : ln of the factor of its depth, less
-    that of the frames before it.
-    """
-
-    T_camera_arrived: np.ndarray = np.eye(4)
-    log_scale: float = 0.0
-
-
 class KeyframeCorrection(NamedTuple):
     """Correction of a keyframe's depth: ln of the factor of all of it, and of that of each pixel (None: 1)."""
 
@@ -59,8 +48,40 @@ class KeyframeCorrection(NamedTuple):
 
     def corrected(self, frame: Frame) -> Frame:
         """Return a frame with its depth, and the standard deviation of that, corrected."""
-        log = 0.0 if self.field is None else self.field.log_factor(np.asarray(frame.depth_mm))
-        return _with_depth_times(frame, np.exp(np.float32(self.log_scale) + log, dtype=np.float32))
+        log = np.float32(self.log_scale) + self.log_factor(np.asarray(frame.depth_mm))
+        return _with_depth_times(frame, np.exp(log, dtype=np.float32))
+
+    def log_factor(self, depth_mm: np.ndarray) -> np.ndarray | np.float32:
+        """Return ln of the field's factor (H, W) of depth (H, W) mm as estimated; 0 without a field."""
+        return np.float32(0) if self.field is None else self.field.log_factor(depth_mm)
+
+
+class KeyframeStep(NamedTuple):
+    """By how much a keyframe was moved as it came; the frames before it, tracked against an earlier one, were not.
+
+    T_camera_arrived : (4, 4), pose as tracked in the camera as moved. before, after : correction of the depth of the
+    frames before it, and its own.
+    """
+
+    T_camera_arrived: np.ndarray = np.eye(4)
+    before: KeyframeCorrection = KeyframeCorrection()
+    after: KeyframeCorrection = KeyframeCorrection()
+
+    @property
+    def log_scale(self) -> float:
+        """Ln of the factor of its depth, less that of the frames before it."""
+        return self.after.log_scale - self.before.log_scale
+
+    def log_factor(self, depth_mm: np.ndarray) -> np.ndarray | np.float32:
+        """Return ln of the factor (H, W) of depth (H, W) mm, corrected by `before`, from its field to that of `after`.
+
+        0 where there is no field. A field takes depth as estimated, so that of `before` is inverted.
+        """
+        if self.before.field is None and self.after.field is None:
+            return np.float32(0)
+        estimated_mm = depth_mm * np.exp(np.float32(-self.before.log_scale))
+        log = np.float32(0) if self.before.field is None else self.before.field.log_factor_before(estimated_mm)
+        return self.after.log_factor(estimated_mm * np.exp(-log)) - log
 
 
 @dataclass(frozen=True)
@@ -69,14 +90,15 @@ class FrameCorrection:
 
     index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
     tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
-    T_world_world_before, log_scale_before : the same for the frames that lead to the keyframe, which its `KeyframeStep`
-    parts from it; None: there is none. sigma_px : robust standard deviation of the reprojection errors; NaN without
-    observations. refused : why keyframes stay as tracked, None where it is. loops : number of accepted loop closures.
-    loop_frames : the two frames of each. depth_fields : (K,) further factors of each pixel's depth; (): none.
-    S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
-    number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens : what
-    left-out tracks tell of it. shape : what other starts of the adjustment tell of it. S_world_adjusted : Sim(3) from
-    the adjusted world to that of the submap, which joins a segment to the one before.
+    T_world_world_before : as `T_world_world`, of the frames that lead to the keyframe, which its step parts from it;
+    None: there is none. steps : (K,) of the keyframes; (): none was moved as it came. sigma_px : robust standard
+    deviation of the reprojection errors; NaN without observations. refused : why keyframes stay as tracked, None where
+    it is. loops : number of accepted loop closures. loop_frames : the two frames of each. depth_fields : (K,) further
+    factors of each pixel's depth; (): none. S_common_map : by number of each merged map, Sim(3) from its world to the
+    common one. tracked : poses as tracked by number of the frame, where known. depth_mm : typical depth, the unit of
+    translations beside rad. lens : what left-out tracks tell of it. shape : what other starts of the adjustment tell of
+    it. S_world_adjusted : Sim(3) from the adjusted world to that of the submap, which joins a segment to the one
+    before.
     """
 
     index: np.ndarray
@@ -84,7 +106,7 @@ class FrameCorrection:
     log_scale: np.ndarray
     sigma_px: float = float("nan")
     T_world_world_before: np.ndarray | None = None
-    log_scale_before: np.ndarray | None = None
+    steps: Sequence[KeyframeStep] = ()
     refused: Notice | None = None
     loops: int = 0
     loop_frames: Sequence[Sequence[int]] = ()
@@ -132,7 +154,7 @@ class FrameCorrection:
         return replace(
             self,
             T_world_world_before=self.T_world_world @ tracked @ inverse(np.stack(arrived)),
-            log_scale_before=self.log_scale + [step.log_scale for step in steps],
+            steps=steps,
         )
 
     def in_world(self, T_new_world: np.ndarray) -> FrameCorrection:
@@ -162,13 +184,19 @@ class FrameCorrection:
         """Return the factors (H, W) float32 of depth (H, W) mm; NaN where depth is unknown."""
         before, after, share = self._between(index)
         factor = np.float32(self._factor(index, before, after, share))
-        if not self.depth_fields:
-            return np.full(depth_mm.shape, factor, np.float32)
-        depth_mm = depth_mm * np.float32(self._world(index).scale)
-        log = self.depth_fields[before].log_factor(depth_mm)
+        log = self._log_field(before, index, depth_mm)
         if after != before:
-            log = (1 - share) * log + share * self.depth_fields[after].log_factor(depth_mm)
-        return factor * np.exp(log.astype(np.float32))
+            log = (1 - share) * log + share * self._log_field(after, index, depth_mm)
+        return np.where(np.isfinite(depth_mm), factor * np.exp(log), np.nan).astype(np.float32)
+
+    def _log_field(self, k: int, index: int, depth_mm: np.ndarray) -> np.ndarray | np.float32:
+        """Return ln of the factor of each pixel's depth (H, W) mm by what is known at keyframe k, near which it is."""
+        step = self._step(k, index)
+        log = step.log_factor(depth_mm)
+        if not self.depth_fields:
+            return log
+        own_mm = depth_mm * np.exp(np.float32(step.log_scale) + log)  # as that of the keyframe, which the field is of
+        return log + self.depth_fields[k].log_factor(own_mm * np.float32(self._world(index).scale))
 
     def _factor(self, index: int, before: int, after: int, share: float) -> float:
         log_scale = (1 - share) * self._log_scale(before, index) + share * self._log_scale(after, index)
@@ -198,8 +226,11 @@ class FrameCorrection:
         return T
 
     def _log_scale(self, k: int, index: int) -> float:
-        leads = index < self.index[k] and self.log_scale_before is not None
-        return float(np.asarray(self.log_scale_before if leads else self.log_scale)[k])
+        return float(self.log_scale[k]) + self._step(k, index).log_scale
+
+    def _step(self, k: int, index: int) -> KeyframeStep:
+        """Return the step from a frame to keyframe k, to which it leads; none where it follows, or is, the keyframe."""
+        return self.steps[k] if self.steps and index < self.index[k] else KeyframeStep()
 
     def _world(self, index: int) -> Similarity:
         """Sim(3) from the world of a frame's map to the common one."""

@@ -64,6 +64,15 @@ class DepthCorrectionField:
             log_depth = np.log(depth_mm, dtype=np.float32)
         return _interpolated(self.values.astype(np.float32), log_depth, self.nearest, self.farthest)
 
+    def log_factor_before(self, corrected_mm: np.ndarray) -> np.ndarray:
+        """Return ln of the factor (H, W) float32 that depth (H, W) mm was multiplied by: the inverse of `log_factor`.
+
+        Where several depths were corrected to the same one, that of the nearest.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_depth = np.log(corrected_mm, dtype=np.float32)
+        return _inverted(self.values.astype(np.float32), log_depth, self.nearest, self.farthest)
+
 
 def fit_depth_correction(
     position: np.ndarray, log_depth: np.ndarray, error: np.ndarray, sigma: np.ndarray, step_sigma: float
@@ -158,6 +167,39 @@ def depth_log_ratios(
         ratios = np.log(there_mm / points[:, 2])
     known: np.ndarray = ratios[np.isfinite(ratios)]
     return known
+
+
+@kernel
+def _inverted(values: np.ndarray, log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
+    """Return a field's values (6, 7, 4) at what the ln depth (H, W) was before their addition, (H, W) float32."""
+    height, width = log_depth.shape
+    found = np.empty((height, width), np.float32)
+    step = _F32((farthest - nearest) / (LEVELS - 1))
+    line, own = np.empty((COLUMNS, LEVELS), np.float32), np.empty(LEVELS, np.float32)
+    for row in range(height):
+        y = (row + 0.5) / height * (ROWS - 1)
+        above = min(int(y), ROWS - 2)
+        for k in range(COLUMNS):
+            for level in range(LEVELS):
+                low, high = values[above, k, level], values[above + 1, k, level]
+                line[k, level] = low + _F32(y - above) * (high - low)
+        for col in range(width):
+            x = (_F32(col) + _F32(0.5)) * _F32((COLUMNS - 1) / width)
+            left, place = min(int(x), COLUMNS - 2), log_depth[row, col] - _F32(nearest)
+            for level in range(LEVELS):
+                low, high = line[left, level], line[left + 1, level]
+                own[level] = low + (x - _F32(left)) * (high - low)
+            # Piecewise linear: the first piece that ends beyond the depth holds it.
+            found[row, col] = own[0] if place == place else _F32(np.nan)
+            if place > own[0]:
+                found[row, col] = own[LEVELS - 1]
+                for level in range(LEVELS - 1):
+                    begin, end = step * level + own[level], step * (level + 1) + own[level + 1]
+                    if place <= end:
+                        share = (place - begin) / (end - begin)
+                        found[row, col] = own[level] + share * (own[level + 1] - own[level])
+                        break
+    return found
 
 
 @kernel

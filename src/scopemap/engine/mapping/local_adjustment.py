@@ -110,8 +110,8 @@ class LocalAdjustment:
             del self._corrections[next(iter(self._corrections))]
         T_camera_world = self._window[-1].T_camera_world
         moved = correction.corrected(replace(keyframe, T_world_camera=inverse(T_camera_world)))
-        more = correction.log_scale - self._correction(reference).log_scale
-        step = KeyframeStep(T_camera_world @ np.asarray(keyframe.T_world_camera), more)
+        arrived = T_camera_world @ np.asarray(keyframe.T_world_camera)
+        step = KeyframeStep(arrived, self._correction(reference), correction)
         return AdjustedKeyframe(moved, matches, step)
 
     def take_over(self, index: int, reference: int) -> None:

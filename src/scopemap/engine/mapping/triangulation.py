@@ -152,12 +152,19 @@ def combine(log_factor: np.ndarray, information: np.ndarray) -> tuple[np.ndarray
 
 @kernel
 def add_comparison(
-    total: np.ndarray, depth_mm: np.ndarray, T: np.ndarray, camera: Intrinsics, at_mm: np.ndarray, at_sigma: np.ndarray
+    total: np.ndarray,
+    depth_mm: np.ndarray,
+    T: np.ndarray,
+    camera: Intrinsics,
+    at_mm: np.ndarray,
+    at_sigma: np.ndarray,
+    weight: float,
 ) -> None:
     """Compare a frame's depth with the one that another frame has there, at every n-th pixel of a row and a column.
 
     Adds information times ln of the factor between them, and information, to `total` (2, rows, columns), unless the
     factor tells of an occlusion. at_mm, at_sigma : depth of the other frame, and standard deviation of its ln.
+    weight : what its information counts, 0..1.
     """
     step = -(-depth_mm.shape[0] // total.shape[1])
     height, width = at_mm.shape
@@ -177,7 +184,7 @@ def add_comparison(
             r, c = int(v), int(u)
             log_factor = np.log(_bilinear(at_mm, r, c, u - c, v - r) / z)
             if abs(log_factor) < _MAX_PROPAGATED:
-                information = 1 / (_bilinear(at_sigma, r, c, u - c, v - r) ** 2 + VIEW_SIGMA**2)
+                information = weight / (_bilinear(at_sigma, r, c, u - c, v - r) ** 2 + VIEW_SIGMA**2)
                 total[0, i, j] += information * log_factor
                 total[1, i, j] += information
 
