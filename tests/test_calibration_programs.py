@@ -189,6 +189,11 @@ def test_text_of_two_bytes_a_letter(encoding: str, tmp_path: Path) -> None:
         ("726,8 727,8 742,7 542,1\n", "decimal commas (726,8)"),
         ("726,8 0 742,7\n0 727,8 542,1\n0 0 1\n", "decimal commas (726,8)"),
         ('{"fx": "726,8", "fy": 727.8, "cx": 742.7, "cy": 542.1}', "fx has a decimal comma (726,8)"),
+        ("fx: 726,8\nfy: 727,8\ncx: 742,7\ncy: 542,1\n", "decimal commas"),
+        ('{"fx": 726,8, "fy": 727,8, "cx": 742,7, "cy": 542,1}', "decimal commas"),
+        ("K: [ 726,8, 0, 742,7, 0, 727,8, 542,1, 0, 0, 1 ]\n", "decimal commas"),
+        ("# oST version 5.0 parameters\n\n[image]\n\nwidth\n1440\n", "ROS' ost.txt; the ost.yaml"),
+        ("ParGroup: Cam_Par: Internal camera parameters;\n  Cx:desc: 742.7;\n", "HALCON's"),
         ('{"fx": {"a": 1}, "fy": ', "line 1, column"),
         ("fx: [1, 2\nfy: {", "line "),
         ("<a><b></a>", "line 1"),
@@ -227,3 +232,34 @@ def test_the_middle_of_other_pictures_is_no_principal_point(size: tuple[int, int
     stated = f"{text}image_width: {size[0]}\nimage_height: {size[1]}\n"
     if size[0] > 320:
         assert read(tmp_path, stated, size).cx == 319.5
+
+
+@pytest.mark.parametrize("centre", ["320 240", "319.5 239.5", "360 240", "512 384"])
+def test_an_exact_middle_of_other_pictures_is_none_however_near(centre: str, tmp_path: Path) -> None:
+    assert "the middle of " in refusal(tmp_path, f"600 600 {centre}", (720, 576))
+    off = " ".join(str(float(number) + 0.3) for number in centre.split())
+    if float(centre.split()[0]) < 400:  # a calibrated centre as near may be these pictures' own
+        assert read(tmp_path, f"600 600 {off}", (720, 576)).fx == 600
+    assert read(tmp_path, "600 600 360 288", (720, 576)).cx == 360
+
+
+def _metashape(*sensors: str) -> str:
+    inner = "".join(f"<sensor>{one}</sensor>" for one in sensors)
+    return f"<document><chunk><sensors>{inner}</sensors></chunk></document>"
+
+
+def _sensor(focal: float, kind: str = "adjusted") -> str:
+    inner = f'<resolution width="1440" height="1080"/><f>{focal}</f><cx>3</cx><cy>-2</cy>'
+    return f'<calibration type="frame" class="{kind}">{inner}</calibration>'
+
+
+def test_metashapes_adjusted_camera_is_taken_and_of_two_sensors_none(tmp_path: Path) -> None:
+    both = _metashape(_sensor(1500.0, "initial") + _sensor(726.8), "")
+    assert read(tmp_path, both).fx == 726.8
+    assert "holds 2 cameras" in refusal(tmp_path, _metashape(_sensor(1500.0), _sensor(726.8)))
+
+
+def test_intrinsics_of_each_frame_beside_a_camera_are_no_distortion(tmp_path: Path) -> None:
+    K = [726.8, 0, 0, 0, 727.8, 0, 742.7, 542.1, 1]
+    record3d = {"w": 1440, "h": 1080, "K": K, "perFrameIntrinsicCoeffs": [[726.8, 727.8, 742.7, 542.1]]}
+    assert read(tmp_path, record3d).cy == 542.1

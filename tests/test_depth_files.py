@@ -156,3 +156,18 @@ def test_unusable_folders_and_files_are_refused(tmp_path: Path) -> None:
     write(tmp_path, "00.png", ramp(np.uint8, 255))
     with pytest.raises(InputError, match="have the same number"):
         files(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("first", "frames", "later"), [(1, range(4), -1), (0, range(1, 5), 1), (0, range(4), 0), (1, range(5), 0)]
+)
+def test_depth_files_numbered_from_1_belong_to_frames_from_0(
+    first: int, frames: range, later: int, tmp_path: Path
+) -> None:
+    for number in range(4):
+        write(tmp_path, f"depth_{number + first:04d}.npy", np.full((50, 60), 10.0 + number, np.float32))
+    found = FilesDepth(tmp_path, SAME, DepthSettings(files_kind="measured"), FilesOfInput(numbers=frames))
+    assert found.later == later
+    for number in range(4):
+        values = found.estimate(frame(number + first + later)).values
+        assert np.nanmedian(values) == 10.0 + number

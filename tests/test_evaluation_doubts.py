@@ -19,6 +19,7 @@ from scopemap.engine.geometry.se3 import inverse
 from scopemap.evaluation.doubts import doubts, evaluate_poses
 from scopemap.evaluation.poses import match
 from scopemap.input.trajectory.trajectory import Trajectory, write_tum
+from scopemap.result.trajectories import read_trajectory
 
 ESTIMATED, TRUTH = (as_trajectory(poses) for poses in vector_a())
 """A path and a noisy estimate of it in another world and scale."""
@@ -128,3 +129,60 @@ def test_numbers_that_miss_each_other_by_one_are_named() -> None:
     every_tenth = TRUTH.rows(np.arange(0, 60, 10))
     with pytest.raises(AlignmentError, match="6 would match with the truth's numbers one lower"):
         match(every_tenth, numbered_from_1(every_tenth), "sim3")
+
+
+def long_path(rate_hz: float = 30.0, count: int = 2400) -> Trajectory:
+    """Return 80 s of a camera that turns and comes back, at some frames/s."""
+    times_s = np.arange(count) / 30
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, 3] = np.column_stack([20 * np.sin(times_s / 3), 15 * np.cos(times_s / 4.1), 2 * times_s])
+    turns = np.column_stack([0.3 * np.sin(times_s / 5), 0.2 * np.sin(times_s / 7), 0.1 * times_s])
+    T[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    return replace(as_trajectory(T), times_s=np.arange(count) / rate_hz, has_indices=False)
+
+
+def stamps_in_ms(path: Trajectory, folder: Path, form: str) -> Trajectory:
+    """Return a path as read from a file whose stamps are milliseconds, which nothing says."""
+    lines = [line for line in _lines_of(path, folder) if not line.startswith("#")]
+    rows = [line.split(maxsplit=1) for line in lines]
+    text = "".join(f"{float(stamp) * 1000:{form}} {rest}\n" for stamp, rest in rows)
+    (folder / "ms.txt").write_text(text)
+    return read_trajectory(folder / "ms.txt", unit="mm")
+
+
+def _lines_of(path: Trajectory, folder: Path) -> list[str]:
+    write_tum(folder / "s.txt", path)
+    return (folder / "s.txt").read_text().splitlines()
+
+
+@pytest.mark.parametrize("form", [".0f", ".3f"])
+@pytest.mark.parametrize("numbered", [True, False])
+def test_milliseconds_that_match_now_and_then_are_said(form: str, numbered: bool, tmp_path: Path) -> None:
+    path = long_path()
+    own = replace(path, has_indices=numbered)
+    in_ms = stamps_in_ms(path, tmp_path, form)
+    assert "the time stamps of the truth may be milliseconds" in said(own, in_ms)
+    assert "the time stamps of the trajectory may be milliseconds" in said(in_ms, own)
+    assert said(own, path) == ""
+
+
+def test_milliseconds_that_match_nowhere_are_named(tmp_path: Path) -> None:
+    path = long_path(count=60)
+    for form in (".0f", ".3f"):
+        with pytest.raises(AlignmentError, match="60 would match if the truth's stamps were milliseconds"):
+            match(path, stamps_in_ms(path, tmp_path, form), "sim3")
+
+
+@pytest.mark.parametrize("rate_hz", [24.0, 25.0, 50.0])
+def test_stamps_of_another_frame_rate_are_said(rate_hz: float) -> None:
+    assert "may be by another frame rate" in said(long_path(), long_path(rate_hz))
+    assert said(long_path(), long_path().rows(np.arange(0, 2400, 10))) == ""  # fewer poses by the same clock
+
+
+@pytest.mark.parametrize("frames", [np.arange(20, 50), np.arange(0, 60, 2)])
+def test_lines_that_count_the_frames_of_a_part_are_said(frames: np.ndarray) -> None:
+    part = TRUTH.rows(frames)
+    lines = replace(part, indices=np.arange(len(frames)))
+    assert f"may be those of the frames {frames[0]} to {frames[-1]} of the other" in said(part, lines)
+    assert "the poses of the trajectory may be those of the frames" in said(lines, part)
+    assert said(part, TRUTH) == ""

@@ -160,3 +160,14 @@ def test_levels_of_fewer_bits_than_16_fill_the_range(bits: int, ending: str, tmp
     said = [str(note) for note in source.notes if "bits" in str(note)]
     expected = [f"levels: 16-bit pictures hold {bits} bits, which are scaled to the whole range"]
     assert said == (expected if bits < 16 else [])
+
+
+def test_masks_that_differ_from_their_pictures_by_the_ending_alone_are_not_mixed_in(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "images", [f"{number:04d}" for number in range(6)])
+    for number in range(6):
+        save(folder / f"{number:04d}.jpg", picture(number, SIZE))
+    with pytest.raises(InputError, match=r"2 series with the same numbers \(6 like 0000\.(jpg|png)"):
+        ImageFolder(folder)
+    for number in range(6):  # one video, of which a part was saved otherwise
+        (folder / f"{number:04d}.jpg").rename(folder / f"{number + 6:04d}.jpg")
+    assert len(list(ImageFolder(folder).frames(slice(None)))) == 12

@@ -245,3 +245,43 @@ def test_our_own_file_is_mm_because_it_says_so(tmp_path: Path, truth: Trajectory
     (tmp_path / "bare.txt").write_text(bare)
     np.testing.assert_allclose(read_trajectory(tmp_path / "bare.txt").positions_mm, 1000 * truth.positions_mm)
     np.testing.assert_allclose(read_trajectory(tmp_path / "bare.txt", unit="mm").positions_mm, truth.positions_mm)
+
+
+# ---- text that is none, or of another country
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_in_any_usual_encoding(encoding: str, truth: Trajectory, tmp_path: Path) -> None:
+    stamps = [f"{number / 30:.6f}" for number in range(60)]
+    plain = write(tmp_path / "plain.txt", "", stamps, rows(truth, w_first=False), " ")
+    (tmp_path / "other.txt").write_bytes(plain.read_text().encode(encoding))
+    assert np.array_equal(read_trajectory(tmp_path / "other.txt").positions_mm, read_trajectory(plain).positions_mm)
+
+
+@pytest.mark.parametrize("separator", [" ", ";", "\t"])
+@pytest.mark.parametrize("form", ["tum", "kitti"])
+def test_decimal_commas_are_named(separator: str, form: str, truth: Trajectory, tmp_path: Path) -> None:
+    stamps = [f"{number / 30:.6f}" for number in range(60)]
+    values = rows(truth, w_first=False) if form == "tum" else truth.T_world_camera[:, :3].reshape(-1, 12).tolist()
+    lines = [
+        ([stamp] if form == "tum" else []) + [f"{value:.6f}" for value in row]
+        for stamp, row in zip(stamps, values, strict=True)
+    ]
+    (tmp_path / "commas.txt").write_text("\n".join(separator.join(line).replace(".", ",") for line in lines))
+    with pytest.raises(InputError, match=r"line 1: it has decimal commas .*: write points"):
+        read_trajectory(tmp_path / "commas.txt")
+
+
+@pytest.mark.parametrize("content", [b"\x93NUMPY\x01\x00\xff", b'{"frames": []}', b"x,y,z\n1,2,3"])
+def test_what_is_no_text_of_poses_is_one_sentence_of_ours(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "poses.dat").write_bytes(content)
+    with pytest.raises(InputError) as refused:
+        read_trajectory(tmp_path / "poses.dat")
+    assert not {"codec", "could not convert", "byte 0x"} & set(str(refused.value).split("'"))
+    assert "no text" in str(refused.value) or "expected numbers, found" in str(refused.value)
+
+
+def test_nanoseconds_with_decimals_are_no_seconds(truth: Trajectory, tmp_path: Path) -> None:
+    stamps = [f"{number * 1e9 / 30:.6f}" for number in range(60)]
+    found = read_trajectory(write(tmp_path / "orb.txt", "", stamps, rows(truth, w_first=False), " "))
+    assert found.times_s == pytest.approx(np.arange(60) / 30)

@@ -50,6 +50,7 @@ KINDS: dict[str, _Kind] = {
     "frames-without-depth": _Kind("note", ("frames", "first")),
     "depth-propagated": _Kind("info", ("every", "frames")),
     "depth-files-kind": _Kind("info", ("kind", "reason")),
+    "depth-files-shifted": _Kind("info", ("folder", "shift")),
     "frames-skipped": _Kind("info", ("frames", "causes")),
     "frames-few": _Kind("note", ("frames",)),
     "frames-forgotten": _Kind("note", ("kept", "frames")),

@@ -1,7 +1,7 @@
 """Doubts about two trajectories: how else they could be read, where they would agree far better. Said, never done.
 
-A truth numbered from 1, poses world-to-camera, quaternions with the scalar first, and metres read as mm leave figures
-that look like the errors of a method.
+A truth numbered from 1, poses world-to-camera, quaternions with the scalar first, metres read as mm and another clock
+(`other_clocks`) leave figures that look like the errors of a method.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from scopemap.engine.errors import AlignmentError
 from scopemap.engine.geometry.align import AlignMode
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
+from scopemap.evaluation.other_clocks import clock_readings
 from scopemap.evaluation.poses import (
     MatchedTrajectories,
     length_ratio,
@@ -174,6 +175,7 @@ def _readings(estimate: Trajectory, reference: Trajectory) -> Iterator[_Reading]
             shifted = replace(reference, times_s=reference.times_s + by * step_s)
             when = f"the truth may be one frame too {'early' if by > 0 else 'late'}"
             yield _Reading(estimate, shifted, when, f"give --time-offset {-by * step_s:.6g}")
+    yield from (_Reading(*read) for read in clock_readings(estimate, reference))
 
 
 def _of_rotation(estimate: Trajectory, reference: Trajectory, errors: _Errors) -> str:

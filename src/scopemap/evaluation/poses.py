@@ -6,7 +6,7 @@ Poses are camera to world, (N, 4, 4) float64, mm, matched row by row. Definition
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from scopemap.evaluation.turn import NOT_DETERMINED, Turn
 from scopemap.input.trajectory.trajectory import Trajectory, path_length_mm
 
 MIN_MATCHED = 3
+_MS_PER_S = 1000.0
 # evo's 0.01 s, and a little over, since decimal time stamps are not exact in binary.
 _MOST_GAP_S = 0.01 + 1e-9
 # A pair over a path length is kept if its path differs by at most this share (evo's `rel_delta_tol`).
@@ -216,9 +217,27 @@ def _too_few(estimate: Trajectory, reference: Trajectory, found: int) -> str:
     spans = [f"{values[0]:.10g}..{values[-1]:.10g}" if len(values) else "none" for values in stamps]
     start = f"cannot compare the trajectories: {found} tracked frames match, at least {MIN_MATCHED} are needed; "
     if gap == 0:
-        return f"{start}frame numbers are {spans[0]} and {spans[1]}{_numbered_otherwise(estimate, reference)}"
+        otherwise = _numbered_otherwise(estimate, reference) or _clocked_otherwise(estimate, reference)
+        return f"{start}frame numbers are {spans[0]} and {spans[1]}{otherwise}"
     times = f"time stamps are {spans[0]} s and {spans[1]} s (30 frames per s where a file has none)"
-    return f"{start}{times}; frame numbers as stamps match too"
+    otherwise = _clocked_otherwise(estimate, reference) or "; frame numbers as stamps match too"
+    return f"{start}{times}{otherwise}"
+
+
+def in_milliseconds(trajectory: Trajectory) -> Trajectory:
+    """Return a trajectory whose time stamps, or frame numbers, are taken for milliseconds."""
+    stamps = trajectory.indices if trajectory.has_indices else trajectory.times_s
+    return replace(trajectory, times_s=stamps / _MS_PER_S, has_indices=False)
+
+
+def _clocked_otherwise(estimate: Trajectory, reference: Trajectory) -> str:
+    """Return that time stamps would match if those of one side were milliseconds, in words; "" if not."""
+    pairs = {"truth": (estimate, in_milliseconds(reference)), "trajectory": (in_milliseconds(estimate), reference)}
+    shared = {whose: len(associate(*pair)[0]) for whose, pair in pairs.items()}
+    whose = max(shared, key=lambda one: shared[one])
+    if shared[whose] < max(MIN_MATCHED, min(len(estimate), len(reference)) / 2):
+        return ""
+    return f"; {shared[whose]} would match if the {whose}'s stamps were milliseconds: its first line may say # time: ms"
 
 
 def _numbered_otherwise(estimate: Trajectory, reference: Trajectory) -> str:

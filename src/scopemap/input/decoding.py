@@ -7,7 +7,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -157,3 +157,14 @@ def by_number(files: Iterable[Path]) -> dict[int, Path]:
             raise InputError(f"reading {file.parent}: {found[number].name} and {file.name} have the same number")
         found[number] = file
     return dict(sorted(found.items()))
+
+
+def frames_later(files: Sequence[int], frames: Sequence[int]) -> int:
+    """Return by how much the numbers of files must change so that both begin and end alike: 0, 1 or -1.
+
+    files, frames : ascending numbers, which may be none.
+    """
+    if not files or not frames:
+        return 0
+    ends = frames[0] - min(files), frames[-1] - max(files)
+    return ends[0] if ends[0] == ends[1] and abs(ends[0]) == 1 else 0

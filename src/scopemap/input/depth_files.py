@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from scopemap.engine.config import DepthSettings
 from scopemap.engine.depth.estimate import DepthEstimate, DepthKind
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
-from scopemap.input.decoding import by_number, frame_number, read_decoded
+from scopemap.input.decoding import by_number, frame_number, frames_later, read_decoded
 
 _IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _NUMPY = ".npy"
@@ -53,10 +53,12 @@ class FilesOfInput:
     """What an input knows of depth files.
 
     scale_mm : mm per unit by its calibration, or None. pictures : its pictures by frame number, none of a video.
+    numbers : of all its frames, ascending; none where they are unknown.
     """
 
     scale_mm: float | None = None
     pictures: Mapping[int, Path] = field(default_factory=dict)
+    numbers: Sequence[int] = ()
 
 
 class FilesDepth:
@@ -66,7 +68,8 @@ class FilesDepth:
     rectifier : from the source camera to the working camera.
     of_input : what the input knows of them.
     kind : of the values. kind_is_stated : whether a setting, or a file beside them, says so. kind_reason : why they are
-    of this kind where it is implied; "": a guess.
+    of this kind where it is implied; "": a guess. later : by how many frames a file belongs to another frame than its
+    number says: 1 or -1 where they are numbered from 1 and the frames from 0, or the other way round.
 
     Raises `InputError` where the folder does not exist, holds no usable file, or two files for one frame.
     """
@@ -79,9 +82,12 @@ class FilesDepth:
         of_input = of_input or FilesOfInput()
         self._folder, self._rectifier = Path(folder), rectifier
         self._files = depth_files(self._folder, of_input.pictures)
+        self._is_rectified = (self._folder / "depth.json").exists()
+        # The files of a run have its frames' numbers.
+        self.later = 0 if self._is_rectified else frames_later(list(self._files), of_input.numbers)
+        self._files = {number + self.later: file for number, file in self._files.items()}
         first = _read(next(iter(self._files.values())))
         self._only_type = first.dtype if settings.files_kind == "auto" else None
-        self._is_rectified = (self._folder / "depth.json").exists()
         stated = _scale_in(self._folder)
         self.kind_is_stated = settings.files_kind != "auto" or stated is not None
         self.kind, self.kind_reason = self._kind_of(first, settings)

@@ -113,7 +113,8 @@ def _one_series(folder: Path, files: list[Path], notes: list[str]) -> list[Path]
         if (number := frame_number(file)) is not None:
             head = _LAST_NUMBER.sub("#", file.stem)
             is_camera = any(word.lower() in _CAMERA for word in _WORD.findall(head))
-            by_form[head if is_camera else re.sub(r"\d+", "#", file.stem)][number] = file
+            form = head if is_camera else re.sub(r"\d+", "#", file.stem)
+            by_form[form + file.suffix.lower()][number] = file  # 0000.jpg beside its mask 0000.png
     first, *others = sorted(by_form.values(), key=len, reverse=True) or [{}]
     mixed = [first, *(other for other in others if 2 * len(first.keys() & other.keys()) > len(other) > 1)]
     if not 1 < len(mixed) <= _FEW_CAMERAS or decimal_numbers(files) is not None:

@@ -15,7 +15,7 @@ from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.kept import Kept
 from scopemap.engine.masking.masker import disc
 from scopemap.engine.notices import Notice
-from scopemap.input.decoding import by_number, frame_number, read_decoded
+from scopemap.input.decoding import by_number, frame_number, frames_later, read_decoded
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _LOSSY = (".jpg", ".jpeg")
@@ -63,7 +63,7 @@ class MaskFiles:
         self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
         self._files, self._single = _numbered(self._folder)
         self._numbers = range(0) if numbers is None else numbers
-        self._later = _frames_later(list(self._files), self._numbers)
+        self._later = frames_later(list(self._files), self._numbers)
         self._files = {number + self._later: file for number, file in self._files.items()}
         self._asked, self._hides, self._level = set(), False, 0
 
@@ -128,14 +128,6 @@ class MaskFiles:
         gapless = len(own) > 1 and own[-1] - own[0] == len(own) - 1
         begins = bool(self._numbers) and self._numbers[0] in self._asked and own[:1] == [self._numbers[0] + 1]
         return not self._later and gapless and begins
-
-
-def _frames_later(masks: list[int], frames: Sequence[int]) -> int:
-    """Return by how much the numbers of masks must change so that both begin and end alike: 0, 1 or -1."""
-    if not masks or not frames:
-        return 0
-    ends = frames[0] - min(masks), frames[-1] - max(masks)
-    return ends[0] if ends[0] == ends[1] and abs(ends[0]) == 1 else 0
 
 
 def _numbered(folder: Path) -> tuple[dict[int, Path], Path | None]:

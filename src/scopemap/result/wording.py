@@ -109,6 +109,9 @@ WORDINGS: dict[str, Wording] = {
     "depth-propagated": Wording(
         "The network estimated depth in one frame in {every}; optical flow propagated it to {frames:frame}."
     ),
+    "depth-files-shifted": Wording(
+        "The depth files in {folder} begin and end one number from the frames: each is used {shift:+.0f} frame from it."
+    ),
     "depth-files-kind": Wording("The depth files hold {kind}: {reason}.", "If that is wrong, set depth.files_kind."),
     "frames-skipped": Wording("{frames:frame} without usable texture were skipped: {causes}."),
     "frames-few": Wording("Only {frames:frame} are in the result: too few to judge it."),

@@ -95,7 +95,7 @@ def _need_weights(config: Config) -> None:
 def _files_of(sequence: Sequence) -> FilesOfInput:
     from scopemap.input.depth_files import FilesOfInput
 
-    return FilesOfInput(sequence.depth_scale_mm, sequence.source.picture_files())
+    return FilesOfInput(sequence.depth_scale_mm, sequence.source.picture_files(), sequence.numbers or ())
 
 
 def missing_weights(config: Config, *other_flows: str, verified: bool = False) -> list[str]:

@@ -41,6 +41,8 @@ def with_files_judged(
         config, estimators = config.model_copy(update={"depth": settings}), replace(estimators, depth=depth)
     if depth.is_in_mm and (depth.kind == "measured" or (depth.kind == "depth" and not config.depth.is_anchored)):
         check_unit(depth, config.depth.near_far_mm)
+    if depth.later:
+        notices = [*notices, Notice("depth-files-shifted", {"folder": str(depth.folder), "shift": depth.later})]
     return config, estimators, notices
 
 

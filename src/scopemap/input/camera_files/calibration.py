@@ -122,8 +122,12 @@ def fitted(calibration: Calibration, image_size: Size, fit: str = "exact") -> Ca
 
 
 def _size_of_centre(central: PinholeCamera) -> Size | None:
-    """Return the standard size that the principal point is the middle of, far from that of the images; None: none."""
+    """Return the standard size that the principal point is the middle of, exactly or far from the images'; or None."""
     size, twice = (central.width, central.height), (2 * central.cx + 1, 2 * central.cy + 1)
+    # Exact middles were set, not calibrated, counted from the first pixel's centre or its corner.
+    nominal = [tuple(two - from_corner for two in twice) for from_corner in (0.0, 1.0)]
+    if size not in nominal and (other := next((one for one in _STANDARD_SIZES if one in nominal), None)):
+        return other
     if all(abs(two - side) <= 2 * _OFF_CENTRE * side for two, side in zip(twice, size, strict=True)):
         return None
     for other in _STANDARD_SIZES:

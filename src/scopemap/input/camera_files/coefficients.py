@@ -41,7 +41,7 @@ _STRAY = re.compile(r"(k|p|s|kc)\d{1,2}|tau[xy12]|omega")
 _UNREAD = re.compile(r"(?<!un)dist(?!anc|rib)|coef|radial|tangential|^param(eter)?s$", re.IGNORECASE)
 # Counts, settings and precisions of a lens, and the second camera's, are not its coefficients.
 _BESIDE = re.compile(
-    r"num|count|estim|flag|model$|type$|fix|zero|max|min|std|sigma|err|uncert|cov|rms|right|inverse|depth|2$|_r$|distr$|coeffs?r$",
+    r"num|count|intrinsic|estim|flag|model$|type$|fix|zero|max|min|std|sigma|err|uncert|cov|rms|right|inverse|depth|2$|_r$|distr$|coeffs?r$",
     re.IGNORECASE,
 )
 _LONGEST_QUOTE = 40

@@ -11,6 +11,7 @@ from scopemap.input.camera_files.parsing import Fields, xml_root
 
 _ADVICE = "export it from Metashape as OpenCV XML (Tools, Camera Calibration), or calibrate with a frame camera"
 _FRAME = "frame"
+_ADJUSTED = "adjusted"
 _CORNER_TO_CENTRE_PX = 0.5
 _OTHERS = ("k4", "p3", "p4")
 _LENS = ("k1", "k2", "p2", "p1", "k3")
@@ -24,7 +25,7 @@ def metashape_fields(text: str) -> Fields | None:
     if "<projection>" not in text and "<sensor" not in text:
         return None
     root = xml_root(text)
-    calibration = root if root.tag == "calibration" else root.find(".//sensor/calibration")
+    calibration = root if root.tag == "calibration" else _only(root.findall(".//sensor"))
     if calibration is None:
         return None
     model = (calibration.findtext("projection") or calibration.get("type") or "").strip()
@@ -33,6 +34,16 @@ def metashape_fields(text: str) -> Fields | None:
     if calibration.find("f") is None:
         raise ValueError(f"it has no f: it is of PhotoScan, whose conventions changed; {_ADVICE}")
     return _frame(calibration)
+
+
+def _only(sensors: list[Element]) -> Element | None:
+    """Return the calibration of the one sensor that has any: the adjusted one, where the initial one is beside it."""
+    found = [calibrations for sensor in sensors if (calibrations := sensor.findall("calibration"))]
+    if len(found) > 1:
+        raise ValueError(f"it is Metashape's and holds {len(found)} cameras: leave the one of these images in it")
+    calibrations = found[0] if found else []
+    adjusted = [one for one in calibrations if one.get("class") == _ADJUSTED]
+    return next(iter(adjusted or calibrations), None)
 
 
 def _frame(calibration: Element) -> Fields:

@@ -173,6 +173,12 @@ _EXPORT = "calibrate with `scopemap calibrate`, or write one line fx fy cx cy [k
 _NAMED: tuple[tuple[str, Callable[[str], Any]], ...] = (
     ("the text of Bouguet's toolbox; its Calib_Results.mat is read", re.compile(r"^\s*fc\s*=\s*\[", re.M).search),
     ("Kalibr's report; its camchain.yaml is read", re.compile(r"projection:.*\+-|reprojection error:").search),
+    ("ROS' ost.txt; the ost.yaml beside it is read", re.compile(r"^# oST version", re.M).search),
+    (f"HALCON's; {_EXPORT}", re.compile(r"^ParGroup: Cam_Par", re.M).search),
+    (
+        "written with decimal commas; write points (fx: 900.5)",
+        re.compile(r"""\b[fc][xy]"?\s*[:=]\s*-?\d+,\d|\d,\d+\s*[,;]\s+-?\d+(,\d+)?\s*[,;]\s+-?\d+,\d""").search,
+    ),
     (f"OpenMVG's; {_EXPORT}", re.compile(r'"(polymorphic_name|sfm_data_version)"').search),
     (f"Pix4D's; {_EXPORT}", re.compile(r"pix4d|^\s*FOCAL\s+\d", re.I | re.M).search),
     (

@@ -32,7 +32,7 @@ _ENDING = re.compile(r"[_.-]?(x|y|z)[_.-](mm|m)$", re.IGNORECASE)  # tx_mm
 _TIME_UNIT = re.compile(r"(?:.*_)?(n|nano|u|µ|micro|m|milli|)s(?:ec|ecs|econds?)?", re.IGNORECASE)
 _TIME_PREFIXES = {"": "s", "n": "ns", "nano": "ns", "u": "us", "µ": "us", "micro": "us", "m": "ms", "milli": "ms"}
 _MOST_FRAMES = 1e9  # whole seconds since 1970 are more
-# Whole stamps that step by so much count no frames: they are microseconds or less.
+# Stamps that step by so much count no frames and no seconds: they are microseconds or less.
 _LEAST_STEP = 1e4
 # Seconds since 1970 have ten digits until 2286; stamps with more are of a smaller unit.
 _MOST_SECONDS = 1e11
@@ -121,9 +121,8 @@ def stamps_s(stamps: np.ndarray, unit: str = "") -> tuple[np.ndarray, str]:
     found = unit
     if not unit:
         step, most = _usual_step(stamps), float(np.abs(stamps).max(initial=0))
-        is_whole = bool(np.all(stamps == np.round(stamps)))
         found = "s"
-        if most >= _MOST_SECONDS or (is_whole and step >= _LEAST_STEP):
+        if most >= _MOST_SECONDS or step >= _LEAST_STEP:
             by_step = [name for name, p in _POWERS.items() if _STEPS_S[0] <= step / 10**p < _STEPS_S[1]]
             by_size = [name for name, p in _POWERS.items() if most / 10**p < _MOST_SECONDS]
             found = [*by_step, *by_size, "ns"][0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,10 @@ from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
 _TIMED_COLUMNS = 17
 EUROC_FILES = ("mav0/state_groundtruth_estimate0/data.csv", "state_groundtruth_estimate0/data.csv")
+_LONGEST_QUOTE = 40
+# Every number has the comma but a whole one, such as a time of 0.
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?")
+_FEWEST_OF_POSE = 7
 _UNIT_LENGTH = 1e-2  # tolerance of a quaternion's length
 
 
@@ -86,7 +91,12 @@ def text_lines(path: Path) -> list[str]:
     with reporting(f"cannot read {path}"):
         if path.exists() and not path.is_file():  # a pipe would be waited for
             raise ValueError("it is no file")
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        content = path.read_bytes()
+        is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # what PowerShell's > writes
+        try:
+            return content.decode("utf-16" if is_utf16 else "utf-8-sig").splitlines()
+        except UnicodeDecodeError:
+            raise ValueError("it is no text: poses are read from text files of numbers, docs/formats.md") from None
 
 
 def fields_of(line: str) -> list[str]:
@@ -104,10 +114,9 @@ def read_rows(path: Path, *, missing: bool = False) -> list[tuple[int, list[floa
         fields = fields_of(line)
         if not rows and named_columns(line) is not None:  # a header, marked as a comment or not
             continue
-        try:
-            row = [float(field) for field in fields]
-        except ValueError as error:
-            raise InputError(f"{path}, line {number}: expected numbers ({error}); mark comments by '#'") from None
+        if _has_decimal_commas(line):
+            raise InputError(f"{path}, line {number}: it has decimal commas ({line.split()[0][:40]}): write points")
+        row = [_number(field, f"{path}, line {number}") for field in fields]
         if not missing and not np.all(np.isfinite(row)):
             raise InputError(f"{path}, line {number}: a pose holds NaN or infinity; leave out frames without a pose")
         if row:
@@ -115,6 +124,20 @@ def read_rows(path: Path, *, missing: bool = False) -> list[tuple[int, list[floa
     if not rows:
         raise InputError(f"reading {path}: it holds no pose")
     return rows
+
+
+def _number(field: str, where: str) -> float:
+    try:
+        return float(field)
+    except ValueError:
+        found = f"expected numbers, found {field[:_LONGEST_QUOTE]!r}"
+        raise InputError(f"{where}: {found}; mark comments by '#'") from None
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """Return whether a line has the numbers of a pose, each written with a comma for the point."""
+    words = line.partition("#")[0].replace(";", " ").split()
+    return len(words) >= _FEWEST_OF_POSE and "," in line and all(map(_DECIMAL_COMMA.fullmatch, words))
 
 
 def read_numbers(path: Path, *, missing: bool = False) -> NumberTable:
