@@ -64,4 +64,4 @@ def test_a_bare_loop_gives_what_the_runner_gives(changes: dict[str, str], tmp_pa
     found = [notice.code for notice in surface.notices]
     assert "fusion-scaled" in found
     assert [code for code in _codes(result) if code in found] == found
-    assert surface.is_confirmed == ("mapping-none" not in _codes(result))
+    assert surface.is_checked == ("mapping-none" not in _codes(result))
