@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,16 +14,15 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.cameras.rectification import Rectifier
 from scopemap.engine.errors import ScopemapError
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.texture import textured_mesh
+from scopemap.engine.fusion.texture import MOST_UNSEEN, textured_mesh
 from scopemap.engine.fusion.texture_views import choose_views, spread
+from scopemap.engine.pipeline import Pipeline
 from scopemap.input.sequence import Sequence as InputSequence
 from scopemap.input.source import Source, SourceFrame
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 
-if TYPE_CHECKING:
-    from scopemap.runner.run import Run
-
+Progress = Callable[[str, int, int], None]
 # Frames of a surface, spread over its time, of which its views are chosen: each is rendered once.
 _CANDIDATES = 24  # by hand
 _ALIGNED_TO = 6  # by hand, for time: of these, the frames to whose common place views are aligned
@@ -31,18 +30,21 @@ _ONCE_ONLY = ("live", "pictures")
 """Names of sources whose pictures cannot be read a second time."""
 
 
-def put_textures(result: Result, run: Run) -> None:
+def put_textures(result: Result, sequence: InputSequence, pipeline: Pipeline, progress: Progress) -> None:
     """Give the surface of a run's result, and those of its other submaps, a texture, where stored frames show it.
 
     Without stored frames, and where the settings ask for none, the surfaces keep the colours of their vertices.
+    progress : called before.
     """
-    store, clock = run.pipeline.fusion.store, run.clock
-    if run.pipeline.config.fusion.colours != "texture" or not run.pipeline.fusion.at_end:
+    if pipeline.config.fusion.colours != "texture" or not pipeline.fusion.at_end:
         return
-    run.progress("texturing", 0, 0)
+    progress("texturing", 0, 0)
+    started = time.perf_counter()
     for one in result.submaps:
-        one.textured = clock.timed("texture", textured, one.mesh, frames_of_surface(one), store.frame, run.sequence)
-    result.provenance["seconds"] = {part: round(seconds, 3) for part, seconds in clock.seconds.items()}
+        one.textured = textured(one.mesh, frames_of_surface(one), pipeline.fusion.store.frame, sequence)
+    elapsed_s = round(time.perf_counter() - started, 3)
+    seconds = result.provenance["seconds"]
+    seconds |= {"texture": elapsed_s, "total": round(seconds["total"] + elapsed_s, 3)}
 
 
 def frames_of_surface(result: Result) -> FrameTable:
@@ -68,7 +70,7 @@ def textured(
 
     candidates = spread(list(pose_of), quality, _CANDIDATES)
     numbers, label = choose_views(mesh, map(posed, candidates))
-    if not numbers:
+    if not numbers or np.sum(label < 0) > MOST_UNSEEN:
         return None
     views = [posed(index) for index in numbers]
     read = _Pictures(sequence, views)

@@ -18,7 +18,7 @@ from rectpack import SORT_LSIDE, PackingBin, PackingMode, SkylineBlWm, newPacker
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.texture_alignment import SurfaceShift
+from scopemap.engine.fusion.texture_alignment import shifts_px
 from scopemap.engine.fusion.texture_levels import ChartVertices, chart_vertices, level_gains
 from scopemap.engine.fusion.texture_views import pieces_of
 from scopemap.engine.geometry.kernels import kernel
@@ -29,6 +29,8 @@ LARGEST_PX = 4096
 """Largest side of a texture: what every graphics card of the last ten years shows (WebGL 2 on phones, too)."""
 _BLEED_PX = 4  # by hand: around each chart its border goes on, for a viewer that shrinks the texture by up to 4
 _CELL_PX = 4  # what linear interpolation at the three corners of a cell of 1 px looks at, and a pixel around it
+MOST_UNSEEN = LARGEST_PX**2 // (2 * _CELL_PX**2)
+"""Most triangles without a view: the cells of more would leave too little of the largest texture for the charts."""
 _GROWN = 1.06  # by hand: of the texture's side, from one attempt to place all charts to the next
 _SHRUNK = 0.85  # by hand: of the pictures, where charts do not fit into the largest texture
 _SMALLEST_PX = 64
@@ -102,12 +104,12 @@ def _shown_at(
     mesh: trimesh.Trimesh, places: ChartVertices, view: np.ndarray, frames: Sequence[Frame], others: Sequence[Frame]
 ) -> np.ndarray:
     """Return where the frames show the vertices of their charts, (N, 2), px of the frames."""
-    pixels, vertices, shifts = np.zeros((len(places.vertex), 2)), np.asarray(mesh.vertices), SurfaceShift(mesh, others)
-    for number, frame in enumerate(frames):
+    pixels, vertices = np.zeros((len(places.vertex), 2)), np.asarray(mesh.vertices)
+    for number, (frame, shift_px) in enumerate(zip(frames, shifts_px(mesh, frames, others), strict=True)):
         assert frame.T_world_camera is not None
         own = np.flatnonzero((places.chart >= 0) & (view[places.chart] == number))
         at = frame.camera.project(transform(inverse(frame.T_world_camera), vertices[places.vertex[own]]))
-        pixels[own] = at + _sampled(shifts.shift_px(frame), at)
+        pixels[own] = at + _sampled(shift_px, at)
     return pixels
 
 

@@ -8,7 +8,7 @@ optimization", SIGGRAPH 2014, find such a place by joint optimisation of poses a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -31,49 +31,50 @@ _LEAST_LEVEL = 8.0  # by hand: darker levels are noise
 _EDGE_PX = 5  # by hand: where the mask of what both show is left out
 
 
-class SurfaceShift:
-    """The shifts of frames, by a mesh, world mm, and other frames with pose and mask that show it."""
+def shifts_px(mesh: trimesh.Trimesh, frames: Sequence[Frame], others: Sequence[Frame]) -> Iterator[np.ndarray]:
+    """Yield, for each frame, how far from where its pose places a point of the surface the frame shows it.
 
-    def __init__(self, mesh: trimesh.Trimesh, others: Sequence[Frame]) -> None:
-        self._mesh, self._flow = mesh, DisFlow()
-        self._others = [(one, np.nan_to_num(self._depth_mm(one))) for one in others]
+    mesh : world mm. frames, others : with pose and mask. Each shift is (H, W, 2) float32, px to the right and down, at
+    the pixels where the poses place the points: the mean over the frame itself and the others, 0 where nothing of the
+    surface is seen.
+    """
+    flow_of = DisFlow()
+    seen_by = [(one, np.nan_to_num(_depth_mm(mesh, one))) for one in others]
+    for frame in frames:
+        yield _shift_px(_depth_mm(mesh, frame), frame, seen_by, flow_of)
 
-    def shift_px(self, frame: Frame) -> np.ndarray:
-        """Return, for each pixel where the pose places a point of the surface, how far from it the frame shows it.
 
-        (H, W, 2) float32, px, to the right and down. Of the frame itself and the others the mean; 0 where nothing of
-        the surface is seen.
-        """
-        depth_mm = self._depth_mm(frame)
-        assert frame.T_world_camera is not None
-        seen = np.isfinite(depth_mm)
-        points = transform(frame.T_world_camera, frame.camera.rays * np.where(seen, depth_mm, 1)[..., None])
-        total, weight = np.zeros((*depth_mm.shape, 2), np.float32), np.ones(depth_mm.shape, np.float32)
-        sigma_px = max(1.0, _SMOOTHED * frame.camera.width)
-        for other, other_mm in self._others:
-            if other.index == frame.index:
-                continue
-            assert other.T_world_camera is not None
-            in_other = transform(inverse(other.T_world_camera), points)
-            pixels = np.nan_to_num(other.camera.project(in_other), nan=-1e4).astype(np.float32)
-            x, y = np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
-            there_mm = cv2.remap(other_mm, x, y, cv2.INTER_NEAREST)
-            both = cv2.remap(other.valid.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
-            both &= seen & frame.valid & (np.abs(there_mm / in_other[..., 2] - 1) < _SAME_SURFACE)
-            if both.mean() < _LEAST_OVERLAP:
-                continue
-            flow = self._flow.estimate_small(
-                _even(cv2.remap(other.rgb, x, y, cv2.INTER_LINEAR), both), _even(frame.rgb, both)
-            )
-            trusted = both & (np.hypot(*np.moveaxis(flow, -1, 0)) < _LARGEST_SHIFT * frame.camera.width)
-            share = cv2.erode(trusted.astype(np.float32), np.ones((_EDGE_PX, _EDGE_PX), np.uint8))
-            total += cv2.GaussianBlur(flow * share[..., None], (0, 0), sigma_px)
-            weight += cv2.GaussianBlur(share, (0, 0), sigma_px)
-        return total / weight[..., None]
+def _shift_px(
+    depth_mm: np.ndarray, frame: Frame, others: Sequence[tuple[Frame, np.ndarray]], flow_of: DisFlow
+) -> np.ndarray:
+    assert frame.T_world_camera is not None
+    seen = np.isfinite(depth_mm)
+    points = transform(frame.T_world_camera, frame.camera.rays * np.where(seen, depth_mm, 1)[..., None])
+    total, weight = np.zeros((*depth_mm.shape, 2), np.float32), np.ones(depth_mm.shape, np.float32)
+    sigma_px = max(1.0, _SMOOTHED * frame.camera.width)
+    for other, other_mm in others:
+        if other.index == frame.index:
+            continue
+        assert other.T_world_camera is not None
+        in_other = transform(inverse(other.T_world_camera), points)
+        pixels = np.nan_to_num(other.camera.project(in_other), nan=-1e4).astype(np.float32)
+        x, y = np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
+        there_mm = cv2.remap(other_mm, x, y, cv2.INTER_NEAREST)
+        both = cv2.remap(other.valid.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
+        both &= seen & frame.valid & (np.abs(there_mm / in_other[..., 2] - 1) < _SAME_SURFACE)
+        if both.mean() < _LEAST_OVERLAP:
+            continue
+        flow = flow_of.estimate_small(_even(cv2.remap(other.rgb, x, y, cv2.INTER_LINEAR), both), _even(frame.rgb, both))
+        trusted = both & (np.hypot(*np.moveaxis(flow, -1, 0)) < _LARGEST_SHIFT * frame.camera.width)
+        share = cv2.erode(trusted.astype(np.float32), np.ones((_EDGE_PX, _EDGE_PX), np.uint8))
+        total += cv2.GaussianBlur(flow * share[..., None], (0, 0), sigma_px)
+        weight += cv2.GaussianBlur(share, (0, 0), sigma_px)
+    return total / weight[..., None]
 
-    def _depth_mm(self, frame: Frame) -> np.ndarray:
-        assert frame.T_world_camera is not None
-        return render_mesh(self._mesh, frame.camera, frame.T_world_camera).depth_mm
+
+def _depth_mm(mesh: trimesh.Trimesh, frame: Frame) -> np.ndarray:
+    assert frame.T_world_camera is not None
+    return render_mesh(mesh, frame.camera, frame.T_world_camera).depth_mm
 
 
 def _even(rgb: np.ndarray, known: np.ndarray) -> np.ndarray:
