@@ -64,7 +64,7 @@ def draw_run(folder: Path, file: Path, number: int | None = None) -> None:
     depth_mm, pose = run.depth.read(frame.index), row["T_world_camera"]
     if depth_mm is None:
         raise SystemExit(f"{folder} kept no depth of frame {frame.index}")
-    albedo = run.config.fusion.colours == "albedo"
+    albedo = run.config.fusion.without_light
     _, rendering = compare_with_frame(run.mesh, frame.camera, pose, frame.rgb, depth_mm, albedo=albedo)
     draw_surface(run, frame, pose, rendering, file)
     if file.stat().st_size > MOST_BYTES:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError, reporting
-from scopemap.engine.fusion.mesh_files import read_mesh, save_mesh
+from scopemap.engine.fusion.mesh_files import read_mesh, read_textured, save_mesh
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import Trajectory, write_tum
 from scopemap.result.depth_maps import DepthReader
@@ -83,9 +83,7 @@ class Result:
             "config": config,
             "provenance": {} if provenance is None else provenance,
             "source_camera": source_camera,
-            "others": [],
-            "segments": [],
-        }
+        } | {"others": [], "segments": [], "textured": None}
         return result
 
     def with_segments(self, segments: list[SurfaceSegment], surfaces: list[trimesh.Trimesh]) -> Result:
@@ -192,6 +190,11 @@ class Result:
     def mesh(self) -> trimesh.Trimesh:
         """The surface, world mm, with colours and attributes of its vertices; empty where there is none."""
         return read_mesh(self.folder / "mesh.ply")
+
+    @cached_property
+    def textured(self) -> trimesh.Trimesh | None:
+        """The triangles of `mesh`, in their order, with a texture of the video's frames; None where there is none."""
+        return read_textured(self.folder / "mesh.glb")
 
     @cached_property
     def segments(self) -> list[SurfaceSegment]:
@@ -370,7 +373,7 @@ class Result:
             folder.mkdir(parents=True, exist_ok=True)
             scale = scale_words(self.provenance.get("scale", {}))
             write_tum(folder / "trajectory.tum", self.trajectory, comment=scale)
-            save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb", comment=scale)
+            save_mesh(self.mesh, folder / "mesh.ply", folder / "mesh.glb", comment=scale, textured=self.textured)
             surfaces = [self.surface(one.segment) for one in self.segments]
             save_segments(self.segments, surfaces, folder, comment=scale)
             sigma_px = self.provenance.get("camera", {}).get("focal_sigma_px")

@@ -219,10 +219,12 @@ class Run:
         """Return the reconstruction of the largest submap with those of the others. Raises `InputError` without one."""
         result = _Finishing(self, self.table, prepared + self.plan.notices).result()
         last = self.frames.last_index if self.interrupted else None
-        facts = {"interrupted_at_frame": last, "resumed_after_frame": self.resumed_after}
+        from scopemap.runner.texturing import put_textures  # not loaded before there is a surface
+
+        put_textures(result, self.sequence, self.pipeline, self.progress)
         notices = notices_of_end(result.frames, last, self.kept_maps.forgotten, self.kept_maps.limits)
-        result.provenance.update(facts)
         result.provenance["notices"] += facts_of_notices(notices)
+        result.provenance |= {"interrupted_at_frame": last, "resumed_after_frame": self.resumed_after}
         return result
 
 

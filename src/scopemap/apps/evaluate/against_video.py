@@ -152,7 +152,7 @@ class RunFrames:
         for frame in self.frames():
             mesh = surfaces.get(self._segment_of(frame.index), trimesh.Trimesh())
             view, depth_mm = render_mesh(mesh, frame.camera, _pose(frame)), _usable_depth(frame)
-            if self._fusion.colours == "albedo":
+            if self._fusion.without_light:
                 view = lit_like(view, frame.camera, frame.rgb, depth_mm)
             agreement = compare_rendering(view, frame.rgb, depth_mm, perceptual)
             if frame.index not in held_out:

@@ -103,9 +103,14 @@ def export_run(
         with TemporaryDirectory(dir=out.parent, prefix=".unfinished-") as place:
             unfinished = Path(place) / out.name
             form.write(run, unfinished, unit or form.units[0], axes or form.axes[0])
+            beside = [path for path in Path(place).iterdir() if path != unfinished]
+            for path in beside:
+                if (out.parent / path.name).exists():
+                    raise InputError(f"{out.parent / path.name} exists; give another name with --out")
             if out.is_dir():
                 out.rmdir()
-            unfinished.rename(out)
+            for path in [*beside, unfinished]:
+                path.rename(out.parent / path.name)
     except OSError as error:
         raise InputError(f"cannot write {out}: {error.strerror or error}") from None
     return run.scale

@@ -17,7 +17,7 @@ import trimesh
 
 from scopemap.apps.export.slicer_markups import markup, write_markups
 from scopemap.engine.errors import InputError
-from scopemap.engine.fusion.mesh_files import ply_bytes, save_mesh
+from scopemap.engine.fusion.mesh_files import ply_bytes, save_mesh, texture_jpeg
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit
 from scopemap.result.result import Result
@@ -42,7 +42,8 @@ _STL_HEADER_BYTES = 80
 def write_surface(run: Result, file: Path, unit: Unit, axes: Axes) -> None:
     """Write the mesh as `file`, whose name ends in .ply, .obj or .stl; the last has no colours and no space for much.
 
-    Raises `InputError` where the run has no surface.
+    Where the run's GLB has a texture the OBJ has it, too, by an .mtl and a .jpg of its name beside it. Raises
+    `InputError` where the run has no surface.
     """
     ending = file.suffix.lower()
     if ending == ".stl":
@@ -51,9 +52,28 @@ def write_surface(run: Result, file: Path, unit: Unit, axes: Axes) -> None:
     mesh, about = _surface_of(run, unit, axes), _about(run, unit, axes)
     if ending == ".ply":
         file.write_bytes(ply_bytes(mesh, about))
+    elif run.textured is not None:
+        _write_textured_obj(_turned(run.textured, unit, axes), file, about)
     else:
         text = trimesh.exchange.obj.export_obj(mesh, header=None)
         file.write_text("".join(f"# {line}\n" for line in about) + text, encoding="utf-8")
+
+
+def _write_textured_obj(textured: trimesh.Trimesh, file: Path, about: list[str]) -> None:
+    """Write a mesh with a texture as OBJ, with the material and the picture beside it."""
+    material, picture = file.with_suffix(".mtl"), file.with_suffix(".jpg")
+    picture.write_bytes(texture_jpeg(textured))
+    # Without ambient and specular light; Wavefront, "MTL material format", 1995.
+    lines = ["newmtl texture", "Ka 0 0 0", "Kd 1 1 1", "Ks 0 0 0", "illum 1", f"map_Kd {picture.name}"]
+    material.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    text = trimesh.exchange.obj.export_obj(textured, header=None, include_texture=False, include_normals=True)
+    uv: Any = textured.visual
+    head = [*(f"# {line}" for line in about), f"mtllib {material.name}", "usemtl texture"]
+    vertices = [line for line in text.splitlines() if line.startswith(("v ", "vn "))]
+    places = [f"vt {u:.6f} {v:.6f}" for u, v in uv.uv.tolist()]
+    corners = (textured.faces + 1).tolist()
+    faces = ["f " + " ".join(f"{corner}/{corner}/{corner}" for corner in face) for face in corners]
+    file.write_text("\n".join([*head, *vertices, *places, *faces]) + "\n", encoding="utf-8")
 
 
 def write_surfaces(run: Result, folder: Path, unit: Unit, axes: Axes) -> None:
@@ -80,7 +100,7 @@ def stl_bytes(run: Result, unit: Unit, axes: Axes) -> bytes:
 
 def write_glb(run: Result, file: Path) -> None:
     """Write the mesh as GLB: metres and y up, which glTF prescribes."""
-    save_mesh(_surface_of(run, "mm", "opencv"), glb_file=file, comment=run.scale)
+    save_mesh(_surface_of(run, "mm", "opencv"), glb_file=file, comment=run.scale, textured=run.textured)
 
 
 def write_slicer(run: Result, folder: Path) -> None:
@@ -108,6 +128,13 @@ def _surface_of(run: Result, unit: Unit, axes: Axes) -> trimesh.Trimesh:
     if not len(run.mesh.faces):
         raise InputError(f"{run.path}: the run has no surface to export")
     return _converted(run.mesh, unit, axes)
+
+
+def _turned(textured: trimesh.Trimesh, unit: Unit, axes: Axes) -> trimesh.Trimesh:
+    """Return a surface with a texture, world mm, in another unit and with other axes."""
+    R = _R_FILE_WORLD[axes]
+    vertices, normals = textured.vertices @ R.T / MM_PER_UNIT[unit], textured.vertex_normals @ R.T
+    return trimesh.Trimesh(vertices, textured.faces, vertex_normals=normals, visual=textured.visual, process=False)
 
 
 def _converted(mesh: trimesh.Trimesh, unit: Unit, axes: Axes) -> trimesh.Trimesh:

@@ -77,9 +77,10 @@ def run(
         ),
     ] = None,
     colours: Annotated[
-        Literal["albedo", "raw"] | None,
+        Literal["texture", "albedo", "raw"] | None,
         options.advanced(
-            help="Mesh colours: without the light's fall-off (albedo, default), or as in the video (raw)."
+            help="Mesh colours: without the light's fall-off (albedo), with pieces of the video besides (texture, "
+            "default), or as in the video (raw)."
         ),
     ] = None,
     mesh_faces: Annotated[

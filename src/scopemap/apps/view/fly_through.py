@@ -118,7 +118,7 @@ def _surface(run: Result, mesh: trimesh.Trimesh, frame: Frame, pose: np.ndarray)
     depth_mm = run.depth.read(frame.index)
     known_mm = np.full(frame.valid.shape, np.nan) if depth_mm is None else np.where(frame.valid, depth_mm, np.nan)
     view = render_mesh(mesh, frame.camera, pose)
-    if run.config.fusion.colours == "albedo":
+    if run.config.fusion.without_light:
         view = lit_like(view, frame.camera, frame.rgb, known_mm)
     return np.where(np.isnan(view.depth_mm)[..., None], np.array(rgb_of(_EMPTY), np.uint8), view.rgb), known_mm
 

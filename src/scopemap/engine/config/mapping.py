@@ -99,9 +99,10 @@ class FusionSettings(StageSettings):
         description="depth beyond this is not fused, mm; default: 200 voxels, or 3.3 times a median depth beyond that",
     )
     every: int = Field(0, ge=0, description="fuse every n-th tracked frame; 0: those that show tissue anew")
-    colours: Literal["albedo", "raw"] = Field(
-        "albedo",
-        description="albedo: without the lamp's fall-off, in one exposure for all frames; raw: of the video",
+    colours: Literal["texture", "albedo", "raw"] = Field(
+        "texture",
+        description="albedo: without the lamp's fall-off, in one exposure for all frames; texture: as albedo, and "
+        "mesh.glb shows pieces of the video's frames; raw: of the video",
     )
     holes: Literal["small", "none", "watertight"] = Field(
         "small",
@@ -119,6 +120,11 @@ class FusionSettings(StageSettings):
     def weighted(self) -> bool:
         """Whether frames, pixels and voxels have weights (Curless and Levoy 1996)."""
         return not self.has("unweighted")
+
+    @property
+    def without_light(self) -> bool:
+        """Whether colours are the tissue's own, without the lamp's fall-off (`fusion/albedo.py`)."""
+        return self.colours != "raw"
 
     @property
     def free_space(self) -> bool:

@@ -137,7 +137,7 @@ def surface_agreement(views: list[SurfaceView], settings: FusionSettings) -> dic
     agreements = []
     for frame, _, rendering in views:
         depth_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
-        if settings.colours == "albedo":
+        if settings.without_light:
             rendering = lit_like(rendering, frame.camera, frame.rgb, depth_mm)
         agreements.append(compare_rendering(rendering, frame.rgb, depth_mm))
     return agreement_figures(agreements) if agreements else {}

@@ -1,13 +1,15 @@
-"""Mesh files: PLY and GLB, with normals, colours and the confidence of each vertex; GLB with surfaces in time."""
+"""Mesh files: PLY and GLB, with normals, colours or a texture, and confidence; GLB with surfaces in time."""
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import trimesh
 
@@ -19,14 +21,26 @@ from scopemap.engine.geometry.srgb import LINEAR
 T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
 # trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
 _PLY_AXES = "unit: mm; axes: OpenCV (x right, y down, z forward)"
-_WRITTEN_COLOURS = "_COLOR_0"
+_WRITTEN_COLOURS, _WRITTEN_UV = "_COLOR_0", "_TEXCOORD_0"
 _FLOAT = 5126  # glTF 2.0, sections 3.6.2.2 and 4.4.3
 _JSON = 0x4E4F534A  # glTF 2.0, section 4.4.3: "JSON"
 _BIN = 0x004E4942  # glTF 2.0, section 4.4.3: "BIN"
+_LINEAR, _LINEAR_MIPMAPS, _CLAMPED = 9729, 9987, 33071  # glTF 2.0, section 5.26
+# Vessels are red on red: at full resolution of the colours. The quality by hand, that of the frame store less what it
+# needs to be opened again.
+_TEXTURE_QUALITY = [
+    *(cv2.IMWRITE_JPEG_QUALITY, 92),
+    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+]
 
 
 def save_mesh(
-    mesh: trimesh.Trimesh, ply_file: Path | None = None, glb_file: Path | None = None, *, comment: str = ""
+    mesh: trimesh.Trimesh,
+    ply_file: Path | None = None,
+    glb_file: Path | None = None,
+    *,
+    comment: str = "",
+    textured: trimesh.Trimesh | None = None,
 ) -> None:
     """Write a mesh with vertex colours, world mm, as binary PLY and as GLB.
 
@@ -34,12 +48,13 @@ def save_mesh(
     `confidence` are properties there. The GLB has metres, y up: 0.001 of the trajectory's unit with y and z negated. It
     is matt and visible from both sides, its colours are linear with 16 bits (glTF 2.0, section 3.7.2.1): 8 bits would
     hold dark sRGB levels 0 to 12 in two steps. Both have vertex normals. A mesh without faces gives no GLB. The unit,
-    the axes and `comment` are comments in the PLY and `asset.extras` in the GLB.
+    the axes and `comment` are comments in the PLY and `asset.extras` in the GLB. textured : the same triangles with a
+    texture, which the GLB has instead of vertex colours, as JPEG inside.
     """
     if ply_file is not None:
         ply_file.write_bytes(ply_bytes(mesh, [_PLY_AXES, comment]))
     if glb_file is not None and len(mesh.faces):
-        glb_file.write_bytes(_glb([mesh], comment))
+        glb_file.write_bytes(_glb([mesh], comment) if textured is None else _textured_glb(textured, comment))
 
 
 def read_mesh(file: Path) -> trimesh.Trimesh:
@@ -62,6 +77,35 @@ def read_mesh(file: Path) -> trimesh.Trimesh:
         if not np.isfinite(mesh.vertices).all():
             raise ValueError("it is damaged: a vertex is nowhere")
     return mesh
+
+
+def read_textured(file: Path) -> trimesh.Trimesh | None:
+    """Return the surface with a texture that `save_mesh` wrote as GLB, world mm; None where there is none.
+
+    Raises `InputError` where it is damaged.
+    """
+    if not file.is_file():
+        return None
+    with reporting(f"cannot read {file}"):
+        content = file.read_bytes()
+        if not _OpenGlb(content).tree.get("images"):
+            return None
+        mesh: Any = trimesh.load(io.BytesIO(content), file_type="glb", force="mesh", process=False)
+        material = trimesh.visual.material.SimpleMaterial(image=mesh.visual.material.baseColorTexture)
+        return trimesh.Trimesh(
+            mesh.vertices @ np.linalg.inv(T_GLTF_WORLD)[:3, :3].T,
+            mesh.faces,
+            vertex_normals=mesh.vertex_normals @ np.sign(T_GLTF_WORLD[:3, :3]),
+            visual=trimesh.visual.TextureVisuals(uv=mesh.visual.uv, material=material),
+            process=False,
+        )
+
+
+def texture_jpeg(textured: trimesh.Trimesh) -> bytes:
+    """Return the texture of a surface as JPEG."""
+    visual: Any = textured.visual
+    picture = np.asarray(visual.material.image)[..., :3]
+    return cv2.imencode(".jpg", picture[..., ::-1], _TEXTURE_QUALITY)[1].tobytes()
 
 
 def save_meshes_in_time(
@@ -99,15 +143,20 @@ class _OpenGlb:
         nodes = [(node["mesh"], number) for number, node in enumerate(self.tree["nodes"]) if "mesh" in node]
         return [number for _, number in sorted(nodes)]
 
+    def view(self, content: bytes) -> int:
+        """Add bytes, and return the number of their buffer view."""
+        self._binary.extend(b"\0" * (-len(self._binary) % 4))
+        view = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": len(content)}
+        self.tree["bufferViews"].append(view)
+        self._binary.extend(content)
+        return len(self.tree["bufferViews"]) - 1
+
     def accessor(self, values: np.ndarray, kind: str) -> int:
         """Add values and return their number."""
         content = np.ascontiguousarray(values, "<f4")
-        view = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": content.nbytes}
-        self.tree["bufferViews"].append(view)
-        self._binary.extend(content.tobytes())
         rows = content.reshape(len(content), -1)
         limits = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
-        about = {"bufferView": len(self.tree["bufferViews"]) - 1, "componentType": _FLOAT, "count": len(content)}
+        about = {"bufferView": self.view(content.tobytes()), "componentType": _FLOAT, "count": len(content)}
         self.tree["accessors"].append(about | {"type": kind} | limits)
         return len(self.tree["accessors"]) - 1
 
@@ -120,6 +169,7 @@ class _OpenGlb:
         """The file."""
         self.tree["buffers"][0]["byteLength"] = len(self._binary)
         text = json.dumps(self.tree).encode()
+        self._binary.extend(b"\0" * (-len(self._binary) % 4))
         chunks = ((text + b" " * (-len(text) % 4), _JSON), (bytes(self._binary), _BIN))
         body = b"".join(struct.pack("<II", len(part), kind) + part for part, kind in chunks)
         return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
@@ -134,6 +184,18 @@ def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
     return head + end + rest
 
 
+def _textured_glb(textured: trimesh.Trimesh, comment: str) -> bytes:
+    """Return a surface with a texture as GLB; the texture is the colour, so it is shown as it is where a viewer can."""
+    glb = _OpenGlb(_glb([textured], comment))
+    view = glb.view(texture_jpeg(textured))
+    glb.tree["images"] = [{"bufferView": view, "mimeType": "image/jpeg"}]
+    filters = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMPED, "wrapT": _CLAMPED}
+    glb.tree["samplers"] = [filters]
+    glb.tree["textures"] = [{"source": 0, "sampler": 0}]
+    glb.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    return glb.content
+
+
 def _glb(meshes: Sequence[trimesh.Trimesh], comment: str) -> bytes:
     R = T_GLTF_WORLD[:3, :3]
     scene = trimesh.Scene()
@@ -142,7 +204,7 @@ def _glb(meshes: Sequence[trimesh.Trimesh], comment: str) -> bytes:
             mesh.vertices @ R.T,
             mesh.faces,
             vertex_normals=mesh.vertex_normals @ np.sign(R),
-            vertex_attributes={_WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])},
+            vertex_attributes=_written_visual(mesh),
             process=False,
         )
         scene.add_geometry(rotated)
@@ -154,10 +216,21 @@ def _glb(meshes: Sequence[trimesh.Trimesh], comment: str) -> bytes:
         tree["asset"]["extras"] = {"unit": "m", "axes": "y up", "comment": comment}
         for primitive in (primitive for part in tree["meshes"] for primitive in part["primitives"]):
             primitive["material"] = 0
-            colours = primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop(_WRITTEN_COLOURS)
-            tree["accessors"][colours]["normalized"] = True
+            attributes = primitive["attributes"]
+            for name in {_WRITTEN_COLOURS, _WRITTEN_UV} & set(attributes):
+                attributes[name[1:]] = attributes.pop(name)
+            if "COLOR_0" in attributes:
+                tree["accessors"][attributes["COLOR_0"]]["normalized"] = True
 
     return trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=finish)
+
+
+def _written_visual(mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """Return the colours of a mesh's vertices, or where they are in its texture, as trimesh writes attributes."""
+    if isinstance(mesh.visual, trimesh.visual.TextureVisuals):
+        # glTF counts from the upper left.
+        return {_WRITTEN_UV: (mesh.visual.uv * [1, -1] + [0, 1]).astype(np.float32)}
+    return {_WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])}
 
 
 def _linear_16_bit(srgb: np.ndarray) -> np.ndarray:

@@ -115,7 +115,7 @@ class TsdfVolume:
         self.finest_mm = self.parameters.voxel_mm
         """Edge of its voxels before they became larger, mm."""
         self._blocks = VoxelBlocks()
-        self._painter = AlbedoPainter() if settings.colours == "albedo" else None
+        self._painter = AlbedoPainter() if settings.without_light else None
 
     @property
     def block_count(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import trimesh
 
@@ -34,10 +35,10 @@ def vertex_colours(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def render_mesh(mesh: trimesh.Trimesh, camera: PinholeCamera, T_world_camera: np.ndarray) -> Rendering:
-    """Return the view of a mesh with vertex colours, world mm, from a pose; both sides of a face are seen.
+    """Return the view of a mesh with vertex colours or a texture, world mm, from a pose; both sides of a face are seen.
 
     Faces that reach behind the camera are left out. Inverse depth is interpolated linearly in the image and colours
-    perspectively, which is exact for plane faces. Raises `ValueError` for a mesh with a texture.
+    perspectively, which is exact for plane faces.
     """
     T = inverse(T_world_camera)
     points = np.asarray(mesh.vertices) @ T[:3, :3].T + T[:3, 3]
@@ -45,12 +46,25 @@ def render_mesh(mesh: trimesh.Trimesh, camera: PinholeCamera, T_world_camera: np
     z = np.where(ahead, points[:, 2], 1.0)
     pixels = points[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     corners = np.column_stack([pixels, np.where(ahead, 1 / z, -1.0)])
-    colours = vertex_colours(mesh)[:, :3].astype(np.float32)
+    texture = mesh.visual if isinstance(mesh.visual, trimesh.visual.TextureVisuals) else None
+    colours = vertex_colours(mesh)[:, :3] if texture is None else np.column_stack([texture.uv, np.zeros(len(points))])
+    colours = colours.astype(np.float32)
     inverse_depth = np.zeros((camera.height, camera.width), np.float32)
     rgb = np.zeros((camera.height, camera.width, 3), np.float32)
     _rasterise(corners, colours, np.asarray(mesh.faces), inverse_depth, rgb)
     depth_mm = np.divide(1, inverse_depth, out=np.full_like(inverse_depth, np.nan), where=inverse_depth > 0)
+    if texture is not None:
+        return Rendering(depth_mm, _from_texture(rgb, inverse_depth > 0, texture))
     return Rendering(depth_mm, np.round(rgb).astype(np.uint8))
+
+
+def _from_texture(uv: np.ndarray, seen: np.ndarray, texture: trimesh.visual.TextureVisuals) -> np.ndarray:
+    """Return the colours (H, W, 3) uint8 at places uv (H, W, 2 or more), 0..1 from the lower left, 0 where not seen."""
+    picture = np.asarray(texture.material.image)[..., :3]
+    height, width = picture.shape[:2]
+    x, y = width * uv[..., 0] - 0.5, height * (1 - uv[..., 1]) - 0.5
+    found = cv2.remap(picture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+    return np.where(seen[..., None], found, np.uint8(0))
 
 
 def render_points(
