@@ -79,8 +79,7 @@ def run(
     colours: Annotated[
         Literal["texture", "albedo", "raw"] | None,
         options.advanced(
-            help="Mesh colours: without the light's fall-off (albedo), with pieces of the video besides (texture, "
-            "default), or as in the video (raw)."
+            help="Mesh colours: without the light's fall-off (albedo, default), or from the video (texture, raw)."
         ),
     ] = None,
     mesh_faces: Annotated[

@@ -100,7 +100,7 @@ class FusionSettings(StageSettings):
     )
     every: int = Field(0, ge=0, description="fuse every n-th tracked frame; 0: those that show tissue anew")
     colours: Literal["texture", "albedo", "raw"] = Field(
-        "texture",
+        "albedo",
         description="albedo: without the lamp's fall-off, in one exposure for all frames; texture: as albedo, and "
         "mesh.glb shows pieces of the video's frames; raw: of the video",
     )
