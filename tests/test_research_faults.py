@@ -133,7 +133,7 @@ FAULTS: list[tuple[str, Edit, str]] = [
     ("serv-ct", with_first([90.5, 3, 41, 0]), "is not .K . 0."),
     # ---- TUM
     (("tum"), line(KINEMATICS, 3, "1305031102.2 0 0 0 0 0 1"), r"line 4: found 7 numbers where earlier"),
-    ("tum", line(KINEMATICS, 3, "1305031102.2 0 0 x 0 0 0 1"), r"line 4: expected numbers .*'x'"),
+    ("tum", line(KINEMATICS, 3, "1305031102.2 0 0 x 0 0 0 1"), r"line 4: expected numbers, found 'x'"),
     ("tum", line(KINEMATICS, 3, "1305031102.2 0 0 0 0 0 0 3"), r"line 4: the quaternion has length 3"),
     ("tum", line(KINEMATICS, 3, f"{STAMPS[0] - 0.004:.4f} 1 0 0 0 0 0 1"), r"line 4: the time stamp of an earlier"),
     *(("tum", line("rgb.txt", 3, row), r"rgb\.txt, line 4: expected `timestamp filename`, found")

@@ -11,6 +11,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from scopemap.apps.export.surfaces import write_surface
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.mesh_files import read_textured, save_mesh
@@ -18,6 +19,7 @@ from scopemap.engine.fusion.texture import textured_mesh
 from scopemap.engine.fusion.texture_levels import chart_vertices, level_gains
 from scopemap.engine.fusion.texture_views import choose_views, pieces_of, spread
 from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.result.result import Result
 
 CAMERA = PinholeCamera(100.0, 100.0, 79.5, 59.5, 160, 120)
 FINE = CAMERA.resized(640, 480)
@@ -171,6 +173,18 @@ def test_glb_holds_the_texture(tmp_path: Path) -> None:
     save_mesh(mesh, glb_file=file)
     assert read_textured(file) is None
     assert read_textured(tmp_path / "none.glb") is None
+
+
+def test_obj_has_the_texture_beside_it(tmp_path: Path) -> None:
+    mesh = _plane(30, FAR_MM)
+    shown = _textured(mesh, _frames())
+    save_mesh(mesh, tmp_path / "mesh.ply", tmp_path / "mesh.glb", textured=shown)
+    write_surface(Result(tmp_path), tmp_path / "mesh.obj", "mm", "ras")
+    assert {"mesh.mtl", "mesh.jpg"} <= {file.name for file in tmp_path.iterdir()}
+    read = trimesh.load(tmp_path / "mesh.obj", process=False)
+    np.testing.assert_allclose(read.triangles, mesh.triangles * [-1, -1, 1], atol=1e-3)
+    turned = trimesh.Trimesh(read.vertices * [-1, -1, 1], read.faces, visual=read.visual, process=False)
+    assert np.median(_errors(turned)) < 3
 
 
 @settings(deadline=None)

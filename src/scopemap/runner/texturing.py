@@ -24,8 +24,8 @@ from scopemap.result.result import Result
 
 Progress = Callable[[str, int, int], None]
 # Frames of a surface, spread over its time, of which its views are chosen: each is rendered once.
-_CANDIDATES = 24  # by hand
-_ALIGNED_TO = 6  # by hand, for time: of these, the frames to whose common place views are aligned
+_CANDIDATES = 20  # by hand
+_ALIGNED_TO = 5  # by hand, for time: of these, the frames to whose common place views are aligned
 _ONCE_ONLY = ("live", "pictures")
 """Names of sources whose pictures cannot be read a second time."""
 

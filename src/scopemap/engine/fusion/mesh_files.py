@@ -25,7 +25,9 @@ _WRITTEN_COLOURS, _WRITTEN_UV = "_COLOR_0", "_TEXCOORD_0"
 _FLOAT = 5126  # glTF 2.0, sections 3.6.2.2 and 4.4.3
 _JSON = 0x4E4F534A  # glTF 2.0, section 4.4.3: "JSON"
 _BIN = 0x004E4942  # glTF 2.0, section 4.4.3: "BIN"
-_LINEAR, _LINEAR_MIPMAPS, _CLAMPED = 9729, 9987, 33071  # glTF 2.0, section 5.26
+_LINEAR = 9729  # glTF 2.0, section 5.26
+_LINEAR_MIPMAPS = 9987  # the same
+_CLAMPED = 33071  # the same
 # Vessels are red on red: at full resolution of the colours. The quality by hand, that of the frame store less what it
 # needs to be opened again.
 _TEXTURE_QUALITY = [

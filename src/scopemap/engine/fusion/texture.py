@@ -33,7 +33,7 @@ MOST_UNSEEN = LARGEST_PX**2 // (2 * _CELL_PX**2)
 """Most triangles without a view: the cells of more would leave too little of the largest texture for the charts."""
 _GROWN = 1.06  # by hand: of the texture's side, from one attempt to place all charts to the next
 _SHRUNK = 0.85  # by hand: of the pictures, where charts do not fit into the largest texture
-_SMALLEST_PX = 64
+_SMALLEST_PX = 64  # by hand: side of the smallest texture
 _SAMPLE_SHARE = 0.5  # by hand: sigma of the mean of levels at a vertex, over the median edge
 _MOST_SAMPLES = 30_000  # OpenCV's remap takes fewer than 32767 in a row
 _OUTSIDE = -1e-6  # rounding: a pixel on the edge of two triangles belongs to both
