@@ -84,7 +84,7 @@ def test_no_table_is_made_of_a_plan_whose_rows_lack_packages_weights_or_sequence
     monkeypatch.setenv("SCOPEMAP_WEIGHTS_DIR", "")  # which is restored
     monkeypatch.setattr(record, "git", lambda *arguments: "")
     monkeypatch.setattr(record, "record", lambda *arguments: pytest.fail("a table was made"))
-    for package in ("open3d", "torch", "lpips"):  # a module of None cannot be found
+    for package in ("open3d", "torch", "torchvision", "lpips"):  # a module of None cannot be found
         monkeypatch.setitem(sys.modules, package, None)
     # A folder is enough where a row lacks what its sequence does not tell.
     (tmp_path / "endoscopy/c3vd/cecum_t1_a").mkdir(parents=True)
@@ -92,7 +92,8 @@ def test_no_table_is_made_of_a_plan_whose_rows_lack_packages_weights_or_sequence
         record.make([name], tmp_path)
     said = str(refused.value)
     assert said.startswith(f"record: the table {name} would have rows without figures: ")
-    assert "needs torch and lpips: pip install -c constraints.txt -e '.[networks]'; needs weights: " in said
+    assert "needs torch and torchvision and lpips: pip install -c constraints.txt -e '.[networks]'; " in said
+    assert "; needs weights: " in said
     assert ("needs Open3D: pip install -c constraints.txt -e './bench[baselines]'" in said) == (name == "methods")
     with pytest.raises(SystemExit, match=f"the table {name} .*cecum_t1_a: nothing like that in {tmp_path / 'none'}"):
         record.make([name], tmp_path / "none")
