@@ -9,14 +9,17 @@ import cv2
 import numpy as np
 import plane_scene
 import pytest
+from drawn_benchmarks import as_scared, seen
 from plane_scene import CAMERA, EVERYWHERE
 from sample_trajectories import as_trajectory, write_c3vd, write_run
+from tiny_phantom import write_tiny
 
 from scopemap.engine.config import MaskSettings
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import se3_exp, so3_exp
 from scopemap.engine.masking.masker import Masker
 from scopemap.input.opening import open_sequence
+from scopemap.input.sequence import Sequence
 from scopemap_bench.evaluation.failure import FailureMeter
 from scopemap_bench.plan import ProtocolPlan
 from scopemap_bench.scoring import score
@@ -112,22 +115,37 @@ def test_a_clip_that_contradicts_the_true_poses_counts_nobody(holds_still: bool,
     assert poses.get("frames_until_contradicted", 0) == (0 if holds_still else FRAMES)
 
 
+def counts_of(sequence: Sequence) -> dict[str, int]:
+    """Frames until poses are contradicted: the true ones, and those of four who evade the measure."""
+    masker, rng = Masker(MaskSettings()), np.random.default_rng(0)
+    names = ("true", "still", "every third", "every third, at random", "late")
+    meters = {name: FailureMeter(sequence.camera) for name in names}
+    for n, frame in enumerate(sequence.frames()):
+        valid, true = masker(frame).valid, sequence.source.pose(frame.index)
+        random = se3_exp(rng.normal(size=6) * [5, 5, 5, 0.1, 0.1, 0.1])
+        poses = {"true": true, "still": np.eye(4), "late": np.eye(4) if n >= 35 else None}
+        poses |= {"every third": None if n % 3 else true, "every third, at random": None if n % 3 else random}
+        for name, pose in poses.items():
+            meters[name].add(frame.rgb, valid, pose)
+    return {name: int(meter.figures()["frames_until_contradicted"]) for name, meter in meters.items()}
+
+
 @pytest.mark.real
 @pytest.mark.parametrize("clip", ["c3vd/cecum_t1_a", "hamlyn/rectified01_part"])
 def test_on_real_clips_the_truth_holds_longest_and_who_stands_still_or_answers_seldom_does_not(
     clip: str, real_data: Path
 ) -> None:
-    sequence = open_sequence(real_data / "endoscopy" / clip, frames=slice(0, 45))
-    masker, rng = Masker(MaskSettings()), np.random.default_rng(0)
-    meters = {name: FailureMeter(sequence.camera) for name in ("true", "still", "every third, at random", "late")}
-    for n, frame in enumerate(sequence.frames()):
-        valid, true = masker(frame).valid, sequence.source.pose(frame.index)
-        random = se3_exp(rng.normal(size=6) * [5, 5, 5, 0.1, 0.1, 0.1])
-        poses = {"true": true, "still": np.eye(4), "every third, at random": None if n % 3 else random}
-        for name, pose in (poses | {"late": np.eye(4) if n >= 35 else None}).items():
-            meters[name].add(frame.rgb, valid, pose)
-    counts = {name: meter.figures()["frames_until_contradicted"] for name, meter in meters.items()}
+    counts = counts_of(open_sequence(real_data / "endoscopy" / clip, frames=slice(0, 45)))
     # Hamlyn has no true poses.
     assert counts.pop("true") == (45 if "c3vd" in clip else 0)
-    assert counts["still"] < 20
-    assert max(counts["every third, at random"], counts["late"]) <= 1
+    assert counts.pop("still") < 20
+    assert max(counts.values()) <= 1
+
+
+def test_in_a_layout_of_scared_the_truth_holds_longest(tmp_path: Path) -> None:
+    """Its video is compressed, its poses are those of the left eye and inverted."""
+    frames = seen(write_tiny(tmp_path / "phantom", frames=30))
+    counts = counts_of(open_sequence(as_scared(frames, tmp_path / "dataset_1" / "keyframe_1"), dataset="scared"))
+    assert counts.pop("true") == 30
+    assert counts.pop("still") < 20
+    assert max(counts.values()) <= 1
