@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from scopemap.apps.browser.files_part import export_place
 from scopemap.apps.browser.marks import CLICKED
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.runs import BrowserRun
+from scopemap.apps.browser.unseen_part import unseen_words
 from scopemap.apps.browser.workspace import Workspace
-from scopemap.apps.coverage.coverage import BLIND, coverage
+from scopemap.apps.coverage.coverage import BLIND, CAUTION, coverage
 from scopemap.engine.notices import Notice
 from scopemap.report.page_data import read_measurements
 from scopemap.result.result import Result
@@ -238,6 +240,12 @@ def test_a_lesion_is_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureF
         assert call("measure", folder, "--frame", 4, "--lesion", outline) == 0
         for line in capsys.readouterr().out.splitlines()[:-1]:
             assert line in shown.words
+
+
+def test_a_share_that_may_be_far_too_large_is_said_with_its_caution(tmp_path: Path) -> None:
+    found = coverage(draw_run(tmp_path))
+    assert CAUTION not in unseen_words(found)
+    assert unseen_words(replace(found, caution=CAUTION)) == f"{unseen_words(found)} {CAUTION}"
 
 
 def test_blind_spots_are_those_of_the_command(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from drawn_run import CAMERA, changed, drawn_result, tube
 from front_door import call, refused
 from test_true_surface import write_coverage
 
-from scopemap.apps.coverage.coverage import BLIND, NOT_SEEN, Coverage, coverage, regions
+from scopemap.apps.coverage.coverage import BLIND, CAUTION, NOT_SEEN, Coverage, coverage, regions
 from scopemap.apps.coverage.layout import Cavity, Lumen, binned
 from scopemap.apps.coverage.unseen import features, views_of
 from scopemap.engine.config import Config
@@ -26,9 +26,11 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.centreline import Centreline, centreline, clock
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import se3, so3_exp
+from scopemap.engine.notices import Notice
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
+from scopemap.result.wording import facts_of_notices
 from scopemap_bench.scripts import coverage as scoring
 
 HOLE_AT, HOLE_CLOCK, HOLE_MM = 40.0, 3.0, 12.0
@@ -215,7 +217,7 @@ def test_the_command_writes_figures_map_and_picture(holed: Path, capfd: pytest.C
     share = (colours[:, 0] > 150) & (colours[:, 1] < 60)
     assert 0 < share.mean() < 0.5  # the hole is red
     facts = json.loads((holed / "coverage" / "coverage.json").read_text())
-    assert set(facts) == {"kind", "unit", "along_unit", "scale", "total", "segments", "blind_spots"}
+    assert set(facts) == {"kind", "unit", "along_unit", "scale", "caution", "total", "segments", "blind_spots"}
     assert (facts["kind"], facts["unit"], len(facts["blind_spots"]) > 0) == ("lumen", "unit", True)
     picture = cv2.imread(str(holed / "coverage" / "map.png"))
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
@@ -247,6 +249,17 @@ def test_a_known_scale_gives_millimetres(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", tube(), ALONG_THE_TUBE[::2], scale=known)
     found: Coverage = coverage(run)
     assert found.facts["unit"] == found.facts["along_unit"] == "mm"
+
+
+def test_an_assumed_lens_and_moving_tissue_are_a_caution(holed: Path, tmp_path: Path) -> None:
+    moved = {"frames": 20, "measured": 30, "most": 3.0, "share": 0.5, "threshold": 0.1, "x": 0.5, "y": 0.5}
+    assumed = {"camera": drawn_result().provenance["camera"] | {"origin": "assumed"}}
+    moving = {"notices": facts_of_notices([Notice("tissue-moves", moved)])}
+    for number, (facts, is_said) in enumerate([(assumed, False), (moving, False), (assumed | moving, True)]):
+        run = write_run(tmp_path / f"{number}", without(tube(), in_hole), ALONG_THE_TUBE, **facts)
+        found = coverage(run)
+        assert (found.caution, found.facts["caution"]) == ((CAUTION,) * 2 if is_said else ("",) * 2), facts
+        assert (CAUTION in str(found)) == is_said
 
 
 def write_truth(folder: Path, positions_mm: np.ndarray) -> Path:

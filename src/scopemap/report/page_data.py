@@ -174,6 +174,7 @@ class _Spot(BaseModel):
 class _Covered(BaseModel):
     kind: str
     unit: str
+    caution: str = ""
     total: _NotSeen
     blind_spots: list[_Spot]
 

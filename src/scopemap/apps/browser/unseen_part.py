@@ -79,12 +79,13 @@ class UnseenPart:
 
 
 def unseen_words(found: Coverage) -> str:
-    """Return which share of what was not seen, with its interval, in a sentence."""
+    """Return which share of what was not seen, with its interval, in a sentence, and what makes it doubtful."""
     low, share, high = (f"{100 * value:.0f}" for value in (found.total.low, found.total.share, found.total.high))
     what = "of the wall between the first and the last place that was examined"
     if found.layout.kind != "lumen":
         what = "of the wall in the directions that were examined"
-    return f"{share} % {what} was not seen, estimated (90 % interval {low} to {high} %)."
+    said = f"{share} % {what} was not seen, estimated (90 % interval {low} to {high} %)."
+    return f"{said} {found.caution}" if found.caution else said
 
 
 def share_of(found: Coverage, spot: BlindSpot) -> float:

@@ -40,6 +40,9 @@ SEEN = 1
 SEEN_BADLY = 2
 NOT_SEEN = 3
 """Classes of the map: seen; from afar or obliquely only; probably not seen. 0 is outside of what was examined."""
+CAUTION = "The lens is assumed and tissue moves: much of this may have been seen."
+_MISLEADING = frozenset({"camera-assumed", "tissue-moves"})
+"""Reasons of the verdict that together make a share far too large, as on one real colonoscopy."""
 _GOOD_COSINE = 0.5
 _GOOD_RADII = 2.0
 _SMOOTHING_BINS = 0.7
@@ -128,7 +131,8 @@ class Coverage:
     distances on the centreline of a lumen from the beginning of the examined part, or degrees from a cavity's mean
     direction of view; 12 o'clock is up in the first picture. spots : the largest first. surface : the closed mesh.
     unseen : (F,) probability that no frame saw a face, by its features (F, 6); NaN outside of what was examined.
-    layout : where points are on the map; first : its row that is the map's first.
+    layout : where points are on the map; first : its row that is the map's first. caution : why the share may be far
+    too large, as a sentence; "": nothing says so.
     """
 
     unit: str
@@ -142,6 +146,7 @@ class Coverage:
     features: np.ndarray
     layout: Layout
     first: int
+    caution: str = ""
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -150,6 +155,7 @@ class Coverage:
         shares = {"total": self.total._asdict(), "segments": [segment._asdict() for segment in self.segments]}
         spots = [asdict(spot) for spot in self.spots]
         known = {"kind": self.layout.kind, "unit": self.unit, "along_unit": along, "scale": self.scale}
+        known |= {"caution": self.caution}
         return known | shares | {"blind_spots": spots}
 
     @property
@@ -169,6 +175,7 @@ class Coverage:
         along, area = self._units
         of = "a lumen" if self.layout.kind == "lumen" else "a cavity, by angles from the mean direction of view"
         lines = [f"not seen: {_percent(self.total)} of {_three_digits(self.total.area)} {area} of {of}; {self.scale}"]
+        lines += [f"  {self.caution}"] if self.caution else []
         lines += [f"  {part.start:.0f} to {part.end:.0f} {along}: {_percent(part)}" for part in self.segments]
         lines += [f"blind spots: {len(self.spots)}" + (", the largest:" if self.spots else "")]
         spots = enumerate(self.spots[:_SHOWN], 1)
@@ -235,7 +242,9 @@ def coverage(folder: Path) -> Coverage:
     shares = [_share(faces, start, end, step, odds, _NOTHING_HIDDEN) for start, end in pairwise(ends)]
     total = _share(faces, 0, len(inside), layout.step, ODDS[layout.kind])
     unit = "mm" if run.scale_known else "unit"
-    return Coverage(unit, run.scale, total, shares, spots, chart, surface, unseen, known, layout, space.first)
+    caution = CAUTION if {reason.code for reason in verdict(run).reasons} >= _MISLEADING else ""
+    first = space.first
+    return Coverage(unit, run.scale, total, shares, spots, chart, surface, unseen, known, layout, first, caution)
 
 
 def _percent(share: Share) -> str:

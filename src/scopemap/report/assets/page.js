@@ -214,7 +214,7 @@ function writeCoverage() {
   element("coverage").hidden = !found;
   if (!found) return;
   const { share, low, high, area } = found.total, lumen = found.kind === "lumen", digits = (value) => Number(value.toPrecision(3));
-  put("coverage-share", `Not seen: ${percent(share)} (90 % interval: ${percent(low)} to ${percent(high)}) of ${digits(area)} ${found.unit}² of a ${found.kind}.`);
+  put("coverage-share", `Not seen: ${percent(share)} (90 % interval: ${percent(low)} to ${percent(high)}) of ${digits(area)} ${found.unit}² of a ${found.kind}. ${found.caution}`.trim());
   element("coverage-map").src = `data:image/png;base64,${found.map}`;
   element("spot-list").replaceChildren(...found.blind_spots.map((spot, n) => {
     const item = document.createElement("li"), button = document.createElement("button");
