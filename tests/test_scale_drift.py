@@ -15,8 +15,9 @@ from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import se3, so3_exp
-from scopemap.engine.mapping import TrackedPose
+from scopemap.engine.mapping import TrackedPose, hypotheses
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
+from scopemap.engine.mapping.judge import LensTest
 from scopemap.engine.mapping.keyframes import path_without_drift
 from scopemap.engine.mapping.mapper import Backend
 
@@ -93,3 +94,21 @@ def test_the_adjustment_does_not_bring_the_drift_back(monkeypatch: pytest.Monkey
         spread.append(np.ptp(factor))
     # The drift to be removed is 1.17.
     assert spread[0] < min(0.06, spread[1]), spread
+
+
+def test_where_left_out_tracks_prefer_the_poses_as_tracked_these_have_the_scale_of_the_network(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They have the drift, so most of their keyframes, with it, must have the network's millimetres."""
+    monkeypatch.setattr(hypotheses, "lens_test", lambda problem, solution: LensTest(held_px=1.0, tracked_px=0.5))
+    log_scale, frames, x_mm = 0.1 * np.arange(8), [], 0.0
+    for n, factor in enumerate(np.exp(log_scale)):
+        true = plane_scene.pose(at_mm=(2.0 * n, 0, 0), turn_rad=(0, 0, 0.01 * n))
+        T = plane_scene.pose(at_mm=(x_mm, 0, 0), turn_rad=(0, 0, 0.01 * n))
+        frames.append(replace(plane_scene.frame(true, n, T, factor), depth_scale=factor))
+        x_mm += 2.0 * factor
+    correction = plane_scene.adjusted(frames)
+    assert correction.refused is not None
+    assert correction.refused.code == "mapping-worse"
+    off = np.log([correction.depth_factor(n) for n in range(8)]) + log_scale
+    np.testing.assert_allclose(np.median(off), 0, atol=1e-6)

@@ -68,8 +68,9 @@ def explain(
     keyframes, alone = _alone(keyframes, main)
     found, worlds = _merged(keyframes, main, allowed, alone)
     merged = keyframes.of_maps(worlds)
-    correction = _with_lens(merged, found, alone, lenses)
-    correction = replace(correction, S_common_map=worlds, tracked=tracked)
+    if found is not alone and alone.correction.refused:
+        found = _unless_worse(merged, found)
+    correction = replace(_with_lens(found, alone, lenses), S_common_map=worlds, tracked=tracked)
     whole = Segment(int(correction.index[-1]), correction)
     if not correction.refused:
         return [whole]
@@ -83,12 +84,32 @@ def _alone(keyframes: Keyframes, main: int) -> tuple[Keyframes, AdjustedMaps]:
     """
     if keyframes.log_scales.any():
         without = keyframes.without_drift(1.0)
-        found = _adjusted(without, {main: without.unit(main)}, main)
+        found = _of_map(without, main)
         if not found.correction.refused:
             return without, found
         del found  # for memory
     keyframes = keyframes.without_drift(0.0)
-    return keyframes, _adjusted(keyframes, {main: keyframes.unit(main)}, main)
+    return keyframes, _of_map(keyframes, main)
+
+
+def _of_map(keyframes: Keyframes, main: int) -> AdjustedMaps:
+    """Return the adjustment of one map; as tracked where left-out tracks prefer that."""
+    world = {main: keyframes.unit(main)}
+    return _unless_worse(keyframes.of_maps(world), _adjusted(keyframes, world, main))
+
+
+def _unless_worse(keyframes: MapKeyframes, found: AdjustedMaps) -> AdjustedMaps:
+    """Return an adjustment with its test of the lens; as tracked where that explains left-out tracks better.
+
+    That test adjusts half of the points with the lens held, so that it tells of the adjustment, too.
+    """
+    if found.correction.refused:
+        return found
+    lens = lens_test(found.problem, found.solution)
+    if (worse := refusal_by_lens(lens)) is None:
+        return found._replace(correction=replace(found.correction, lens=lens))
+    as_tracked = replace(keyframes.uncorrected(lens.held_px), refused=worse, lens=lens)
+    return found._replace(correction=as_tracked, errors=found.errors._replace(is_adjusted=False))
 
 
 def _merged(
@@ -121,18 +142,17 @@ def _merged(
     return found, worlds
 
 
-def _with_lens(keyframes: MapKeyframes, found: AdjustedMaps, alone: AdjustedMaps, lenses: LensKinds) -> FrameCorrection:
+def _with_lens(found: AdjustedMaps, alone: AdjustedMaps, lenses: LensKinds) -> FrameCorrection:
     """Return the correction with the test of the lens; where one map was refused, only if it contradicts the lens.
 
     alone : the main map's own adjustment, which tells enough of the lens.
     """
     tested = found if alone.correction.refused else alone
-    lens = lens_test(tested.problem, tested.solution)
+    lens = tested.correction.lens
+    if math.isnan(lens.held_px):  # it was refused before
+        lens = lens_test(tested.problem, tested.solution)
     lens = lenses.better_than(lens, tested.problem, tested.solution)
-    worse = refusal_by_lens(lens)
-    if worse is not None and tested is found and not found.correction.refused:
-        return replace(keyframes.uncorrected(lens.held_px), refused=worse, lens=lens)
-    if len(keyframes.S_common_map) == 1 and found.correction.refused and not lens.contradicts:
+    if found is alone and found.correction.refused and not lens.contradicts:
         return found.correction
     return replace(found.correction, lens=lens)
 
