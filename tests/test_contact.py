@@ -20,11 +20,12 @@ from scopemap.engine.depth.mapis import DenseCorrespondence
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
 from scopemap.engine.mapping.segments import Segment, Submap
-from scopemap.engine.tracking.causes import ADVICE, LossCause, causes_of_loss
+from scopemap.engine.tracking.causes import LossCause, causes_of_loss
 from scopemap.engine.tracking.relocalisation import RotationFollower, rotation_by_flow
 from scopemap.engine.tracking.track import Track
 from scopemap.engine.tracking.tracker import Tracker
 from scopemap.result.frame_table import LOST, ROTATED, FrameTable
+from scopemap.result.losses import ADVICE
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.submap_frames import frames_of_submap
 

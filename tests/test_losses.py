@@ -12,10 +12,10 @@ from scopemap import open_sequence, reconstruct
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import Config, TrackingSettings
 from scopemap.engine.frame import Frame
-from scopemap.engine.tracking.causes import ADVICE, LossCause, causes_of_loss
+from scopemap.engine.tracking.causes import LossCause, causes_of_loss
 from scopemap.engine.tracking.usable import too_few_pixels
 from scopemap.result.frame_table import ELSEWHERE, LOST, NOT_USED
-from scopemap.result.losses import losses, main_cause
+from scopemap.result.losses import ADVICE, losses, main_cause
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 

@@ -14,7 +14,7 @@ import typer.main
 
 from scopemap.cli.app import app
 from scopemap.engine.notices import KINDS, Notice
-from scopemap.engine.tracking.causes import ADVICE
+from scopemap.result.losses import ADVICE
 from scopemap.result.wording import WORDINGS, text_of
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,9 +8,24 @@ from itertools import groupby
 
 import numpy as np
 
-from scopemap.engine.tracking.causes import ADVICE, LossCause
+from scopemap.engine.tracking.causes import LossCause
 from scopemap.input.trajectory.trajectory import SKIPPED
 from scopemap.result.frame_table import FrameTable
+
+ADVICE = {
+    LossCause.FAST_MOTION: "Next time, turn and withdraw more slowly, and record every frame.",
+    LossCause.MOTION_BLUR: "Next time, move more slowly; more light shortens the exposure.",
+    LossCause.UNSHARP: "Next time, rinse the lens and remove smoke and fluid before moving on.",
+    LossCause.TOO_DARK: "Next time, go nearer or turn the light up.",
+    LossCause.OVEREXPOSED: "Next time, withdraw from the wall until it is no longer white.",
+    LossCause.VIEW_COVERED: "Next time, withdraw from the wall or remove what covers the view.",
+    LossCause.CONTACT: "Next time, withdraw from the wall until the lumen or a fold is in view.",
+    LossCause.NO_TEXTURE: "Next time, keep folds or vessels in view.",
+    LossCause.VIEW_CHANGED: "Next time, hold the camera still while tissue or instruments move.",
+    LossCause.NOT_FOUND_AGAIN: "Next time, return to the last place and look from a similar angle.",
+    LossCause.OTHER: "See the reason in frames.csv.",
+}
+"""What can be done, by the cause of a loss."""
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from scopemap.engine.notices import Level, Notice
-from scopemap.engine.tracking.causes import ADVICE
 from scopemap.result.evidence import LEAST_SUBMAP_S, Evidence
+from scopemap.result.losses import ADVICE
 from scopemap.result.submap_summaries import doubt_words
 from scopemap.result.surface_segments import SurfaceSegment
 from scopemap.result.wording import LEVEL_WORDS, text_of

@@ -14,8 +14,9 @@ from scopemap.apps.browser.scene import quaternion
 from scopemap.apps.browser.seen_by import frames_that_saw
 from scopemap.apps.browser.shown_surface import SurfacePick
 from scopemap.apps.browser.window import escaped
-from scopemap.engine.tracking.causes import ADVICE, LossCause
+from scopemap.engine.tracking.causes import LossCause
 from scopemap.result.frame_table import ELSEWHERE, LOST, ROTATED
+from scopemap.result.losses import ADVICE
 from scopemap.result.run_input import places_of_input
 from scopemap.runner.reread_frames import reread_frames
 

@@ -92,13 +92,13 @@ class FrameCorrection:
     tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
     T_world_world_before : as `T_world_world`, of the frames that lead to the keyframe, which its step parts from it;
     None: there is none. steps : (K,) of the keyframes; (): none was moved as it came. sigma_px : robust standard
-    deviation of the reprojection errors; NaN without observations. refused : why keyframes stay as tracked, None where
-    it is. loops : number of accepted loop closures. loop_frames : the two frames of each. depth_fields : (K,) further
-    factors of each pixel's depth; (): none. S_common_map : by number of each merged map, Sim(3) from its world to the
-    common one. tracked : poses as tracked by number of the frame, where known. depth_mm : typical depth, the unit of
-    translations beside rad. lens : what left-out tracks tell of it. shape : what other starts of the adjustment tell of
-    it. S_world_adjusted : Sim(3) from the adjusted world to that of the submap, which joins a segment to the one
-    before.
+    deviation of the reprojection errors; NaN without observations. refused : why no adjustment is kept, so that
+    keyframes stay as tracked, or as the pose graph merges maps; None: one is kept. loops : number of accepted loop
+    closures. loop_frames : the two frames of each. depth_fields : (K,) further factors of each pixel's depth; (): none.
+    S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
+    number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens : what
+    left-out tracks tell of it. shape : what other starts of the adjustment tell of it. S_world_adjusted : Sim(3) from
+    the adjusted world to that of the submap, which joins a segment to the one before.
     """
 
     index: np.ndarray

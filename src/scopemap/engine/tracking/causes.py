@@ -1,4 +1,4 @@
-"""Why frames are lost, and what the operator can do about it."""
+"""Why frames are lost."""
 
 from __future__ import annotations
 
@@ -26,21 +26,6 @@ class LossCause(StrEnum):
     NOT_FOUND_AGAIN = "not found again"
     OTHER = "other"
 
-
-ADVICE = {
-    LossCause.FAST_MOTION: "Next time, turn and withdraw more slowly, and record every frame.",
-    LossCause.MOTION_BLUR: "Next time, move more slowly; more light shortens the exposure.",
-    LossCause.UNSHARP: "Next time, rinse the lens and remove smoke and fluid before moving on.",
-    LossCause.TOO_DARK: "Next time, go nearer or turn the light up.",
-    LossCause.OVEREXPOSED: "Next time, withdraw from the wall until it is no longer white.",
-    LossCause.VIEW_COVERED: "Next time, withdraw from the wall or remove what covers the view.",
-    LossCause.CONTACT: "Next time, withdraw from the wall until the lumen or a fold is in view.",
-    LossCause.NO_TEXTURE: "Next time, keep folds or vessels in view.",
-    LossCause.VIEW_CHANGED: "Next time, hold the camera still while tissue or instruments move.",
-    LossCause.NOT_FOUND_AGAIN: "Next time, return to the last place and look from a similar angle.",
-    LossCause.OTHER: "See the reason in frames.csv.",
-}
-"""What can be done, by the cause of a loss."""
 
 _OF_ITS_OWN = {
     LossCause.TOO_DARK,
