@@ -9,6 +9,7 @@ import pytest
 from drawn_bundle import FOCAL_PX, KEYFRAMES, LINE, tracked, world
 
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
+from scopemap.engine.mapping import lens
 from scopemap.engine.mapping.bundle_adjustment import adjust, adjust_in_windows, linearised
 from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, Points, Priors
 from scopemap.engine.mapping.judge import LensTest
@@ -47,6 +48,17 @@ def test_left_out_tracks_contradict_a_wrong_focal_length_and_ask_for_the_right_o
     assert found.contradicts == (factor != 1.0)
     assert [notice.code for notice in found.notices] == ["camera-contradicted"] * (factor != 1.0)
     assert found.ratio == pytest.approx(1.0, abs=0.03) if factor == 1.0 else found.ratio < 0.97
+
+
+def test_of_many_keyframes_those_in_the_middle_tell_of_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(11)
+    T, points, observations = world(rng)
+    monkeypatch.setattr(lens, "WINDOW", len(T) - 1)
+    seen = replace(observations, pixel=observations.pixel + rng.normal(0, 0.1, observations.pixel.shape))
+    problem = BundleProblem(tracked(T, rng), points, seen, LOOSE, LINE, 0.85 * FOCAL_PX)
+    found = lens_test(problem, adjust(problem).state)
+    assert found.log_focal == pytest.approx(-np.log(0.85), abs=0.03)
+    assert found.contradicts
 
 
 def test_a_shifted_centre_alone_contradicts_no_lens() -> None:

@@ -1,4 +1,4 @@
-"""Poses by frame: tracking against the keyframe (RTDL), depth refined with the motion known (MAPIS), keyframes."""
+"""Poses by frame: tracked against the keyframe, depth refined with the motion known (MAPIS), keyframes adjusted."""
 
 from __future__ import annotations
 

@@ -150,10 +150,10 @@ def _flat(problem: BundleProblem) -> BundleProblem:
     """Return the problem from a start without depth or poses."""
     flat = _loosely(problem, np.full(len(problem.points.host), np.median(problem.begin.log_depth)))
     T = np.repeat(problem.begin.T_camera_world[:1], len(problem.T_camera_world), axis=0)
-    successive = np.arange(len(T) - 1)[:, None] + [0, 1]
+    in_turn = np.arange(len(T) - 1)[:, None] + [0, 1]
     assert flat.start is not None
     start = flat.start._replace(T_camera_world=T)
-    return replace(flat, T_camera_world=T, priors=_NO_POSES, neighbours=successive, start=start)
+    return replace(flat, T_camera_world=T, priors=_NO_POSES, neighbours=in_turn, start=start)
 
 
 def _from(problem: BundleProblem, keyframes: State) -> BundleSolution:
