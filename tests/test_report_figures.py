@@ -79,9 +79,9 @@ def test_depth_colours_are_a_scale(near_mm: float, span_mm: float) -> None:
     depth = np.linspace(near_mm, near_mm + span_mm, 256)[None].astype(np.float32)
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_TURBO)[..., ::-1][0].tolist()
     levels = [table.index(colour) for colour in colour_depth(depth, near_mm, near_mm + span_mm)[0].tolist()]
-    assert levels[0] == 0
-    assert levels[-1] == 255
-    assert (np.diff(levels) >= 0).all()
+    assert levels[0] == 255  # near is red, here as in the previews and on the page
+    assert levels[-1] == 0
+    assert (np.diff(levels) <= 0).all()
 
 
 def test_unknown_depth_is_black_and_the_range_must_make_sense() -> None:

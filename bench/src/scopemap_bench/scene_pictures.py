@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.geometry.rendering import render_points
-from scopemap.report.depth_figures import MASKED_GREY, colour_depth, percentiles
+from scopemap.report.depth_figures import MASKED_GREY, colour_depth, colour_share, percentiles
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     TRUTH_COLOUR,
@@ -48,11 +48,11 @@ def draw_depth_change(
         mean = f"mean {change_mm.mean():.2f} mm" if len(change_mm) else "unknown"
         names = (f"{method}: previous", "current", f"|difference|: {mean}")
         pictures = [colour_depth(depth, near_mm, far_mm) for depth in depths]
-        pictures.append(colour_depth(changes_mm[method], 0.0, most_mm))
+        pictures.append(colour_share(changes_mm[method] / most_mm))
         for picture, seen in zip(pictures, (*tissue, tissue[0] & tissue[1]), strict=True):
             picture[~seen] = MASKED_GREY
         rows.append(dict(zip(names, pictures, strict=True)))
-    depth = f"depth: blue {near_mm:.0f} to red {far_mm:.0f} mm"
+    depth = f"depth: red {near_mm:.0f} to blue {far_mm:.0f} mm"
     scales = f"{depth}; difference: blue 0 to red {most_mm:.1f} mm; black: unknown; grey: masked, not counted"
     picture_grid(rows, (300, 250), scales).save(file)
 

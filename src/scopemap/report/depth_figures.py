@@ -27,12 +27,17 @@ MASKED_GREY = 110
 
 
 def colour_depth(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndarray:
-    """Return (H, W, 3) uint8 sRGB of depth (H, W) mm: `near_mm` blue, `far_mm` red (turbo), NaN black."""
+    """Return (H, W, 3) uint8 sRGB of depth (H, W) mm: `near_mm` red, `far_mm` blue (turbo), NaN black."""
     if not far_mm > near_mm:
         raise ValueError(f"colouring depth: far ({far_mm} mm) must be beyond near ({near_mm} mm)")
-    known = np.isfinite(depth_mm)
-    share = (np.where(known, depth_mm, near_mm) - near_mm) / (far_mm - near_mm)
-    rgb = cv2.applyColorMap(np.round(255 * np.clip(share, 0, 1)).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    return colour_share((far_mm - depth_mm) / (far_mm - near_mm))
+
+
+def colour_share(share: np.ndarray) -> np.ndarray:
+    """Return (H, W, 3) uint8 sRGB of shares (H, W): 0 and below blue, 1 and above red (turbo), NaN black."""
+    known = np.isfinite(share)
+    level = np.round(255 * np.clip(np.where(known, share, 0), 0, 1)).astype(np.uint8)
+    rgb = cv2.applyColorMap(level, cv2.COLORMAP_TURBO)[..., ::-1].copy()
     rgb[~known] = 0
     return rgb
 
@@ -108,7 +113,7 @@ def draw_depths(images: Sequence[np.ndarray], depths_mm: Mapping[str, Sequence[n
         # The first row names the columns.
         titles = [title if number == 0 else " " * column for column, title in enumerate(("image", *depths_mm))]
         rows.append(dict(zip(titles, [image, *pictures], strict=True)))
-    picture_grid(rows, _CELL_PX, f"blue {near_mm:.0f} mm .. red {far_mm:.0f} mm, black unknown").save(file)
+    picture_grid(rows, _CELL_PX, f"red {near_mm:.0f} mm .. blue {far_mm:.0f} mm, black unknown").save(file)
 
 
 def draw_renderings(pairs: Mapping[int, tuple[np.ndarray, np.ndarray]], file: Path) -> None:

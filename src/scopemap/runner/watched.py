@@ -242,7 +242,7 @@ def _points(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pictures(frame: Frame) -> tuple[bytes, bytes]:
-    """Return a frame's picture, dark where it is not used, with its corners; and its depth in colours, near blue."""
+    """Return a frame's picture, dark where it is not used, with its corners; and its depth in colours, near red."""
     shown = np.where(frame.valid[..., None], frame.rgb, (frame.rgb * _MASKED_SHARE).astype(np.uint8))
     depth_mm = np.full(frame.valid.shape, np.nan, np.float32) if frame.depth_mm is None else frame.depth_mm
     known = frame.valid & np.isfinite(depth_mm)

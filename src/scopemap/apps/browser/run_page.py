@@ -81,7 +81,7 @@ class RunPage:
         stop = gui.add_button("Stop" if self._live else "Stop and keep what there is", icon=_icon("PLAYER_STOP"))
         self._stop = window.on(stop, self._stop_run)
         self._picture = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Frame: unused parts dark, corners green")
-        self._depth = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Depth: blue near, red far")
+        self._depth = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Depth: red near, blue far")
         self._coverage = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="What was not seen so far")
         self._picture.visible = self._depth.visible = self._coverage.visible = False
         with gui.add_folder("Log", expand_by_default=False):
