@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import trimesh
 
@@ -18,6 +17,7 @@ from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.rendering import Rendering, render_mesh, vertex_colours
 from scopemap.evaluation.poses import rotation_errors_rad, translation_errors_mm
 from scopemap.input.trajectory.trajectory import path_length_mm
+from scopemap.report.depth_figures import colour_share
 from scopemap.report.mesh_figures import draw_trajectories
 from scopemap.report.page import PAGE, write_comparison
 from scopemap.report.sheet import picture_grid
@@ -89,7 +89,7 @@ class TwoRuns:
                 {
                     f"{names[0]}, frame {v.index}": v.first.rgb,
                     names[1]: v.second.rgb,
-                    "difference": _coloured(v.difference),
+                    "difference": colour_share(v.difference * 100 / _DRAWN_PERCENT),
                 }
                 for v in worst
             ]
@@ -193,13 +193,6 @@ def _same_input(first: Result, second: Result) -> bool | None:
     """Return whether both have read the same; None where one does not say."""
     sums = [dict(run.provenance.get("input_content") or {}).get("sha256") for run in (first, second)]
     return None if None in sums else sums[0] == sums[1]
-
-
-def _coloured(difference: np.ndarray) -> np.ndarray:
-    levels = np.nan_to_num(255 * np.clip(difference * 100 / _DRAWN_PERCENT, 0, 1)).astype(np.uint8)
-    rgb = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1].copy()
-    rgb[~np.isfinite(difference)] = 0
-    return rgb
 
 
 def refuse_run_as_truth(truth: Path) -> None:
