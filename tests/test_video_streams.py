@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from av.stream import Disposition
 from drawn_inputs import number_in, picture
+from PIL import Image
 
 from scopemap.apps.inspect.container import read_container
 from scopemap.engine.config import InputSettings
@@ -169,3 +170,18 @@ def test_pictures_that_ffmpeg_fills_in_are_said(tmp_path: Path) -> None:
     assert str(warning).startswith("the data of the video hole.ts are interrupted or damaged near frame ")
     assert "unless pieces were joined there" in str(warning), "FFmpeg does not tell a join from a loss"
     assert 8 <= int(str(warning).split("near frame ")[1].split(":")[0]) <= 22
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("stack.tif", "of a TIFF only the first picture is read; save its pages as a folder of images"),
+        ("moving.webp", "animated WebP is not read; save it as a video or a folder of images"),
+    ],
+)
+def test_files_of_several_pictures_that_are_not_read_are_named(name: str, why: str, tmp_path: Path) -> None:
+    """They were said to hold one frame, or pictures that are too large."""
+    first, *others = (Image.fromarray(picture(number, SIZE)) for number in range(5))
+    first.save(tmp_path / name, save_all=True, append_images=others)
+    with pytest.raises(InputError, match=why):
+        open_sequence(tmp_path / name)

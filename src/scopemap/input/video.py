@@ -28,6 +28,7 @@ from scopemap.input.video_format.streams import (
     other_streams,
     stated_length_s,
     video_stream,
+    why_few_pictures,
     why_no_video,
 )
 from scopemap.input.video_format.time_stamps import TimeStamps
@@ -97,6 +98,8 @@ class VideoFile(Source):
         self._is_smeared = False
         self._counted = dict[tuple[int | None, int | None], tuple[int, int | None]]()
         first = [frame for _, _, frame in islice(self._decoded(), 2)]
+        if len(first) < 2 and (why := why_few_pictures(path)):
+            raise InputError(f"reading the video {path}: {why}")
         if len(first) == 1:
             raise InputError(f"reading the video {path}: it holds one frame, two are needed")
         if not first:
