@@ -159,6 +159,47 @@ def test_unusable_folders_and_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.ones((3, 50, 60), np.float32), r"of shape \(3, 50, 60\).*save one array \(height, width\) per frame"),
+        (np.ones((50, 60), np.int32), "holds int32 .*save it as uint16 or float32"),
+        (
+            np.array([{"depth": 1}], dtype=object),
+            "it holds Python objects, which are not loaded; save the array itself",
+        ),
+    ],
+)
+def test_arrays_that_are_no_depth_of_one_frame_are_refused_for_what_they_are(
+    array: np.ndarray, message: str, tmp_path: Path
+) -> None:
+    """All were said to be colour-mapped pictures, or answered by NumPy's own words."""
+    np.save(tmp_path / "0.npy", array)
+    with pytest.raises(InputError, match=message):
+        files(tmp_path)
+
+
+def test_an_array_that_breaks_off_is_called_damaged(tmp_path: Path) -> None:
+    write(tmp_path, "0.npy", ramp(np.float32, 80))
+    (tmp_path / "0.npy").write_bytes((tmp_path / "0.npy").read_bytes()[:3000])
+    with pytest.raises(InputError, match=r"0\.npy: it is no array of NumPy, or damaged"):
+        files(tmp_path)
+
+
+def test_three_equal_channels_with_unknown_pixels_are_one(tmp_path: Path) -> None:
+    """NaN differs from NaN: they were taken for a colour-mapped picture."""
+    depth_mm = ramp(np.float32, 80)
+    depth_mm[3, 4] = np.nan
+    write(tmp_path, "0.npy", np.dstack([depth_mm] * 3))
+    assert np.isnan(files(tmp_path).estimate(frame()).values[3, 4])
+
+
+def test_arrays_of_other_formats_are_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "0000.npz", depth=ramp(np.float32, 80))
+    with pytest.raises(InputError, match=r"; save what its \.npz files hold as one npy file per frame"):
+        files(tmp_path)
+
+
+@pytest.mark.parametrize(
     ("first", "frames", "later"), [(1, range(4), -1), (0, range(1, 5), 1), (0, range(4), 0), (1, range(5), 0)]
 )
 def test_depth_files_numbered_from_1_belong_to_frames_from_0(

@@ -133,6 +133,37 @@ def test_files_that_the_first_frames_cannot_decide_are_refused(tmp_path: Path) -
     assert prepared(black, None, folder, **{"depth.files_kind": "measured"})[0].kind == "measured"
 
 
+CONTENTLESS: dict[str, tuple[Write, Callable[[np.ndarray], np.ndarray], str]] = {
+    "zeros": (_levels, np.zeros_like, "hold no positive number"),
+    "unknown": (_floats, lambda mm: mm * np.nan, "hold no positive number"),
+    "negative": (_floats, lambda mm: -mm, "hold no positive number"),
+    "one number": (_floats, lambda mm: 0 * mm + 30, "hold one number everywhere, such as 30"),
+    "one level": (_levels, lambda mm: np.full(mm.shape, 9), "hold one number everywhere, such as 9"),
+    "stretched": (
+        _floats,
+        lambda mm: 0.1 + 254.9 * stretched(np.where(mm < 99, mm, np.nan)),  # the phantom's depth is cut off at 100 mm
+        "each reach from 0.1 to 255: each frame was stretched by itself",
+    ),
+    "logarithm": (_floats, np.log, r"vary \d\.\d times less: they may be logarithms of depth"),
+}
+
+
+@pytest.mark.parametrize("form", CONTENTLESS)
+def test_files_that_are_no_depth_in_mm_are_refused(form: str, phantom: Path, pictures: Path, tmp_path: Path) -> None:
+    """They ended in a result, with known sizes, or in the advice to state a kind that they do not have."""
+    save, values_of, message = CONTENTLESS[form]
+    with pytest.raises(InputError, match=message):
+        prepared(pictures, phantom, write(phantom, tmp_path / "files", save, values_of))
+
+
+def test_depth_that_is_cut_off_at_a_farthest_one_is_not_taken_for_stretched(
+    phantom: Path, pictures: Path, tmp_path: Path
+) -> None:
+    """Its largest number is the same in each file, too, but in many pixels."""
+    folder = write(phantom, tmp_path / "files", _floats, lambda mm: np.clip(np.nan_to_num(mm), 0, 40))
+    assert prepared(pictures, phantom, folder)[0].kind == "measured"
+
+
 def test_motion_and_network_decide_together() -> None:
     nan = float("nan")
     assert KindEvidence((9.0, 9.0), nan, 2).sign == 1

@@ -122,9 +122,23 @@ def test_what_is_not_known_to_be_one_camera_is_refused(forms: list[str], words: 
 
 
 def test_a_stray_picture_is_not_the_folder(tmp_path: Path) -> None:
-    assert open_sequence(_folder(tmp_path / "gt", [*(f"gt_{k:03d}" for k in range(12)), "overview"])).count == 13
+    assert open_sequence(_folder(tmp_path / "gt", [*(f"gt_{k:03d}" for k in range(12)), "overview"])).count == 12
     with pytest.raises(InputError, match="label pictures by their names"):
         open_sequence(_folder(tmp_path / "masks", [*(f"mask_{k:03d}" for k in range(12)), "overview"]))
+
+
+def test_a_stray_picture_without_a_number_is_no_frame(tmp_path: Path) -> None:
+    """A cover was the last frame, and all frames lost their numbers, by which masks and depth files are found."""
+    source = ImageFolder(_folder(tmp_path / "images", [*(f"{number:04d}" for number in range(5, 15)), "cover"]))
+    assert (source.numbers, _shown(source)) == (list(range(5, 15)), list(range(10)))
+    assert any(
+        note.startswith("left out: 1 picture(s) without a number") and "cover.png" in note for note in source.notes
+    )
+
+
+def test_the_first_of_renamed_pictures_may_have_no_number(tmp_path: Path) -> None:
+    names = ["image", *(f"image ({number})" for number in range(1, 10))]
+    assert _shown(ImageFolder(_folder(tmp_path / "images", names))) == list(range(10))
 
 
 def test_two_counters_of_two_digits_are_no_times(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from scopemap.input.mask_files import MaskFiles, create_masks
 from scopemap.input.opening import open_sequence
 from scopemap.runner.estimators import create_estimators
 from scopemap.runner.provenance import estimators_provenance
+from scopemap.runner.reconstruct import reconstruct
 
 SOURCE = PinholeCamera(400.0, 400.0, 319.5, 239.5, 640, 480)
 RECTIFIER = Rectifier(SOURCE, working_camera(SOURCE, (320, 240)))
@@ -175,9 +176,10 @@ def test_masks_without_a_frame_and_masks_that_may_be_late_are_told(tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "level", "code"),
     [("{}.png", 0, "masks-empty"), ("{}.jpg", 1, "masks-faint"), ("{}.jpg", 90, "masks-faint"),
-     ("mask.png", 0, "masks-empty"), ("{}.png", 1, ""), ("{}.jpg", 255, ""), ("mask.png", 1, "")],
+     ("mask.png", 0, "masks-empty"), ("{}.png", 1, "masks-large"), ("{}.jpg", 255, "masks-large"),
+     ("mask.png", 1, "masks-large")],
 )  # fmt: skip
-def test_masks_that_never_hide_a_pixel_are_told(name: str, level: int, code: str, tmp_path: Path) -> None:
+def test_masks_that_hide_nothing_or_everything_are_told(name: str, level: int, code: str, tmp_path: Path) -> None:
     values = {name.format(k): np.full((480, 640), level, np.uint8) for k in range(3)}
     masks = MaskFiles(write_masks(tmp_path / "masks", values), RECTIFIER, numbers=range(3))
     assert set(_codes(masks, range(3))) == ({code} if code else set())
@@ -192,3 +194,14 @@ def test_masks_numbered_from_one_beside_a_video_numbered_from_zero(tmp_path: Pat
     assert estimators.masks is not None
     assert all(estimators.masks.covered(index) is not None for index in range(6))
     assert {notice.code for notice in estimators.masks.notices} == {"masks-shifted"}
+
+
+def test_a_run_whose_masks_hide_nearly_all_says_so(tmp_path: Path) -> None:
+    """Masks that are white at tissue: only the share of usable pixels was said."""
+    video = write_video(tmp_path / "v.mp4", 3)
+    inverted = np.full((480, 640), 255, np.uint8)
+    inverted[:80, :80] = 0
+    masks = write_masks(tmp_path / "masks", {f"{k}.png": inverted for k in range(3)})
+    config = Config.load(settings={"mask.files": str(masks), "depth.backend": "shading", "input.focal": "assume"})
+    with pytest.raises(InputError, match=r"is usable\. The masks in .* hide 98 % of the pictures.*invert them"):
+        reconstruct(open_sequence(video), config)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from av.stream import Disposition
 from drawn_inputs import number_in, picture
+from PIL import Image
 
 from scopemap.apps.inspect.container import read_container
 from scopemap.engine.config import InputSettings
@@ -144,3 +145,43 @@ def test_a_file_without_a_video_is_named_by_what_it_is(content: bytes, words: st
     with pytest.raises(InputError, match=rf"v\.mp4: .*{words}") as refused:
         VideoFile(file)
     assert "Invalid data" not in str(refused.value)
+
+
+def _packets_of(pictures: int, file: Path) -> list[bytes]:
+    """A transport stream, whose packets have 188 bytes; a key picture every 12 pictures."""
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("mpeg4", rate=RATE, options={"g": "12"})
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = *SIZE, "yuv420p", 4_000_000
+        for number in range(pictures):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(number, SIZE), format="rgb24")))
+        container.mux(stream.encode())
+    content = file.read_bytes()
+    return [content[at : at + 188] for at in range(0, len(content), 188)]
+
+
+def test_pictures_that_ffmpeg_fills_in_are_said(tmp_path: Path) -> None:
+    """Lost packets end in smeared pictures, which FFmpeg returns as sound ones."""
+    packets = _packets_of(36, tmp_path / "whole.ts")
+    hole = tmp_path / "hole.ts"
+    hole.write_bytes(b"".join(packets[: len(packets) // 2] + packets[len(packets) // 2 + 4 :]))
+    source = open_sequence(hole, settings=EVERY).source
+    list(source.frames(slice(None)))
+    (warning,) = source.warnings
+    assert str(warning).startswith("the data of the video hole.ts are interrupted or damaged near frame ")
+    assert "unless pieces were joined there" in str(warning), "FFmpeg does not tell a join from a loss"
+    assert 8 <= int(str(warning).split("near frame ")[1].split(":")[0]) <= 22
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("stack.tif", "of a TIFF only the first picture is read; save its pages as a folder of images"),
+        ("moving.webp", "animated WebP is not read; save it as a video or a folder of images"),
+    ],
+)
+def test_files_of_several_pictures_that_are_not_read_are_named(name: str, why: str, tmp_path: Path) -> None:
+    """They were said to hold one frame, or pictures that are too large."""
+    first, *others = (Image.fromarray(picture(number, SIZE)) for number in range(5))
+    first.save(tmp_path / name, save_all=True, append_images=others)
+    with pytest.raises(InputError, match=why):
+        open_sequence(tmp_path / name)

@@ -46,6 +46,7 @@ KINDS: dict[str, _Kind] = {
     "masks-unused": _Kind("note", ("masks", "folder", "first")),
     "masks-empty": _Kind("note", ("folder", "level")),
     "masks-faint": _Kind("doubtful", ("folder", "level")),
+    "masks-large": _Kind("doubtful", ("folder", "share")),
     "frames-failed": _Kind("note", ("frames", "first", "reason")),
     "frames-without-depth": _Kind("note", ("frames", "first")),
     "depth-propagated": _Kind("info", ("every", "frames")),

@@ -18,7 +18,7 @@ from scopemap.engine.errors import InputError, reporting
 
 _MOST_MEGAPIXELS = 64.0
 _VARIABLE = "SCOPEMAP_MAX_MEGAPIXELS"
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_MISSING_BYTES = 16 << 20
 _WIDTH = 256  # TIFF 6.0, section 8
@@ -53,7 +53,7 @@ def write_encoded(file: Path, image: np.ndarray) -> None:
     A TIFF is packed by deflate: OpenCV's own LZW is read by imageio and tifffile with imagecodecs alone.
     """
     is_tiff = file.suffix.lower() in (".tif", ".tiff")
-    options = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE] if is_tiff else []
+    options = [cv2.IMWRITETIFF_COMPRESSION, cv2.IMWRITETIFF_COMPRESSION_ADOBE_DEFLATE] if is_tiff else []
     file.write_bytes(cv2.imencode(file.suffix, image, options)[1].tobytes())
 
 
@@ -126,7 +126,7 @@ def _claimed_pixels(content: bytes) -> float:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            if content[:4] in _TIFF:
+            if content[:4] in TIFF:
                 # Pillow opens few kinds of TIFF, but reads the directory of all.
                 directory = TiffImagePlugin.ImageFileDirectory_v2(content[: 16 if b"+" in content[:4] else 8])
                 file.seek(directory.next)

@@ -24,10 +24,11 @@ from scopemap.engine.config import DepthSettings
 from scopemap.engine.depth.estimate import DepthEstimate, DepthKind
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
-from scopemap.input.decoding import by_number, frame_number, frames_later, read_decoded
+from scopemap.input.decoding import by_number, frame_number, frames_later
+from scopemap.input.depth_reading import NUMPY, read_depth_file
 
 _IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
-_NUMPY = ".npy"
+_OTHER_ARRAYS = (".npz", ".exr", ".pfm", ".mat", ".h5", ".hdf5", ".pt", ".pth", ".pkl")  # that networks write depth to
 _NAMED_DEPTH = re.compile(r"(^|[._-])(depth|disp|disparity)([._-]|$)", re.IGNORECASE)
 _COLOUR = re.compile(r"[._-](color|colour|rgb)$", re.IGNORECASE)
 _OTHER_CONTENT = re.compile(r"[._-](color|colour|rgb|normals?|flow|occlusion|masks?)$", re.IGNORECASE)
@@ -86,7 +87,7 @@ class FilesDepth:
         # The files of a run have its frames' numbers.
         self.later = 0 if self._is_rectified else frames_later(list(self._files), of_input.numbers)
         self._files = {number + self.later: file for number, file in self._files.items()}
-        first = _read(next(iter(self._files.values())))
+        first = read_depth_file(next(iter(self._files.values())))
         self._only_type = first.dtype if settings.files_kind == "auto" else None
         stated = _scale_in(self._folder)
         self.kind_is_stated = settings.files_kind != "auto" or stated is not None
@@ -126,21 +127,25 @@ class FilesDepth:
         The numbers are those of the file, whatever its kind.
         """
         try:
-            array = _read(self._files[frame.index])
+            array = read_depth_file(self._files[frame.index])
             self._check(array, self._files[frame.index])
         except (KeyError, InputError):
             return None
         values = _depth(array, 1.0)
         return self._resized(values) if self._is_rectified else self._rectifier.nearest(values)
 
-    def median(self) -> float:
-        """Return the median of all positive values in a few files, in their unit; NaN where none can be read."""
-        files, medians = list(self._files.values()), list[float]()
+    def samples(self) -> list[np.ndarray]:
+        """Return what a few files from all parts hold, (h, w) each, of those that can be read."""
+        files, found = list(self._files.values()), list[np.ndarray]()
         for file in files[:: max(1, len(files) // _LOOKED_AT)]:
             with suppress(InputError):
-                values = _depth(_read(file), 1.0)
-                medians += [float(np.nanmedian(values))] if np.isfinite(values).any() else []
-        return float(np.median(medians)) if medians else float("nan")
+                found.append(read_depth_file(file))
+        return found
+
+    def median(self) -> float:
+        """Return the median of all positive values in a few files, in their unit; NaN where none can be read."""
+        known = [values[np.isfinite(values)] for values in (_depth(array, 1.0) for array in self.samples())]
+        return float(np.median([np.median(values) for values in known if values.size] or [np.nan]))
 
     def estimate(self, frame: Frame) -> DepthEstimate:
         """Return the depth or disparity of `frame` (found by `frame.index`), rectified, NaN = unknown.
@@ -155,7 +160,7 @@ class FilesDepth:
                 f"no depth file for frame {frame.index} in {self._folder} ({len(numbers)} files, numbers {numbers[0]} "
                 f"to {numbers[-1]}): name each file as its picture, or by the frame's number"
             )
-        array = _read(file)
+        array = read_depth_file(file)
         self._check(array, file)
         values = _disparity(array) if self.kind == "disparity" else _depth(array, self._scale.mm)
         return DepthEstimate(self._rectified(values), self.kind)
@@ -235,7 +240,7 @@ def depth_files(folder: Path, pictures: Mapping[int, Path] | None = None) -> dic
     """
     if not folder.is_dir():
         raise InputError(f"reading depth files: {folder} is no folder; give files:FOLDER with the folder of the files")
-    candidates = [f for f in sorted(folder.iterdir()) if f.suffix.lower() in (*_IMAGES, _NUMPY) and f.name[0] != "."]
+    candidates = [f for f in sorted(folder.iterdir()) if f.suffix.lower() in (*_IMAGES, NUMPY) and f.name[0] != "."]
     own = {picture.resolve() for picture in (pictures or {}).values()}
     others = [file for file in candidates if file.resolve() not in own]
     if pictures and (matched := _by_picture(others, pictures)):
@@ -248,9 +253,15 @@ def depth_files(folder: Path, pictures: Mapping[int, Path] | None = None) -> dic
     if not numbered:
         raise InputError(
             f"reading depth files: {folder} holds no png, tif, jpg or npy file with a number in its name that could be "
-            "depth; the number is the frame's"
+            f"depth; the number is the frame's{_other_endings(folder)}"
         )
     return by_number(named or numbered)
+
+
+def _other_endings(folder: Path) -> str:
+    """Return what to do with files of arrays in other formats, as the end of a sentence; "" where there are none."""
+    endings = sorted({file.suffix.lower() for file in folder.iterdir()} & set(_OTHER_ARRAYS))
+    return f"; save what its {' and '.join(endings)} files hold as one npy file per frame" if endings else ""
 
 
 def _by_picture(files: list[Path], pictures: Mapping[int, Path]) -> dict[int, Path]:
@@ -285,26 +296,6 @@ def _picture_in(stem: str, pictures: Mapping[str, int]) -> str | None:
     begins = [stem[:i] for i in reversed(at) if stem[:i] in pictures]
     ends = [stem[i + 1 :] for i in at if stem[i + 1 :] in pictures]
     return next(iter([] if _OTHER_CONTENT.search(stem) else [*begins, *ends]), None)
-
-
-def _read(file: Path) -> np.ndarray:
-    """Return (h, w) uint8, uint16 or floating; raises `InputError` for other content."""
-    try:
-        is_array = file.suffix.lower() == _NUMPY
-        array = np.load(file, mmap_mode="r", allow_pickle=False) if is_array else read_decoded(file)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"cannot read the depth file {file}: {error}") from None
-    if array is None:
-        raise InputError(f"cannot read the depth file {file}: not an image, or damaged")
-    array = np.squeeze(array)
-    if array.ndim == 3 and (array[..., :3] == array[..., :1]).all():
-        array = array[..., 0]
-    if array.ndim != 2 or not (array.dtype in (np.uint8, np.uint16) or np.issubdtype(array.dtype, np.floating)):
-        raise InputError(
-            f"the depth file {file} holds {array.dtype} of shape {array.shape}: expected one channel of 8 or 16 bit "
-            "or floats; a colour-mapped depth picture cannot be converted to depth"
-        )
-    return array
 
 
 def _disparity(array: np.ndarray) -> np.ndarray:

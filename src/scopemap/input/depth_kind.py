@@ -38,6 +38,10 @@ _MOST_OF_ONE = 10.0  # log odds that one window may give
 _AGAINST = 3.0  # log odds that take the network's word away
 # scopenet's depth correlates with the true one by .97 to .99 in colons, but by -.8 on a phantom's abdominal wall.
 _NETWORK_DECISIVE = 0.9
+# Spread of ln depth over that of scopenet's, where the two correlate: .76 to 1.23 for true depth of C3VD and a phantom,
+# .47 where a quarter of the picture is cut off, .22 to .39 for its logarithm (2026-11).
+_FLAT = 0.45
+_SPREAD_PERCENTILES = (10, 90)
 _WINDOWS = 4
 _FEWEST_WINDOWS = 2
 _CORRELATED = 30.0  # of the errors count as one, as in `focal_length.trial`
@@ -61,12 +65,19 @@ class KindEvidence:
     """What the first frames say of depth files; positive: their numbers are depth, negative: inverse depth.
 
     motion : (K,) log odds of each window. network : median rank correlation with scopenet's depth, NaN: none.
-    frames : how many depth files were looked at.
+    frames : how many depth files were looked at. spread : median ratio of the spread of their logarithm to that of
+    scopenet's depth, NaN: none.
     """
 
     motion: tuple[float, ...]
     network: float
     frames: int
+    spread: float = math.nan
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether they vary far less than scopenet's depth, though in its order: they may be logarithms of depth."""
+        return abs(self.network) >= _NETWORK_DECISIVE and self.spread < _FLAT
 
     @property
     def total(self) -> float:
@@ -104,14 +115,18 @@ def kind_evidence(sequence: Sequence, config: Config, numbers: Numbers) -> KindE
 
     No more windows are looked at than it takes for both to say the same.
     """
-    motion, ranks, network = list[float](), list[float](), ScopeNetDepth(rays_known=sequence.calibrated)
+    motion, compared, network = (
+        list[float](),
+        list[tuple[float, float]](),
+        ScopeNetDepth(rays_known=sequence.calibrated),
+    )
     evidence = KindEvidence((), math.nan, 0)
     for frames, found in islice(_with_numbers(sequence, config, numbers), _WINDOWS):
-        ranks.append(_rank_correlation(network, frames[0], found))
+        compared.append(_compared(network, frames[0], found))
         if (window := window_of(frames)) is not None:
             motion.append(_log_odds(window, resampled(found, frames[0].camera)))
-        known = [rank for rank in ranks if math.isfinite(rank)]
-        evidence = KindEvidence(tuple(motion), float(np.median(known)) if known else math.nan, len(ranks))
+        rank, spread = np.median([one for one in compared if math.isfinite(one[0])] or [(math.nan, math.nan)], axis=0)
+        evidence = KindEvidence(tuple(motion), float(rank), len(compared), float(spread))
         if len(motion) >= _FEWEST_WINDOWS and evidence.by_motion * evidence.by_network > 0:
             break
     return evidence
@@ -123,14 +138,20 @@ def _with_numbers(sequence: Sequence, config: Config, numbers: Numbers) -> Itera
             yield frames, found
 
 
-def _rank_correlation(network: ScopeNetDepth, frame: Frame, found: np.ndarray) -> float:
-    """Return Spearman's correlation of a file's numbers with scopenet's depth; NaN where one of them is constant."""
+def _compared(network: ScopeNetDepth, frame: Frame, found: np.ndarray) -> tuple[float, float]:
+    """Return Spearman's correlation of a file's numbers with scopenet's depth, and the spread of their logarithm in
+    units of that of scopenet's; NaN where one of them is constant.
+    """
     small = frame.downscaled(depth_downscale(DepthSettings(), max(frame.valid.shape)))
     values = resampled(found, small.camera)
     known = small.valid & (values > 0)
     if known.sum() < _MIN_CORNERS or np.ptp(values[known]) == 0:
-        return math.nan
-    return float(spearmanr(network.estimate(small).values[known], values[known]).statistic)
+        return math.nan, math.nan
+    predicted = network.estimate(small).values[known]
+    of_network, of_file = (
+        np.ptp(np.percentile(np.log(one), _SPREAD_PERCENTILES)) for one in (predicted, values[known])
+    )
+    return float(spearmanr(predicted, values[known]).statistic), float(of_file / of_network)
 
 
 def _log_odds(window: Window, found: np.ndarray) -> float:

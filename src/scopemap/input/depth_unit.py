@@ -1,6 +1,8 @@
-"""The unit of depth files: a depth that no endoscope sees is refused, with the units that would fit."""
+"""What depth files cannot hold: nothing, a scale of their own in each frame, a depth that no endoscope sees."""
 
 from __future__ import annotations
+
+import numpy as np
 
 from scopemap.engine.errors import InputError
 from scopemap.input.depth_files import FilesDepth
@@ -22,6 +24,42 @@ _UNITS = (
     (0.001, "in micrometres"),
 )
 _MOST_SUGGESTED = 3
+# By hand: a depth that is cut off at a farthest one has more pixels there, one that is stretched to it a few.
+_MOST_AT_THE_LARGEST = 1e-3
+_ROUNDED = 1e-5  # of the largest: by hand, what float32 leaves of equal numbers after a few operations
+_FEWEST_ALIKE = 3  # files whose largest value may be the same by chance; by hand
+
+
+def check_values(files: FilesDepth) -> None:
+    """Raise `InputError` where a few files hold no positive number, or one number everywhere."""
+    known = [array[np.isfinite(array) & (array > 0)] for array in files.samples()]
+    if not known:
+        return  # none can be read: the first frame says so
+    if not any(values.size for values in known):
+        raise InputError(
+            f"the depth files in {files.folder} hold no positive number: depth and disparity are positive, and 0, NaN "
+            "and negative numbers mean unknown; give what the network returned"
+        )
+    if all(np.ptp(values) == 0 for values in known if values.size):
+        raise InputError(
+            f"the depth files in {files.folder} hold one number everywhere, such as {known[0].max(initial=0):g}: they "
+            "say nothing of depth; give what the network returned"
+        )
+
+
+def check_common_scale(files: FilesDepth) -> None:
+    """Raise `InputError` where each file of depth in mm was stretched to the same range: their scales differ."""
+    arrays = [array[np.isfinite(array)].astype(np.float64) for array in files.samples() if np.isfinite(array).any()]
+    ranges = np.array([(array.min(), array.max()) for array in arrays])
+    if len(arrays) < _FEWEST_ALIKE or (np.ptp(ranges, axis=0) > _ROUNDED * ranges.max()).any():
+        return
+    if all((array == array.max()).mean() < _MOST_AT_THE_LARGEST for array in arrays):
+        low, high = ranges[0]
+        raise InputError(
+            f"the depth files in {files.folder} each reach from {low:g} to {high:g}: each frame was stretched by "
+            "itself, so they are not mm, nor of one scale; give depth as the network returned it, or inverse depth, "
+            "whose scale may differ, with --set depth.files_kind=disparity"
+        )
 
 
 def check_unit(files: FilesDepth, near_far_mm: tuple[float, float] | None = None) -> None:

@@ -65,7 +65,7 @@ def chosen_frames(folder: Path, files: list[Path]) -> Chosen:
     where only such pictures are there, and where several series have the same numbers and none is known to be colour.
     """
     notes = list[str]()
-    files = _one_eye(_frames(folder, files, notes), notes)
+    files = _numbered(_one_eye(_frames(folder, files, notes), notes), notes)
     files = in_order(_one_series(folder, files, notes))
     return Chosen(files, notes, [] if decimal_numbers(files) is not None else _doubts(files))
 
@@ -89,6 +89,21 @@ def _content(file: Path) -> tuple[str, str] | None:
     """Return the kind of a picture that is no frame, and the word that tells: the first or last one of its name."""
     words = [word.lower() for word in _WORD.findall(file.stem)]
     return next(((_OTHER_CONTENT[word], word) for word in words[:1] + words[-1:] if word in _OTHER_CONTENT), None)
+
+
+def _numbered(files: list[Path], notes: list[str]) -> list[Path]:
+    """Return the files without the few that have no number where the others have one, such as a cover or thumbnail."""
+    numbered = [file for file in files if frame_number(file) is not None]
+    # The first of copies, or of files that were renamed together, may have none: image.png, image (1).png.
+    strays = [file for file in files if file not in numbered and not _begins_one_of(file, numbered)]
+    if not strays or len(strays) * _MOST_PICTURES > len(numbered):
+        return files
+    notes.append(f"left out: {len(strays)} picture(s) without a number in their names, such as {min(strays).name}")
+    return [file for file in files if file not in strays]
+
+
+def _begins_one_of(file: Path, others: list[Path]) -> bool:
+    return any(other.stem.startswith(file.stem) for other in others)
 
 
 def _one_eye(files: list[Path], notes: list[str]) -> list[Path]:

@@ -21,6 +21,7 @@ _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _LOSSY = (".jpg", ".jpeg")
 _HALF = 127
 _GROW_PX = 3  # by hand: by which masks are widened
+_LARGE = 0.75  # by hand: of a picture, on average; the border around a round field of view in 16:9 hides .6
 _NO_MASKS = "none"
 
 
@@ -54,7 +55,8 @@ class MaskFiles:
     """
 
     _asked: Kept[set[int]]
-    _hides: Kept[bool]
+    _hidden: Kept[float]
+    _read_masks: Kept[int]
     _level: Kept[int]
 
     def __init__(
@@ -65,7 +67,7 @@ class MaskFiles:
         self._numbers = range(0) if numbers is None else numbers
         self._later = frames_later(list(self._files), self._numbers)
         self._files = {number + self._later: file for number, file in self._files.items()}
-        self._asked, self._hides, self._level = set(), False, 0
+        self._asked, self._hidden, self._read_masks, self._level = set(), 0.0, 0, 0
 
     def covered(self, index: int) -> np.ndarray | None:
         """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.
@@ -90,7 +92,8 @@ class MaskFiles:
         # The alpha channel is ignored.
         level = image if image.ndim == 2 else image[..., :3].max(-1)
         hidden = level > (_HALF if file.suffix.lower() in _LOSSY else 0)
-        self._hides, self._level = self._hides or bool(hidden.any()), max(self._level, int(level.max()))
+        self._hidden, self._read_masks = self._hidden + float(hidden.mean()), self._read_masks + 1
+        self._level = max(self._level, int(level.max()))
         masked = self._rectifier.nearest(hidden.astype(np.uint8))
         return cv2.dilate(masked, disc(self._grow_px)) > 0
 
@@ -105,7 +108,7 @@ class MaskFiles:
 
     @property
     def notices(self) -> list[Notice]:
-        """What looks wrong: most frames have no mask, masks have no frame or another number, no mask hides a pixel."""
+        """What looks wrong: masks that are missing or have no frame, another number, or hide nothing or nearly all."""
         found, folder = list[Notice](), {"folder": str(self._folder)}
         missing = len(self._asked - set(self._files))
         if self._single is None and 2 * missing > len(self._asked):
@@ -117,8 +120,10 @@ class MaskFiles:
         if self._numbers and (left := sorted(set(self._files) - set(self._numbers) - self._asked)):
             found.append(Notice("masks-unused", {"masks": len(left), "first": self._files[left[0]].name} | folder))
         used = 1 if self._single is not None else len(self._asked & set(self._files))
-        if used and not self._hides:
+        if used and not self._hidden:
             found.append(Notice("masks-faint" if self._level else "masks-empty", {"level": self._level} | folder))
+        if self._read_masks and (share := self._hidden / self._read_masks) > _LARGE:
+            found.append(Notice("masks-large", {"share": share} | folder))
         return found
 
     @property

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
 from av.container import InputContainer
+from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
@@ -23,11 +22,13 @@ from scopemap.input.decoding import limit_in_words, most_pixels
 from scopemap.input.sampling import SampledPair, pair_of, pairs_in_order
 from scopemap.input.source import Source, SourceFrame
 from scopemap.input.video_format.entry import WITH_EDIT_LISTS, FrameIndex, changes_size, entered, frame_index
+from scopemap.input.video_format.orientation import display_matrix, swaps_sides, upright
 from scopemap.input.video_format.streams import (
     lasts_to_the_end,
     other_streams,
     stated_length_s,
     video_stream,
+    why_few_pictures,
     why_no_video,
 )
 from scopemap.input.video_format.time_stamps import TimeStamps
@@ -94,14 +95,17 @@ class VideoFile(Source):
         self._length_is_own = True
         self._coded_aspect: Fraction | None = None  # of the picture that was decoded last
         self._frame_index: FrameIndex | None = None
+        self._is_smeared = False
         self._counted = dict[tuple[int | None, int | None], tuple[int, int | None]]()
         first = [frame for _, _, frame in islice(self._decoded(), 2)]
+        if len(first) < 2 and (why := why_few_pictures(path)):
+            raise InputError(f"reading the video {path}: {why}")
         if len(first) == 1:
             raise InputError(f"reading the video {path}: it holds one frame, two are needed")
         if not first:
             raise InputError(f"reading the video {path}: it holds no readable frame, or pictures of {limit_in_words()}")
         # Of one frame: a frame whose side data was looked at refers to itself, and waits for the garbage collector.
-        self._matrix = _display_matrix(first[0])
+        self._matrix = display_matrix(first[0])
         self.height, self.width = self._shown(first[0], VideoReformatter()).shape[:2]
         with self._opened() as container:
             stream = self._stream(container)
@@ -117,7 +121,7 @@ class VideoFile(Source):
 
     def _take_aspect(self, stated: Fraction | None) -> None:
         aspect = float(stated or 1.0)
-        self.pixel_aspect = 1 / aspect if self._matrix is not None and _swaps_sides(self._matrix) else aspect
+        self.pixel_aspect = 1 / aspect if self._matrix is not None and swaps_sides(self._matrix) else aspect
 
     def _take_count(self, container: InputContainer, stream: VideoStream) -> None:
         duration_s, self._length_is_own = stated_length_s(container, stream)
@@ -257,6 +261,7 @@ class VideoFile(Source):
                 reading.begin(self.rate_hz, entry.number)
             for packet in container.demux(stream) if entry is None else entry.packets:
                 if packet.size:
+                    self._look_for_smears(packet, reading)
                     reading.packets += 1
                     due.append(None if packet.dts is None else float(packet.dts * packet.time_base))
                     if in_order and packet.pts is not None and not packet.is_discard:
@@ -269,6 +274,7 @@ class VideoFile(Source):
                 for frame in decoded:
                     if entry is not None and reading.shown_pts is None and not _is_entry(frame, entry.pts):
                         continue
+                    self._look_for_smears(frame, reading)
                     # The k-th picture that is shown is due when the k-th is decoded.
                     self._coded_aspect = stream.codec_context.sample_aspect_ratio
                     stamp_s = frame.time if in_order else due[reading.index] if reading.index < len(due) else None
@@ -292,6 +298,13 @@ class VideoFile(Source):
             for packet in container.demux(stream):
                 with suppress(av.FFmpegError):
                     yield from (frame for frame in packet.decode() if frame.pts is not None and frame.pts > last_pts)
+
+    def _look_for_smears(self, data: Packet | VideoFrame, reading: _Reading) -> None:
+        """Warn once: FFmpeg fills what is missing from other pictures, and shows the result as if it were sound."""
+        if data.is_corrupt and not self._is_smeared:
+            self._is_smeared = True
+            found = f"the data of the video {self.path.name} are interrupted or damaged near frame {reading.index}"
+            self._warn(f"{found}: unless pieces were joined there, pictures up to the next key picture may be smeared")
 
     def _report(self, reading: _Reading) -> None:
         stamps, read = reading.stamps, reading.shown
@@ -373,25 +386,3 @@ def _may_be_entered(container: InputContainer, stream: VideoStream, places: int)
 def _tolerance(count: int) -> float:
     """Return how many frames a claim of so many may be wrong by."""
     return max(_MISSING_FRAMES, _MISSING_SHARE * count)
-
-
-def upright(rgb: np.ndarray, matrix: Sequence[int]) -> np.ndarray:
-    """Return a picture (h, w, 3) rotated and mirrored by a display matrix, to the nearest quarter turn.
-
-    `matrix` is that of ISO/IEC 14496-12, 9 numbers a b u c d v x y w: a pixel at (x, y) is shown at
-    (a x + c y, b x + d y), up to a shift.
-    """
-    across, down = matrix[0], matrix[4]
-    if _swaps_sides(matrix):
-        rgb, across, down = rgb.transpose(1, 0, 2), matrix[3], matrix[1]
-    return np.ascontiguousarray(rgb[:: -1 if down < 0 else 1, :: -1 if across < 0 else 1])
-
-
-def _swaps_sides(matrix: Sequence[int]) -> bool:
-    return abs(matrix[1]) > abs(matrix[0])
-
-
-def _display_matrix(frame: VideoFrame) -> tuple[int, ...] | None:
-    """Return the 9 numbers that say how a frame is to be shown, None where nothing does."""
-    stated: Any = frame.side_data.get("DISPLAYMATRIX")
-    return None if stated is None else struct.unpack("=9i", bytes(stated)[: 9 * 4])

@@ -104,6 +104,10 @@ WORDINGS: dict[str, Wording] = {
         "No mask in {folder} hides a pixel: of a JPEG levels above 127 count, and the largest is {level}.",
         "Write the masks as PNG, or with levels of 0 and 255.",
     ),
+    "masks-large": Wording(
+        "The masks in {folder} hide {share:.0%} of the pictures on average: what is not 0 is hidden.",
+        "If the masks are white at tissue, invert them.",
+    ),
     "frames-failed": Wording("Processing failed in {frames:frame}, first in frame {first}: {reason}."),
     "frames-without-depth": Wording("The network returned no depth for {frames:frame}, first for frame {first}."),
     "depth-propagated": Wording(

@@ -11,7 +11,7 @@ from scopemap.engine.estimators import Estimators
 from scopemap.engine.notices import Notice
 from scopemap.input.depth_files import FilesDepth
 from scopemap.input.depth_kind import KindEvidence, kind_evidence
-from scopemap.input.depth_unit import check_unit
+from scopemap.input.depth_unit import check_common_scale, check_unit, check_values
 from scopemap.input.prepared import UNKNOWN_MAKE
 from scopemap.input.sequence import Sequence
 
@@ -28,14 +28,17 @@ def with_files_judged(
     """Return settings and estimators with the kind of depth files, and a notice where the first frames decided it.
 
     Files of a data set are left alone: its format says what they are. Raises `InputError` where the first frames
-    contradict what the files imply, or do not tell, and for a unit that no endoscope has.
+    contradict what the files imply, or do not tell, for files without depth, and for a unit that no endoscope has.
     """
     depth = estimators.depth
     if not isinstance(depth, FilesDepth) or _is_of_data_set(sequence, depth):
         return config, estimators, []
+    check_values(depth)
     notices = list[Notice]()
     if not depth.kind_is_stated:
         kind, notices = _judged(sequence, config, depth)
+        if kind == "measured" and not depth.kind_reason:
+            check_common_scale(depth)
         depth = depth.of_kind(kind)
         settings = config.depth.model_copy(update={"files_kind": kind})
         config, estimators = config.model_copy(update={"depth": settings}), replace(estimators, depth=depth)
@@ -74,6 +77,12 @@ def _judged(sequence: Sequence, config: Config, depth: FilesDepth) -> tuple[Dept
         raise InputError(
             f"the depth files in {depth.folder} may hold depth or inverse depth, which neither the motion of the first "
             f"frames nor scopenet's depth decides; {_STATE_IT}"
+        )
+    if found == "measured" and evidence.is_flat:
+        raise InputError(
+            f"the depth files in {depth.folder} are in the order of scopenet's depth, but vary "
+            f"{1 / evidence.spread:.1f} times less: they may be logarithms of depth, or hold an offset; give depth "
+            "itself, or state --set depth.files_kind=measured if they are depth"
         )
     values = {"kind": _in_words(found), "reason": evidence.reason}
     return found, [Notice("depth-files-kind", values)]

@@ -201,7 +201,7 @@ class Run:
     @cached_property
     def adjusted(self) -> Adjusted:
         """The adjusted submaps, and what was tracked backwards. Raises `InputError` where no frame was tracked."""
-        check_tracked(self.table, self.sequence.path)
+        check_tracked(self.table, self.sequence.path, self.pipeline.preprocessing.estimators.masks)
         if self.pipeline.config.mapping.at_end:
             self.progress("adjusting keyframes", 0, 0)
         trim_memory()

@@ -11,17 +11,21 @@ import numpy as np
 from scopemap.engine.backwards import MapMerge
 from scopemap.engine.errors import InputError
 from scopemap.engine.mapping.segments import Submap
+from scopemap.engine.masking.masker import StoredMasks
 from scopemap.engine.tracking.causes import LossCause, causes_of_loss
 from scopemap.engine.tracking.track import Track, TrackedFrames
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY
 from scopemap.result.frame_table import FrameTable
+from scopemap.result.wording import in_words
 
 
-def check_tracked(frames: FrameTable, path: Path) -> None:
-    """Raise `InputError` where no frame of the input at a path was tracked."""
+def check_tracked(frames: FrameTable, path: Path, masks: StoredMasks | None) -> None:
+    """Raise `InputError` where no frame of the input at a path was tracked; it says where masks hide nearly all."""
     if not frames.tracked.any():
         reason = frames["reason"][0] if len(frames) else "interrupted before the first"
-        raise InputError(f"no frame of {path} could be used: {reason}")
+        large = next((one for one in masks.notices if one.code == "masks-large"), None) if masks is not None else None
+        hidden = "" if large is None else f". {in_words(large)}"
+        raise InputError(f"no frame of {path} could be used: {reason}{hidden}")
 
 
 def tracked_frames(frames: FrameTable) -> TrackedFrames:

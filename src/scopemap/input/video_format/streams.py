@@ -11,7 +11,7 @@ from av.container import InputContainer
 from av.stream import Disposition
 from av.video.stream import VideoStream
 
-from scopemap.input.decoding import first_bytes
+from scopemap.input.decoding import TIFF, first_bytes
 
 # Formats of cover pictures. A video may have one of them, too: only its length tells.
 _PICTURE_CODECS = ("bmp", "gif", "jpegxl", "mjpeg", "png", "tiff", "webp")
@@ -79,6 +79,16 @@ def lasts_to_the_end(container: InputContainer, within_s: float) -> bool:
             if packet.pts is not None and packet.time_base is not None:
                 last_s = max(last_s, float((packet.pts + (packet.duration or 0)) * packet.time_base))
     return last_s >= due_s - within_s
+
+
+def why_few_pictures(file: Path) -> str:
+    """Return a phrase that says why FFmpeg reads fewer than two pictures in a file that may hold more; "" else."""
+    start = first_bytes(file, _LOOKED_AT_BYTES)
+    if start[:4] in TIFF:
+        return "of a TIFF only the first picture is read; save its pages as a folder of images"
+    if start[:4] == b"RIFF" and start[8:12] == b"WEBP":
+        return "animated WebP is not read; save it as a video or a folder of images"
+    return ""
 
 
 def why_no_video(file: Path) -> str:
