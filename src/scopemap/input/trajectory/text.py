@@ -161,7 +161,9 @@ def tum_poses(table: NumberTable, unit: Unit) -> tuple[np.ndarray, str]:
     """Return the poses (N, 4, 4), mm, of `stamp tx ty tz qx qy qz qw` rows, and unit and order of columns in words."""
     mm_per_unit, words = table.unit(unit)
     order = "" if table.columns is None else table.columns.words
-    T = from_quaternions(table.values[:, 4:], table.values[:, 1:4] * mm_per_unit, table.where)
+    with np.errstate(over="ignore"):  # refused as a position that no camera has
+        positions_mm = table.values[:, 1:4] * mm_per_unit
+    T = from_quaternions(table.values[:, 4:], positions_mm, table.where)
     return T, ", ".join(filter(None, (words, order)))
 
 
