@@ -17,8 +17,8 @@ from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit, 
 _TIMED_COLUMNS = 17
 EUROC_FILES = ("mav0/state_groundtruth_estimate0/data.csv", "state_groundtruth_estimate0/data.csv")
 _LONGEST_QUOTE = 40
-# Every number has the comma but a whole one, such as a time of 0.
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?")
+# Every number has the comma but a whole one, such as a time of 0, or a power, such as Excel's 1E-05.
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 _FEWEST_OF_POSE = 7
 _UNIT_LENGTH = 1e-2  # tolerance of a quaternion's length
 
