@@ -65,6 +65,17 @@ def test_names_alignment_and_json(places: tuple[Path, Path, Path]) -> None:
     assert run("compare", ours, "--truth", truth, "--quiet").stdout == ""
 
 
+def test_the_frames_outside_a_part_are_not_lost(places: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    ours, theirs, truth = places
+    part = write_run(tmp_path / "part", as_trajectory(vector_a()[0]).rows(np.arange(20, 50)))
+    (part / "provenance.json").write_text(json.dumps({"selection": {"frames": "20:50", "of": 60}}))
+    run("compare", ours, part, theirs, "--truth", truth, "--out", tmp_path / "out")
+    rows = list(csv.DictReader((tmp_path / "out/tables/overview.csv").read_text().splitlines()))
+    found = {row["method"]: (row["sequence"], row["frames tracked"]) for row in rows}
+    assert found["part"] == ("pose, frames 20 to 49 of 60", "30 of 30")
+    assert found["ours"] == found["theirs.txt"] == ("pose", "60 of 60")
+
+
 def test_a_benchmarks_run_brings_its_figures(tmp_path: Path) -> None:
     for name, ate in (("a", 1.0), ("b", 2.0)):
         (tmp_path / name).mkdir()

@@ -35,18 +35,27 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_says_what_it_found_and_draws_it(say: Say, video: Path) -> None:
-    code, out, err = say(video)
+    code, out, err = say(video, "--out", "seen.png")
     assert (code, err) == (0, "inspected 36 of 36 frames\n")
     assert out.startswith(f"{video}\n")
     for words in ("mpeg4", "picture in picture", "advice: overlay: runs leave them out", "--set", "\nforecast: good"):
         assert words in out
-    picture = cv2.imread("my [clip]_inspection.png")
+    picture = cv2.imread("seen.png")
     assert picture is not None
     # Overlays are boxed in yellow, insets in magenta, what a run leaves out is tinted blue.
     blue, green, red = (picture[..., channel].astype(int) for channel in range(3))
     for colour in ((red > 200) & (green > 200) & (blue < 60), (red > 200) & (green < 60) & (blue > 200)):
         assert colour.sum() > 100
     assert ((blue > 140) & (red < 120)).sum() > 500
+
+
+def test_it_writes_nothing_unasked(say: Say, video: Path) -> None:
+    for _ in range(2):  # what was there refused the second call
+        code, out, _ = say(video)
+        assert code == 0
+        assert out.endswith("picture: none; --out FILE.png draws the findings\n")
+    assert json.loads(say(video, "--json", "--frames", ":2")[1])["picture"] is None
+    assert list(Path().iterdir()) == []
 
 
 def test_json_is_all_that_is_printed_and_a_part_counts_as_the_whole_does(say: Say, video: Path, tmp_path: Path) -> None:

@@ -216,6 +216,13 @@ def test_scales_that_are_none_are_refused(text: str, tmp_path: Path) -> None:
         read_climb_reference(folder)
 
 
+def test_a_scale_that_no_length_has_is_refused(tmp_path: Path) -> None:
+    folder = write_reference(tmp_path, path_of(5))
+    (tmp_path / "scales.csv").write_text(f"{HEAD}1e308\n")
+    with pytest.raises(InputError, match=r"image \d: a position of .* mm is none of a camera"):
+        read_climb_reference(folder)
+
+
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     poses = path_of(6)
     written = replace(frames_of(poses, 3), status=np.array(["initial", "ok", "lost", "ok", "ok", "ok"]))
@@ -241,6 +248,8 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         ("0,000002.png,0,0,0,1,1,0,0", "line 2: the quaternion has length 1.41"),
         ("0,000002.png,0,0,0,1,0,0,0\n1,2.png,0,0,0,1,0,0,0", "line 3: frame 2 is repeated"),
         ("0,000002.png,nan,0,0,1,0,0,0", "it holds no pose"),
+        ("0,000002.png,1e308,0,0,1,0,0,0", r"line 2: a position of 1e\+308 mm is none of a camera"),
+        ("0,000002.png,0,0,-1e200,1,0,0,0", r"line 2: a position of 1e\+200 mm"),
     ],
 )
 def test_rows_that_cannot_be_scored_are_refused(row: str, message: str, tmp_path: Path) -> None:

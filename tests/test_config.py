@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import scopemap.engine.config
 from docs.settings_page import settings_page
 from scopemap.engine.config import PRESETS, Config, MappingSettings, TrackingSettings, setting_names
+from scopemap.engine.config.removed import REMOVED
 from scopemap.engine.config.settings import StageSettings
 from scopemap.engine.errors import SettingsError
 from scopemap.result.result import Result
@@ -205,7 +206,7 @@ def test_an_unreadable_file_is_refused(tmp_path: Path, content: bytes) -> None:
 def test_a_result_of_another_version_keeps_the_settings_that_are_still_there(tmp_path: Path) -> None:
     config = Config.load("paper", settings={"tracking.huber": 2, "fusion.voxel_mm": 0.5})
     file = _write(tmp_path, config.toml() + "tracking.lamp_gamma = 0.35\nmapping.moving_tissue = true\n")
-    with pytest.raises(SettingsError, match=r"unknown setting 'tracking\.lamp_gamma'"):
+    with pytest.raises(SettingsError, match=r"tracking\.lamp_gamma \(removed, use tracking\.photometric\)"):
         Config.load(file=file)
     file.rename(tmp_path / "config.toml")
     ignored = (
@@ -261,3 +262,36 @@ def _read_in(file: Path) -> set[tuple[str, str]]:
     attributes = [node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Attribute)]
     owners = [getattr(node.value, "attr", getattr(node.value, "id", "")) for node in attributes]
     return {(owner.strip("_"), node.attr) for owner, node in zip(owners, attributes, strict=True)}
+
+
+def test_the_file_of_an_earlier_version_is_refused_once_by_what_became_of_its_settings(tmp_path: Path) -> None:
+    file = tmp_path / "config.toml"
+    gone = ("mask.highlights = true", "smoothing.alpha = 0.3", "mapping.moving_tissue = true", "fusion.foo = 1")
+    file.write_text(Config().toml() + "\n".join(gone) + "\n")
+    with pytest.raises(SettingsError) as refused:
+        Config.load(file=file)
+    assert str(refused.value) == (
+        f"{file} is of another version of scopemap. Delete the lines of these settings: fusion.foo (unknown), "
+        "mapping.moving_tissue (removed, nothing takes its place), mask.highlights (removed, use "
+        "mask.method=no-highlights), smoothing.alpha (removed, nothing takes its place)"
+    )
+    with pytest.raises(SettingsError, match=r"'tracking\.channels': removed, use tracking\.photometric"):
+        Config.load(settings={"tracking.channels": 3})
+
+
+def test_what_replaces_a_removed_setting_is_one() -> None:
+    assert not REMOVED.keys() & set(setting_names())
+    for place in filter(None, REMOVED.values()):
+        name, _, value = place.partition("=")
+        Config.load(settings={name: value} if value else {name: getattr(*_parent(name))})
+
+
+def _parent(name: str) -> tuple[object, str]:
+    group, _, own = name.partition(".")
+    return getattr(Config(), group), own
+
+
+def test_the_changelog_names_every_removed_setting() -> None:
+    text = (Path(__file__).parents[1] / "CHANGELOG.md").read_text(encoding="utf-8")
+    removed = text.partition("### Removed")[2].partition("\n### ")[0]
+    assert [name for name in REMOVED if f"`{name}`" not in removed] == []

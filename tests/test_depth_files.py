@@ -17,7 +17,7 @@ from scopemap.engine.config import DepthSettings
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
 from scopemap.input.camera_files.writing import write_calibration
-from scopemap.input.depth_files import FilesDepth, FilesOfInput
+from scopemap.input.depth_files import FilesDepth, FilesOfInput, depth_files
 
 SOURCE = PinholeCamera(100.0, 100.0, 59.5, 49.5, 120, 100)
 TARGET = SOURCE.resized(60, 50)
@@ -212,3 +212,14 @@ def test_depth_files_numbered_from_1_belong_to_frames_from_0(
     for number in range(4):
         values = found.estimate(frame(number + first + later)).values
         assert np.nanmedian(values) == 10.0 + number
+
+
+def test_depth_files_with_decimal_numbers_belong_to_the_pictures_with_these(tmp_path: Path) -> None:
+    names = ("0.067", "0.2", "0.967", "1.067")
+    for name in names:
+        (tmp_path / f"depth_{name}.npy").touch()
+    pictures = dict(enumerate(tmp_path / f"frame_{name}.png" for name in names))
+    found = depth_files(tmp_path, pictures)
+    assert {number: file.name for number, file in found.items()} == {
+        number: f"depth_{name}.npy" for number, name in enumerate(names)
+    }

@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from front_door import call
-from sample_trajectories import as_trajectory, random_pair, vector_a, write_c3vd
+from sample_trajectories import as_trajectory, random_pair, vector_a, write_c3vd, write_run
 from scipy.spatial.transform import Rotation
+from winding_path import seen, straight, winding
 
 from scopemap.engine.errors import AlignmentError
 from scopemap.engine.geometry.se3 import inverse
+from scopemap.evaluation.clock import read_later
 from scopemap.evaluation.doubts import doubts, evaluate_poses
 from scopemap.evaluation.poses import match
 from scopemap.input.trajectory.trajectory import Trajectory, write_tum
@@ -186,3 +188,45 @@ def test_lines_that_count_the_frames_of_a_part_are_said(frames: np.ndarray) -> N
     assert f"may be those of the frames {frames[0]} to {frames[-1]} of the other" in said(part, lines)
     assert "the poses of the trajectory may be those of the frames" in said(lines, part)
     assert said(part, TRUTH) == ""
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+@pytest.mark.parametrize(("late_s", "count"), [(0.5, 120), (-0.5, 120), (0.25, 60), (-0.05, 60), (1.3, 400)])
+def test_a_truth_by_a_late_clock_is_said(late_s: float, count: int, numbered: bool) -> None:
+    estimate = replace(seen(np.arange(count) / 30 + late_s, 0.02), has_indices=numbered)
+    truth = replace(winding(np.arange(count) / 30), has_indices=numbered)
+    sentence = said(estimate, truth)
+    found = re.search(r"clock may be ([\d.]+) s (late|early) .*; if so, give --time-offset (\S+) to scopemap", sentence)
+    assert found is not None, sentence
+    assert float(found[3]) == pytest.approx(late_s, abs=0.006)
+    assert float(found[1]) == abs(float(found[3]))
+    assert found[2] == ("late" if late_s > 0 else "early")
+    # What is given already is counted.
+    half = read_later(truth, late_s / 2)
+    rest = "".join(doubts(estimate, half, match(estimate, half, "sim3"), read_s=late_s / 2))
+    rest = re.findall(r"--time-offset (\S+)", rest)
+    assert [float(one) for one in rest] == [pytest.approx(late_s, abs=0.006)] * len(rest)
+    assert said(estimate, read_later(truth, late_s)) == ""
+
+
+def test_a_clock_that_the_path_does_not_tell_is_not_said() -> None:
+    times_s = np.arange(120) / 30
+    assert said(straight(times_s + 0.5, 0.05), straight(times_s, 0.05, seed=2)) == ""
+    drifting = seen(times_s, 0.5)
+    drifting.T_world_camera[:, 0, 3] += 0.2 * times_s**2
+    assert said(drifting, winding(times_s)) == ""
+
+
+def test_evaluate_names_the_offset_and_takes_it(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    times_s = np.arange(150) / 30
+    run, truth = write_run(tmp_path / "run", seen(times_s, 0.02)), winding(times_s)
+    write_tum(tmp_path / "truth.tum", replace(truth, times_s=truth.times_s + 0.5))
+    given = ("evaluate", run, "--truth", tmp_path / "truth.tum", "--json")
+    capfd.readouterr()
+    assert call(*given) == 0
+    offset = re.search(r"give --time-offset (0\.\d+)", json.loads(capfd.readouterr().out)["doubts"][0])
+    assert offset is not None
+    assert call(*given, "--time-offset", offset[1]) == 0
+    figures = json.loads(capfd.readouterr().out)
+    assert "doubts" not in figures
+    assert figures["ate_rmse_mm"] < figures["ate_as_recorded_mm"] / 5

@@ -18,7 +18,9 @@ from evo.tools import file_interface
 from front_door import call, refused
 from PIL import Image
 
+from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.rendering import render_mesh
+from scopemap.result.trajectories import read_trajectory
 
 POSES = np.stack([pose_of(index) for index in range(IN_RESULT)])
 UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
@@ -298,3 +300,46 @@ def test_what_cannot_be_exported_is_refused(run: Path, tmp_path: Path, capfd: py
     assert call("export", run, "--to", "climb", "--units", "m", "--out", out) == 2
     assert call("export", "--to", "tum", "--out", tmp_path / "a.txt") == 2
     assert not out.exists()
+
+
+@pytest.mark.parametrize(("to", "out", "poses"), [("kitti", "k", "k/poses.txt"), ("kitti", "k.txt", "k.txt")])
+def test_lines_of_a_part_name_their_frames(
+    to: str, out: str, poses: str, run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The first line of a part is no frame 0, and whoever lays it beside a whole video's truth must know."""
+    capfd.readouterr()
+    assert call("export", run / "maps/1", "--to", to, "--out", tmp_path / out) == 0
+    said = capfd.readouterr().out
+    first, file = 24 - IN_FIRST_MAP, tmp_path / poses
+    assert f"the {IN_FIRST_MAP} lines of {file.name} are frames {first} to 23 of the input" in said
+    beside = file.with_name(f"{file.stem}.frames.txt")
+    assert beside.name in said
+    assert np.loadtxt(beside).tolist() == list(range(first, 24))
+    found = read_trajectory(file)
+    assert found.indices.tolist() == list(range(first, 24))
+    assert "frame numbers by" in found.source
+    beside.write_text("3\n4\n")
+    with pytest.raises(InputError, match=f"numbers 2 lines, {file.name} has {IN_FIRST_MAP}; export again"):
+        read_trajectory(file)
+
+
+def test_lines_that_are_frame_numbers_need_no_list(
+    run: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    capfd.readouterr()
+    assert call("export", run, "--to", "kitti", "--out", tmp_path / "k.txt", "--json") == 0
+    assert "lines" not in json.loads(capfd.readouterr().out)
+    assert [file.name for file in tmp_path.iterdir()] == ["k.txt"]
+
+
+def test_an_export_for_endogslam_names_the_frames_of_its_poses(run: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(run, tmp_path / "run"))
+    lines = (other / "frames.csv").read_text().splitlines()
+    (other / "frames.csv").write_text("\n".join([lines[0], *lines[4:]]) + "\n")
+    poses = (other / "trajectory.tum").read_text().splitlines()
+    heads = [line for line in poses if line.startswith("#")]
+    (other / "trajectory.tum").write_text("\n".join([*heads, *poses[len(heads) + 3 :]]) + "\n")
+    folder = exported(other, "endogslam", tmp_path / "out")
+    numbers = [int(file.name[:6]) for file in sorted((folder / "color").glob("*.png"))]
+    assert numbers == list(range(3, IN_RESULT))
+    assert read_trajectory(folder / "pose.txt").indices.tolist() == numbers

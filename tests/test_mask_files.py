@@ -18,7 +18,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.masking.masker import Masker
 from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
-from scopemap.input.mask_files import MaskFiles, create_masks
+from scopemap.input.mask_files import MaskFiles, create_masks, masks_of
 from scopemap.input.opening import open_sequence
 from scopemap.runner.estimators import create_estimators
 from scopemap.runner.provenance import estimators_provenance
@@ -205,3 +205,40 @@ def test_a_run_whose_masks_hide_nearly_all_says_so(tmp_path: Path) -> None:
     config = Config.load(settings={"mask.files": str(masks), "depth.backend": "shading", "input.focal": "assume"})
     with pytest.raises(InputError, match=r"is usable\. The masks in .* hide 98 % of the pictures.*invert them"):
         reconstruct(open_sequence(video), config)
+
+
+DECIMALS = ("0.067", "0.2", "0.967", "1.067")
+"""Times of which 0.2 is 200 and 1.067 is not 67."""
+
+
+def _decimal_masks(tmp_path: Path, names: tuple[str, ...]) -> Path:
+    return write_masks(tmp_path / "masks", {f"mask_{name}.png": left_half(10 * n + 9) for n, name in enumerate(names)})
+
+
+def test_masks_with_decimal_numbers_belong_to_the_pictures_with_these(tmp_path: Path) -> None:
+    pictures = dict(enumerate(tmp_path / f"frame_{name}.png" for name in DECIMALS))
+    folder = _decimal_masks(tmp_path, DECIMALS[1:])
+    masks = MaskFiles(folder, RECTIFIER, numbers=range(4), pictures=pictures)
+    covered = [masks.covered(number) is not None for number in range(4)]
+    assert covered == [False, True, True, True]
+    assert masks.notices == []
+
+
+def test_masks_with_decimal_numbers_that_no_frame_has_are_refused(tmp_path: Path) -> None:
+    folder = _decimal_masks(tmp_path, DECIMALS)
+    pictures = dict(enumerate(tmp_path / f"frame_{name}.png" for name in ("0.067", "0.2", "0.968", "1.067")))
+    with pytest.raises(InputError, match=r"1 of 4 files, such as mask_0\.967\.png, have no frame of this number"):
+        MaskFiles(folder, RECTIFIER, numbers=range(4), pictures=pictures)
+    with pytest.raises(InputError, match=r"mask_0\.067\.png hold decimal numbers, and those of the frames do not"):
+        MaskFiles(folder, RECTIFIER, numbers=range(4))
+
+
+def test_masks_of_a_folder_of_decimal_names_are_used_for_their_own_frames(tmp_path: Path) -> None:
+    (tmp_path / "frames").mkdir()
+    for place, name in enumerate(DECIMALS):
+        save(tmp_path / f"frames/frame_{name}.png", picture(place, (640, 480)))
+    folder = _decimal_masks(tmp_path, DECIMALS)
+    masks = masks_of(MaskSettings(files=str(folder)), open_sequence(tmp_path / "frames"))
+    assert masks is not None
+    assert all(masks.covered(number) is not None for number in range(4))
+    assert masks.notices == []

@@ -272,6 +272,14 @@ def test_decimal_commas_are_named(separator: str, form: str, truth: Trajectory, 
         read_trajectory(tmp_path / "commas.txt")
 
 
+def test_decimal_commas_beside_whole_powers_are_named(tmp_path: Path) -> None:
+    """As German and French spreadsheets save a table: semicolons, and 1E-05 without a comma."""
+    file = tmp_path / "excel.csv"
+    file.write_text("timestamp;tx;ty;tz;qx;qy;qz;qw\n0,5;1,25;1E-05;-2E+00;0;0;0;1\n")
+    with pytest.raises(InputError, match=r"line 2: it has decimal commas .*: write points"):
+        read_trajectory(file)
+
+
 @pytest.mark.parametrize("content", [b"\x93NUMPY\x01\x00\xff", b'{"frames": []}', b"x,y,z\n1,2,3"])
 def test_what_is_no_text_of_poses_is_one_sentence_of_ours(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "poses.dat").write_bytes(content)

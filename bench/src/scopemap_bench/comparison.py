@@ -27,6 +27,7 @@ from scopemap.evaluation.poses import match
 from scopemap.input.sequence import Sequence as Frames
 from scopemap.input.trajectory.trajectory import Trajectory, Unit
 from scopemap.result.depth_maps import DepthReader
+from scopemap.result.input_part import part_of_input
 from scopemap.result.reference import read_reference, reference_trajectory
 from scopemap.result.result import Result
 from scopemap.result.trajectories import read_trajectory
@@ -287,7 +288,10 @@ def _of_benchmark(path: Path, name: str, protocol: ProtocolPlan) -> FinishedRun:
 def _scored(path: Path, name: str, truth: Path, protocol: ProtocolPlan, unit: Unit | None) -> FinishedRun:
     if not path.exists():
         raise InputError(f"comparing {path}: no such file or folder")
-    result = RunResult(truth.stem if truth.is_file() else truth.resolve().name, name, timing=_timing(path))
+    sequence = truth.stem if truth.is_file() else truth.resolve().name
+    # A part is a sequence of its own: its frames are all it could track, and a shorter path has smaller errors.
+    sequence = ", ".join(filter(None, (sequence, _part(path))))
+    result = RunResult(sequence, name, timing=_timing(path))
     frames = _frames(path, truth)
     if frames is not None:
         usual = default_protocol(frames).depth_range_mm
@@ -320,6 +324,14 @@ def _frames(path: Path, truth: Path) -> Frames | None:
         return open_truth(path, truth)
     except InputError:  # a folder of poses without images
         return None
+
+
+def _part(path: Path) -> str:
+    """Return which part of its input a run used, in words; "" for all of it, and for trajectory files."""
+    try:
+        return part_of_input(Result(path).provenance)
+    except (InputError, ValueError, TypeError, AttributeError):
+        return ""
 
 
 def _timing(path: Path) -> dict[str, float]:

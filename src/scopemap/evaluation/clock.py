@@ -20,7 +20,7 @@ from scopemap.input.trajectory.trajectory import Trajectory
 FIT: Final = "fit"
 MOST_OFFSET_S = 0.5
 """Offsets that are tried, s, in either direction: more than a recorder delays its pictures by."""
-_STEP_S = 0.005
+_STEPS = 100  # in either direction: of 5 ms for half a second
 # Fewer frames that have a true pose at every offset tried would be fitted by chance.
 _LEAST_FRAMES = 10
 # An offset is told apart from the best one where the error is so much larger: a share of it, or of the path's spread.
@@ -84,9 +84,14 @@ def read_later(reference: Trajectory, offset_s: float) -> Trajectory:
 
 
 def fitted_offset(
-    estimate: Trajectory, reference: Trajectory, align: AlignMode, *, first: int | None = None
+    estimate: Trajectory,
+    reference: Trajectory,
+    align: AlignMode,
+    *,
+    first: int | None = None,
+    most_s: float = MOST_OFFSET_S,
 ) -> ClockFit | None:
-    """Return the offset of at most half a second that leaves the least error of positions after the alignment.
+    """Return the offset of less than `most_s` that leaves the least error of positions after the alignment.
 
     None where the poses do not tell it: on a straight path of constant speed the alignment absorbs any offset, and
     frames may be too few. All offsets are compared on the same frames, those that have a true pose by each.
@@ -94,7 +99,7 @@ def fitted_offset(
     known = reference.rows(reference.tracked)
     rows_estimate, rows_reference = associate(estimate, known)
     ok = estimate.tracked[rows_estimate]
-    curve, offsets = PoseCurve(known), np.arange(-MOST_OFFSET_S, MOST_OFFSET_S + _STEP_S / 2, _STEP_S)
+    curve, offsets = PoseCurve(known), np.linspace(-most_s, most_s, 2 * _STEPS + 1)
     estimated, times_s = estimate.T_world_camera[rows_estimate[ok]], known.times_s[rows_reference[ok]]
     inside = np.all([curve.knows(times_s + offset) for offset in offsets], axis=0)
     if np.count_nonzero(inside) < max(_LEAST_FRAMES, first or 0):
@@ -113,7 +118,7 @@ def fitted_offset(
     spread_mm = float(np.sqrt(curve.at(times_s)[:, :3, 3].var(axis=0).sum()))
     # Of all that are as good the outermost: noise of the true poses makes an error wave from frame to frame.
     alike = offsets[errors_mm <= errors_mm[best] + max(_RISE * errors_mm[best], _RISE_OF_SPREAD * spread_mm)]
-    within_s = float(np.abs(alike - offsets[best]).max()) + _STEP_S
+    within_s = float(np.abs(alike - offsets[best]).max()) + most_s / _STEPS
     if within_s > _MOST_DOUBT_S:
         return None
     found = minimize_scalar(error_mm, bounds=(offsets[best - 1], offsets[best + 1]), method="bounded")

@@ -7,7 +7,7 @@ A truth numbered from 1, poses world-to-camera, quaternions with the scalar firs
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from scopemap.engine.errors import AlignmentError
 from scopemap.engine.geometry.align import AlignMode
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.evaluation.other_clocks import clock_readings
+from scopemap.evaluation.other_clocks import clock_readings, late_readings
 from scopemap.evaluation.poses import (
     MatchedTrajectories,
     length_ratio,
@@ -87,14 +87,19 @@ class _Reading:
     remedy: str
 
 
-def doubts(estimate: Trajectory, reference: Trajectory, matched: MatchedTrajectories) -> list[str]:
-    """Return a sentence for each other reading of two trajectories that would explain the errors of `matched`."""
+def doubts(
+    estimate: Trajectory, reference: Trajectory, matched: MatchedTrajectories, *, read_s: float = 0.0
+) -> list[str]:
+    """Return a sentence for each other reading of two trajectories that would explain the errors of `matched`.
+
+    read_s : so much later than recorded `reference` is read already, s.
+    """
     found = [_of_unit(matched)]
     try:
         errors = _Errors.of(estimate, reference)
     except AlignmentError:  # standing still: nothing tells
         return [one for one in found if one]
-    said = _of_reading(estimate, reference, errors)
+    said = _of_reading(estimate, reference, errors, read_s)
     found.append(said or _of_rotation(estimate, reference, errors))
     return [one for one in found if one]
 
@@ -132,12 +137,14 @@ def _of_unit(matched: MatchedTrajectories) -> str:
     return ""
 
 
-def _of_reading(estimate: Trajectory, reference: Trajectory, before: _Errors) -> str:
+def _of_reading(estimate: Trajectory, reference: Trajectory, before: _Errors, read_s: float) -> str:
     """Return the sentence of the reading, or of two together, that leaves the least error; "" where none is better."""
     now, found = before, list[_Reading]()
     while len(found) < 2:
-        tried = [(errors, one) for one in _readings(estimate, reference) if (errors := _errors(one)) is not None]
-        better = [(errors, one) for errors, one in tried if errors.improve(now)]
+        better = _better(_readings(estimate, reference, read_s), now)
+        # An offset that is fitted explains whole frames, too: it is tried where nothing else does.
+        if not better and now.share > _ROUNDING:
+            better = _better((_Reading(*read) for read in late_readings(estimate, reference, read_s)), now)
         if not better:
             break
         now, best = min(better, key=lambda pair: pair[0].rank)
@@ -153,6 +160,11 @@ def _of_reading(estimate: Trajectory, reference: Trajectory, before: _Errors) ->
     return f"{supposed}, which would leave {left} after a Sim(3); if so, {remedies}"
 
 
+def _better(readings: Iterable[_Reading], now: _Errors) -> list[tuple[_Errors, _Reading]]:
+    tried = [(errors, one) for one in readings if (errors := _errors(one)) is not None]
+    return [(errors, one) for errors, one in tried if errors.improve(now)]
+
+
 def _errors(reading: _Reading) -> _Errors | None:
     try:
         return _Errors.of(reading.estimate, reading.reference)
@@ -160,7 +172,7 @@ def _errors(reading: _Reading) -> _Errors | None:
         return None
 
 
-def _readings(estimate: Trajectory, reference: Trajectory) -> Iterator[_Reading]:
+def _readings(estimate: Trajectory, reference: Trajectory, read_s: float) -> Iterator[_Reading]:
     for name, inverted in (("the truth", False), ("the trajectory", True)):
         one, other = (_inverted(estimate), reference) if inverted else (estimate, _inverted(reference))
         yield _Reading(one, other, f"the poses of {name} may be world-to-camera", "invert them")
@@ -174,7 +186,8 @@ def _readings(estimate: Trajectory, reference: Trajectory) -> Iterator[_Reading]
         elif step_s > 0:
             shifted = replace(reference, times_s=reference.times_s + by * step_s)
             when = f"the truth may be one frame too {'early' if by > 0 else 'late'}"
-            yield _Reading(estimate, shifted, when, f"give --time-offset {-by * step_s:.6g}")
+            give = f"give --time-offset {read_s - by * step_s:.6g} to scopemap evaluate"
+            yield _Reading(estimate, shifted, when, give)
     yield from (_Reading(*read) for read in clock_readings(estimate, reference))
 
 

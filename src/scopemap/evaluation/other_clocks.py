@@ -1,4 +1,4 @@
-"""Other clocks and counts by which two trajectories may be meant: milliseconds, another frame rate, lines in order.
+"""Other clocks and counts by which two trajectories may be meant: late, milliseconds, another rate, lines in order.
 
 Whole milliseconds look like frame numbers, a rate of 25 in place of 30 frames/s meets the other's stamps now and then,
 and the first line of a KITTI file is frame 0 even where it was written of frames 20 to 49. The poses that match by
@@ -7,11 +7,14 @@ chance have figures that look like a method's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
+from scopemap.engine.errors import AlignmentError
+from scopemap.evaluation.clock import fitted_offset, read_later
 from scopemap.evaluation.poses import associate, in_milliseconds
 from scopemap.input.trajectory.trajectory import Trajectory
 
@@ -23,6 +26,11 @@ ClockReading = tuple[Trajectory, Trajectory, str, str]
 _MORE = 1.2
 _MOST_RATIO = 2.0  # of frame rates that are mistaken for each other: 25, 30, 50, 60
 _SAME_RATE = 1e-3
+# Offsets that are tried, s. A recorder that starts by hand is a second or two late. All offsets are compared on the
+# frames that have a true pose by each: of a clip of 2 s the second leaves enough, of one of 5 s the first.
+_MOST_LATE_S = (2.0, 0.6)
+# So many frames, spread over the path, tell an offset as well as all, in a fraction of the time.
+_FRAMES_TRIED = 300
 
 
 def clock_readings(estimate: Trajectory, reference: Trajectory) -> Iterator[ClockReading]:
@@ -32,6 +40,26 @@ def clock_readings(estimate: Trajectory, reference: Trajectory) -> Iterator[Cloc
     for reading in (one for way in ways for one in way(estimate, reference)):
         if _matched(reading[0], reading[1]) > _MORE * before:
             yield reading
+
+
+def late_readings(estimate: Trajectory, reference: Trajectory, read_s: float = 0.0) -> Iterator[ClockReading]:
+    """Yield the truth by a clock that is early or late by an offset that the path tells; nothing where it tells none.
+
+    read_s : so much later the truth is read already, s.
+    """
+    few = estimate.rows(np.arange(0, len(estimate), math.ceil(len(estimate) / _FRAMES_TRIED)))
+    for most_s in _MOST_LATE_S:
+        try:
+            fit = fitted_offset(few, reference, "sim3", most_s=most_s)
+            if fit is None:
+                continue
+            read = read_later(reference, fit.offset_s)
+        except AlignmentError:  # standing still, or too few true poses
+            continue
+        early = f"{abs(fit.offset_s):.3f} s {'late' if fit.offset_s > 0 else 'early'} (to within {fit.within_s:.3f} s)"
+        give = f"give --time-offset {read_s + fit.offset_s:.3f} to scopemap evaluate"
+        yield estimate, read, f"the truth's clock may be {early}", give
+        return
 
 
 def _matched(estimate: Trajectory, reference: Trajectory) -> int:

@@ -24,8 +24,9 @@ from scopemap.engine.config import DepthSettings
 from scopemap.engine.depth.estimate import DepthEstimate, DepthKind
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
-from scopemap.input.decoding import by_number, frame_number, frames_later
+from scopemap.input.decoding import frame_number, frames_later
 from scopemap.input.depth_reading import NUMPY, read_depth_file
+from scopemap.input.image_names import by_frame
 
 _IMAGES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _OTHER_ARRAYS = (".npz", ".exr", ".pfm", ".mat", ".h5", ".hdf5", ".pt", ".pth", ".pkl")  # that networks write depth to
@@ -234,7 +235,7 @@ def depth_files(folder: Path, pictures: Mapping[int, Path] | None = None) -> dic
 
     pictures : the input's pictures by frame number, None of a video. A depth file belongs to the picture whose name it
     has, with more before or after a separator (`0001_color.png`, `0001_color-dpt_512.png`), where half of the files or
-    of the pictures match; else to the frame of the last whole number in its name. Where some names contain depth or
+    of the pictures match; else to the frame of the number in its name (`by_frame`). Where some names contain depth or
     disparity, the others are left out, as are names of other content (`*_color.*`, masks, normals), unless pictures
     are named so. Raises `InputError` where there is none, or two belong to one frame.
     """
@@ -255,7 +256,7 @@ def depth_files(folder: Path, pictures: Mapping[int, Path] | None = None) -> dic
             f"reading depth files: {folder} holds no png, tif, jpg or npy file with a number in its name that could be "
             f"depth; the number is the frame's{_other_endings(folder)}"
         )
-    return by_number(named or numbered)
+    return by_frame(named or numbered, pictures or {})
 
 
 def _other_endings(folder: Path) -> str:

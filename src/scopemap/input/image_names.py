@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median, mode
 
 from scopemap.engine.errors import InputError
-from scopemap.input.decoding import frame_number
+from scopemap.input.decoding import by_number, frame_number
 
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _OTHER_CONTENT = {
@@ -171,6 +172,33 @@ def decimal_numbers(files: list[Path]) -> dict[Path, float] | None:
     if 2 * len(written) < len(files) or not _are_decimals(whole, shares, written):
         return None
     return {file: float(match[0]) for file, match in matches}
+
+
+def by_frame(files: list[Path], pictures: Mapping[int, Path]) -> dict[int, Path]:
+    """Return files that belong to frames, such as masks, by the number of their frame.
+
+    pictures : of the frames by their numbers, none of a video. A file whose name ends in a decimal number belongs to
+    the picture with the same one, as `frame_0.2` and `mask_0.2`; else it belongs to the frame of the last whole number.
+    Raises `InputError` for decimal numbers that no picture has, and as `by_number`.
+    """
+    decimal = decimal_numbers(files)
+    if decimal is None:
+        return by_number(files)
+    ordered = sorted(decimal, key=lambda file: decimal[file])
+    own = decimal_numbers(list(pictures.values()))
+    if own is None:
+        # Digits behind the point count as a number where they increase as the decimal numbers do.
+        if all((frame_number(a) or 0) < (frame_number(b) or 0) for a, b in pairwise(ordered)):
+            return by_number(ordered)
+        found = f"names such as {ordered[0].name} hold decimal numbers, and those of the frames do not"
+        raise InputError(f"reading {ordered[0].parent}: {found}; name each file by the number of its frame")
+    number_of = {own[picture]: number for number, picture in pictures.items()}
+    stray = [file for file in ordered if decimal[file] not in number_of]
+    if stray:
+        found = f"{len(stray)} of {len(ordered)} files, such as {stray[0].name}, have no frame of this number"
+        name_as = f"name each as its frame, such as {next(iter(pictures.values())).name}"
+        raise InputError(f"reading {stray[0].parent}: {found}; {name_as}")
+    return {number_of[decimal[file]]: file for file in ordered}
 
 
 def _are_decimals(whole: list[str], shares: list[str | None], written: list[str]) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from collections.abc import Sequence as Numbers
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,7 +17,11 @@ from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.kept import Kept
 from scopemap.engine.masking.masker import disc
 from scopemap.engine.notices import Notice
-from scopemap.input.decoding import by_number, frame_number, frames_later, read_decoded
+from scopemap.input.decoding import frame_number, frames_later, read_decoded
+from scopemap.input.image_names import by_frame, decimal_numbers
+
+if TYPE_CHECKING:
+    from scopemap.input.sequence import Sequence
 
 _LOSSLESS = (".png", ".tif", ".tiff", ".bmp")
 _LOSSY = (".jpg", ".jpeg")
@@ -25,20 +31,30 @@ _LARGE = 0.75  # by hand: of a picture, on average; the border around a round fi
 _NO_MASKS = "none"
 
 
+def masks_of(settings: MaskSettings, sequence: Sequence) -> MaskFiles | None:
+    """Return the masks of a sequence's frames that the settings name; see `create_masks`."""
+    source = sequence.source
+    return create_masks(settings, sequence.rectifier, source.masks, sequence.numbers, source.picture_files())
+
+
 def create_masks(
-    settings: MaskSettings, rectifier: Rectifier, own: Path | None = None, numbers: Sequence[int] | None = None
+    settings: MaskSettings,
+    rectifier: Rectifier,
+    own: Path | None = None,
+    numbers: Numbers[int] | None = None,
+    pictures: Mapping[int, Path] | None = None,
 ) -> MaskFiles | None:
     """Return the masks that the settings name, where they name none the data set's own, None where there are none.
 
-    own : folder of the data set's masks, or None. numbers : as `MaskFiles` has them. Raises as `MaskFiles` does, and
-    `SettingsError` where the settings contradict each other or the input.
+    own : folder of the data set's masks, or None. numbers, pictures : as `MaskFiles` has them. Raises as
+    `MaskFiles` does, and `SettingsError` where the settings contradict each other or the input.
     """
     folder = None if settings.files == _NO_MASKS else Path(settings.files) if settings.files else own
     if settings.instruments == "off" and folder is not None and settings.files:
         raise SettingsError(f"mask.instruments=off contradicts mask.files={settings.files}: leave one of them out")
     if folder is None or settings.instruments == "off":
         return None
-    return MaskFiles(folder, rectifier, _GROW_PX, numbers)
+    return MaskFiles(folder, rectifier, _GROW_PX, numbers, pictures)
 
 
 class MaskFiles:
@@ -50,6 +66,8 @@ class MaskFiles:
     grow_px : by which masks are widened, at the working size: outlines are drawn a little inside more often than not.
     numbers : of all frames of the input, ascending, or None. Masks that are numbered from 1 where the frames are from
     0, or the other way round, belong to the frame one before or after their number.
+    pictures : of all frames by their numbers, None of a video. Masks whose names hold decimal numbers (mask_0.067)
+    belong to the pictures with these numbers.
 
     Raises `InputError` where the folder does not exist, holds no such image, or two for one frame.
     """
@@ -60,11 +78,17 @@ class MaskFiles:
     _level: Kept[int]
 
     def __init__(
-        self, folder: Path, rectifier: Rectifier, grow_px: int = 0, numbers: Sequence[int] | None = None
+        self,
+        folder: Path,
+        rectifier: Rectifier,
+        grow_px: int = 0,
+        numbers: Numbers[int] | None = None,
+        pictures: Mapping[int, Path] | None = None,
     ) -> None:
         self._folder, self._rectifier, self._grow_px = Path(folder), rectifier, grow_px
-        self._files, self._single = _numbered(self._folder)
+        self._files, self._single = _numbered(self._folder, pictures or {})
         self._numbers = range(0) if numbers is None else numbers
+        self._by_name = bool(pictures) and decimal_numbers(list(self._files.values())) is not None
         self._later = frames_later(list(self._files), self._numbers)
         self._files = {number + self._later: file for number, file in self._files.items()}
         self._asked, self._hidden, self._read_masks, self._level = set(), 0.0, 0, 0
@@ -132,18 +156,18 @@ class MaskFiles:
         own = sorted(self._files)
         gapless = len(own) > 1 and own[-1] - own[0] == len(own) - 1
         begins = bool(self._numbers) and self._numbers[0] in self._asked and own[:1] == [self._numbers[0] + 1]
-        return not self._later and gapless and begins
+        return not (self._later or self._by_name) and gapless and begins
 
 
-def _numbered(folder: Path) -> tuple[dict[int, Path], Path | None]:
-    """Return the images by the number in their names, and the only image where that has none."""
+def _numbered(folder: Path, pictures: Mapping[int, Path]) -> tuple[dict[int, Path], Path | None]:
+    """Return the images by the number of their frame, and the only image where its name has no number."""
     if not folder.is_dir():
         raise InputError(f"reading masks: {folder} is no folder; mask.files names the folder of the images")
     files = (file for file in sorted(folder.iterdir()) if not file.name.startswith("."))
     images = [file for file in files if file.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
     numbered = [file for file in images if frame_number(file) is not None]
     if numbered:
-        return by_number(numbered), None
+        return by_frame(numbered, pictures), None
     if len(images) == 1:
         return {}, images[0]
     raise InputError(

@@ -21,7 +21,7 @@ from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.engine.models import device, weights
 from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.features import SiftFeatures
-from scopemap.input.mask_files import create_masks
+from scopemap.input.mask_files import masks_of
 from scopemap.input.sequence import Sequence
 from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder
 
@@ -71,7 +71,7 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         corner_flow,
         own.flow or create_flow(networks.keyframe_flow, networks.device),
         perceptual.create_perceptual(networks.perceptual, networks.device),
-        create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers),
+        masks_of(config.mask, sequence),
         AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
         tracker,
     )

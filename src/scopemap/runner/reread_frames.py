@@ -14,7 +14,7 @@ from scopemap.engine.errors import CalibrationError, InputError, SettingsError
 from scopemap.engine.frame import Frame
 from scopemap.engine.masking.masker import Masker
 from scopemap.input.decoding import read_decoded
-from scopemap.input.mask_files import create_masks
+from scopemap.input.mask_files import masks_of
 from scopemap.input.opening import open_sequence, open_source
 from scopemap.input.prepared import OF_UNKNOWN_VIEWS
 from scopemap.input.sequence import Sequence
@@ -74,9 +74,7 @@ def open_input(run: Path, given: Path | None = None) -> tuple[Sequence, Masker]:
     sequence = open_truth(run, source, config.input.frames)
     if not is_camera_of(run, sequence):
         raise InputError(f"the input {source} of the run {run} gives another camera now")
-    return sequence, Masker(
-        config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers)
-    )
+    return sequence, Masker(config.mask, masks_of(config.mask, sequence))
 
 
 def reread_frames(run: Path, indices: set[int], given: Path | None = None) -> Iterator[Frame]:

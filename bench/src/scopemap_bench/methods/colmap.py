@@ -20,7 +20,7 @@ import numpy as np
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError
 from scopemap.engine.masking.masker import Masker
-from scopemap.input.mask_files import create_masks
+from scopemap.input.mask_files import masks_of
 from scopemap.input.sequence import Sequence
 from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.methods.imported import write_trajectory
@@ -76,7 +76,7 @@ class Colmap:
 
 def _write_frames(sequence: Sequence, config: Config, folder: Path) -> int:
     """Write frames as NUMBER.png to images/ and their usable pixels to masks/ as COLMAP reads them; return how many."""
-    masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers))
+    masker = Masker(config.mask, masks_of(config.mask, sequence))
     for name in ("images", "masks"):
         (folder / name).mkdir()
     count = 0

@@ -5,7 +5,7 @@ from functools import partial
 
 from scopemap.input.trajectory.text import read_kitti
 from scopemap.result.trajectories import TrajectoryFormat
-from scopemap_bench.trajectories import climb, scared, splatam, text
+from scopemap_bench.trajectories import climb, monogs, scared, splatam, text
 
 FORMATS = (
     TrajectoryFormat(
@@ -16,6 +16,7 @@ FORMATS = (
         "scared", scared.read_scared, scared.SCARED_FILES, lambda path: scared.find_frame_data(path) is not None
     ),
     TrajectoryFormat("oneslam", text.read_oneslam, text.ONESLAM_FILES, text.is_oneslam),
+    TrajectoryFormat("monogs", monogs.read_monogs, monogs.MONOGS_FILES, monogs.is_monogs),
     TrajectoryFormat("bodyslam", read_kitti),
     TrajectoryFormat("endogslam", partial(splatam.read_params, split="train")),
     TrajectoryFormat("splatam", partial(splatam.read_params, split="all")),

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from scopemap.engine.errors import InputError, reporting
 from scopemap.input.trajectory.colmap_poses import read_colmap
-from scopemap.input.trajectory.poses import from_quaternions, stamped
+from scopemap.input.trajectory.poses import check_near, from_quaternions, stamped
 from scopemap.input.trajectory.text import text_lines
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
 
@@ -49,6 +49,7 @@ def read_climb_reference(folder: Path) -> Trajectory:
     scale = _scale_mm(folder.absolute())
     T = found.T_world_camera.copy()
     T[:, :3, 3] *= scale or 1.0
+    check_near(T[:, :3, 3], [f"{folder}, image {index}" for index in found.indices])
     words = f"mm by {SCALES_FILE}" if scale else f"scale unknown (not in {SCALES_FILE}), mm (assumed)"
     source = f"CLiMB reference (COLMAP), world-to-camera inverted, {words}"
     return replace(found, T_world_camera=T, indices=found.indices - 1, source=source)

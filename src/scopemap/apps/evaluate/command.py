@@ -91,7 +91,8 @@ def evaluate(
             matched = match(estimate, reference, align, first=align_first)
             measured = _measured(Compared(trajectory, truth, estimate, reference, matched), further)
             sources = {"trajectory": estimate.source, "truth": reference.source}
-            doubted = doubts(estimate, reference, matched)
+            read_s = clock.get("time_offset_s", 0.0)
+            doubted = doubts(estimate, reference, matched, read_s=0.0 if math.isnan(read_s) else read_s)
             said = {"doubts": doubted} if doubted else {}
             figures = pose_report(matched) | clock | measured | figures | said | {"sources": sources}
             if not quiet:

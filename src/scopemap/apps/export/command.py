@@ -36,11 +36,12 @@ def export(
 
     The export holds the tracked frames, the surface or depth, depending on the format.
     """
-    from scopemap.apps.export.formats import export_run
+    from scopemap.apps.export.formats import export_run, frames_of_lines
 
     warn_of_damage(run, silent=quiet)
     scale = export_run(run, to, out, units, axes, source=source)
+    lines = frames_of_lines(run, to, out)
     if as_json:
-        print_json({"out": str(out), "format": to, "scale": scale})
+        print_json({"out": str(out), "format": to, "scale": scale} | ({"lines": lines} if lines else {}))
     elif not quiet:
-        typer.echo(f"{out}: written; {scale}")
+        typer.echo("\n".join(filter(None, (f"{out}: written; {scale}", lines))))

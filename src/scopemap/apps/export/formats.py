@@ -12,9 +12,9 @@ from scopemap.apps.export.image_layouts import write_colmap, write_endogslam, wr
 from scopemap.apps.export.mcap_bag import write_mcap
 from scopemap.apps.export.points import write_gaussians, write_points
 from scopemap.apps.export.surfaces import Axes, write_glb, write_slicer, write_surface, write_surfaces
-from scopemap.apps.export.trajectories import write_euroc_file, write_kitti_folder
+from scopemap.apps.export.trajectories import lines_in_words, write_euroc_file, write_kitti_file, write_kitti_folder
 from scopemap.engine.errors import InputError, SettingsError
-from scopemap.input.trajectory.trajectory import Unit, write_kitti, write_tum
+from scopemap.input.trajectory.trajectory import Unit, write_tum
 from scopemap.result.result import Result
 
 Write = Callable[[Result, Path, Unit, Axes], None]
@@ -36,6 +36,8 @@ class ExportFormat:
     write_file: Write | None = None
 
 
+# Files of poses without numbers, in a folder of their format.
+_UNNUMBERED = {"kitti": "poses.txt", "endogslam": "pose.txt"}
 _ANY_AXES: tuple[Axes, ...] = ("lps", "ras", "opencv", "gltf")
 FORMATS: dict[str, ExportFormat] = {
     "nerfstudio": ExportFormat(lambda run, out, unit, axes: write_nerfstudio(run, out), ("m",)),
@@ -52,7 +54,7 @@ FORMATS: dict[str, ExportFormat] = {
         lambda run, out, unit, axes: write_kitti_folder(run, out, unit),
         ("m", "mm"),
         is_text=True,
-        write_file=lambda run, out, unit, axes: write_kitti(out, run.tracked.trajectory, unit=unit),
+        write_file=lambda run, out, unit, axes: write_kitti_file(run, out, unit),
     ),
     "euroc": ExportFormat(lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv", is_text=True),
     "ply": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".ply"),
@@ -114,6 +116,16 @@ def export_run(
     except OSError as error:
         raise InputError(f"cannot write {out}: {error.strerror or error}") from None
     return run.scale
+
+
+def frames_of_lines(folder: Path, name: str, out: Path) -> str:
+    """Return which frames the lines of an export's file of poses belong to; "" where their numbers, or names, say so.
+
+    folder, name, out : as of `export_run`.
+    """
+    if name not in _UNNUMBERED:
+        return ""
+    return lines_in_words(Result(folder), out / _UNNUMBERED[name] if out.is_dir() else out)
 
 
 def _named(form: ExportFormat, name: str, out: Path) -> ExportFormat:

@@ -18,6 +18,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from scopemap.apps.export.trajectories import write_frame_numbers
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.mesh_files import ply_bytes
@@ -114,6 +115,7 @@ def write_endogslam(run: Result, folder: Path) -> None:
         write_image(folder / "depth" / f"{frame.index:06d}_depth.tiff", np.round(levels).astype(np.uint16))
     transposed = np.swapaxes(run.tracked.trajectory.T_world_camera, 1, 2).reshape(-1, 16)
     np.savetxt(folder / "pose.txt", transposed, fmt="%.12g", delimiter=",")
+    write_frame_numbers(run, folder / "pose.txt")
     camera = run.camera
     values = {"image_height": camera.height, "image_width": camera.width, "fx": camera.fx, "fy": camera.fy}
     values |= {"cx": camera.cx, "cy": camera.cy, "png_depth_scale": 1 / depth.scale_mm, "crop_edge": 0}

@@ -11,20 +11,42 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit, write_kitti
+from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit, numbers_file, write_kitti
 from scopemap.result.result import Result
 
 _NS_PER_S = 1e9
 
 
 def write_kitti_folder(run: Result, folder: Path, unit: Unit) -> None:
-    """Write `poses.txt`, a line per tracked frame, and `times.txt`, the time of each line, s.
-
-    KITTI has no place for a comment or a frame that is lost: lines are not frame numbers where frames are left out.
-    """
+    """Write `poses.txt` as `write_kitti_file` does, and `times.txt`, the time of each line, s."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_kitti(folder / "poses.txt", run.tracked.trajectory, unit=unit)
+    write_kitti_file(run, folder / "poses.txt", unit)
     np.savetxt(folder / "times.txt", run.tracked.trajectory.times_s, fmt="%.6e")
+
+
+def write_kitti_file(run: Result, file: Path, unit: Unit) -> None:
+    """Write a line per tracked frame, and the frames' numbers beside it where they are not those of the lines.
+
+    KITTI has no place for a comment or a frame that is lost.
+    """
+    write_kitti(file, run.tracked.trajectory, unit=unit)
+    write_frame_numbers(run, file)
+
+
+def write_frame_numbers(run: Result, file: Path) -> None:
+    """Write the frame of each line of a file of poses beside it, where that is not the line's number from 0."""
+    if lines_in_words(run, file):
+        head = f"number in the input, from 0, of the frame of each line of {file.name}"
+        np.savetxt(numbers_file(file), run.tracked.trajectory.indices, fmt="%d", header=head)
+
+
+def lines_in_words(run: Result, file: Path) -> str:
+    """Return which frames the lines of a file of poses belong to; "" where lines are numbered as the frames."""
+    numbers = run.tracked.trajectory.indices
+    if np.array_equal(numbers, np.arange(len(numbers))):
+        return ""
+    lines = f"the {len(numbers)} lines of {file.name} are frames {numbers[0]} to {numbers[-1]} of the input"
+    return f"{lines}; {numbers_file(file).name} states the frame of each line"
 
 
 def write_euroc_file(run: Result, file: Path) -> None:

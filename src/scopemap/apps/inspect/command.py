@@ -20,7 +20,7 @@ def inspect(
     source: options.Input,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="PNG picture to write; default: NAME_inspection.png in this folder."),
+        typer.Option(metavar="FILE", help="PNG picture to write; default: none."),
     ] = None,
     masks: Annotated[
         Path | None,
@@ -40,32 +40,33 @@ def inspect(
 
     This takes as long as decoding plus about 20 ms per frame. For a long video, --frames ::10 is faster.
     """
-    file = out or Path(f"{source.resolve().stem if source.is_file() else source.resolve().name}_inspection.png")
-    _refuse(file, masks, overwrite)
+    _refuse(out, masks, overwrite)
     from scopemap.apps.inspect.inspecting import inspect as inspection_of
     from scopemap.apps.inspect.inspection_sheet import MASK_NAME, draw_inspection, write_mask
 
     with count_progress("inspecting", "inspected", silent=quiet or as_json) as listener:
         found = inspection_of(source, dataset=dataset, camera=camera, frames=frames, listener=listener)
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        draw_inspection(found, file)
+        if out is not None:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            draw_inspection(found, out)
         written = masks is not None and write_mask(found, masks)
     except OSError as error:
         raise InputError(f"writing the inspection of {source}: {error.strerror or error}") from None
     if as_json:
-        print_json(found.report | {"path": str(source), "picture": str(file)})
+        print_json(found.report | {"path": str(source), "picture": None if out is None else str(out)})
     elif not quiet:
         _print(source, found)
-        typer.echo(f"picture: {file}")
+        typer.echo(f"picture: {'none; --out FILE.png draws the findings' if out is None else out}")
         if masks is not None:
             typer.echo(f"mask: {masks / MASK_NAME}, {'for all frames' if written else 'empty: nothing to leave out'}")
 
 
-def _refuse(file: Path, masks: Path | None, overwrite: bool) -> None:
+def _refuse(file: Path | None, masks: Path | None, overwrite: bool) -> None:
     from scopemap.apps.inspect.inspection_sheet import MASK_NAME
 
-    options.check_output(file, (".png",), overwrite)
+    if file is not None:
+        options.check_output(file, (".png",), overwrite)
     if masks is None or not masks.exists():
         return
     if not masks.is_dir():

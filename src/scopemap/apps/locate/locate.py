@@ -20,7 +20,7 @@ from scopemap.engine.masking.masker import Masker
 from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.corner_pose import pose_from_correspondences
 from scopemap.engine.tracking.features import FeatureDetector, Features, relative_pose_pnp, similarities
-from scopemap.input.mask_files import create_masks
+from scopemap.input.mask_files import masks_of
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence as FrameSequence
 from scopemap.result.result import Result
@@ -197,7 +197,7 @@ def locate(folder: Path, sequence: FrameSequence | Path | str, source: Path | No
     """
     sequence = open_other(folder, sequence) if isinstance(sequence, Path | str) else sequence
     places, settings = PlaceMap(folder, source), Result(folder).config.mask.model_copy(update={"files": ""})
-    mask = Masker(settings, create_masks(settings, sequence.rectifier, sequence.source.masks, sequence.numbers))
+    mask = Masker(settings, masks_of(settings, sequence))
     return (places.locate(mask(frame)) for frame in sequence.frames())
 
 

@@ -25,6 +25,7 @@ from scopemap.engine.config.depth import DepthSettings, MapisSettings, NetworkSe
 from scopemap.engine.config.input import InputSettings, MaskSettings
 from scopemap.engine.config.mapping import FusionSettings, MappingSettings
 from scopemap.engine.config.presets import PRESETS
+from scopemap.engine.config.removed import REMOVED
 from scopemap.engine.config.settings import Settings, StageSettings, hint
 from scopemap.engine.config.tracking import SmoothingSettings, TrackingSettings
 from scopemap.engine.errors import SettingsError
@@ -85,6 +86,8 @@ class Config(Settings):
         if unknown is not None:
             unknown += sorted(in_file.keys() - set(setting_names()))
             in_file = {name: value for name, value in in_file.items() if name not in unknown}
+        else:
+            _check_file(file, in_file)
         chosen = str(settings.get("preset") or preset or in_file.get("preset") or "default")
         if chosen not in PRESETS:
             raise SettingsError(f"unknown preset '{chosen}': choose one of {', '.join(PRESETS)}")
@@ -164,9 +167,26 @@ def check_setting(dotted: str) -> None:
     if dotted in (names := setting_names()):
         return
     group = dotted.partition(".")[0] + "."
+    if dotted in REMOVED:
+        raise SettingsError(f"unknown setting '{dotted}': {_instead(dotted)}")
     others = [name.removeprefix(group) for name in names if name.startswith(group)]
     of_group = f" {group[:-1]} has {', '.join(others)}" if others else ""
     raise SettingsError(f"unknown setting '{dotted}': {hint(dotted, names)}{of_group}")
+
+
+def _check_file(file: Path | None, in_file: dict[str, Any]) -> None:
+    """Raise `SettingsError` for a file of another version, with all its names that are none of a setting."""
+    unknown = sorted(in_file.keys() - set(setting_names()))
+    if not set(unknown) & REMOVED.keys():  # a misspelt one
+        return
+    words = ", ".join(f"{name} ({_instead(name)})" for name in unknown)
+    raise SettingsError(f"{file} is of another version of scopemap. Delete the lines of these settings: {words}")
+
+
+def _instead(name: str) -> str:
+    if name not in REMOVED:
+        return "unknown"
+    return f"removed, use {REMOVED[name]}" if REMOVED[name] else "removed, nothing takes its place"
 
 
 def _insert(tree: dict[str, Any], dotted: str, value: Any) -> None:

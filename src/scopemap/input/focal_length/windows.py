@@ -19,7 +19,7 @@ from scopemap.engine.flow.corners import detect_corners, normalised_brightness
 from scopemap.engine.frame import Frame, is_constant
 from scopemap.engine.geometry.warp import resampled
 from scopemap.engine.masking.masker import Masker
-from scopemap.input.mask_files import create_masks
+from scopemap.input.mask_files import masks_of
 from scopemap.input.sequence import Sequence
 
 MAX_FRAMES = 120
@@ -94,7 +94,7 @@ def _at_default_size(sequence: Sequence) -> Sequence:
 
 
 def _kept(sequence: Sequence, config: Config) -> Iterator[Frame]:
-    masker = Masker(config.mask, create_masks(config.mask, sequence.rectifier, sequence.source.masks, sequence.numbers))
+    masker = Masker(config.mask, masks_of(config.mask, sequence))
     count = min(sequence.count or MAX_FRAMES, MAX_FRAMES)
     every = min(max(count // _MIN_KEPT, 1), _EVERY)
     step = every * (sequence.selection.step or 1)

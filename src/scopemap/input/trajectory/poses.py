@@ -12,6 +12,8 @@ from scopemap.engine.geometry.se3 import orthonormalised
 from scopemap.input.trajectory.trajectory import ASSUMED_FRAMES_PER_S, Trajectory
 
 _RIGID_TOLERANCE = 1e-2
+# Of any unit: the moon is nearer. From 1e154 on squares of positions overflow, and errors are no numbers.
+_FARTHEST_MM = 1e12
 
 
 def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
@@ -19,6 +21,7 @@ def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
     wrong = np.flatnonzero(~np.isfinite(T).all(axis=(1, 2)))
     if wrong.size:
         raise InputError(f"{where[wrong[0]]}: a pose holds NaN or infinity; leave out frames without a pose")
+    check_near(T[:, :3, 3], where)
     R = T[:, :3, :3]
     deviation = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
     bottom = np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
@@ -32,12 +35,21 @@ def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
     return orthonormalised(T)
 
 
+def check_near(positions_mm: np.ndarray, where: list[str]) -> None:
+    """Raise `InputError`, with its `where`, at the first of positions (N, 3), mm, that no camera has."""
+    wrong = np.flatnonzero(~(np.abs(positions_mm) <= _FARTHEST_MM).all(axis=1))
+    if wrong.size:
+        farthest = np.abs(positions_mm[wrong[0]]).max()
+        raise InputError(f"{where[wrong[0]]}: a position of {farthest:.3g} mm is none of a camera; correct the number")
+
+
 def from_quaternions(xyzw: np.ndarray, positions: np.ndarray, where: list[str]) -> np.ndarray:
     """Return motions (N, 4, 4) of unit quaternions (N, 4), scalar last, and translations (N, 3); checks the lengths."""
     norms = np.linalg.norm(xyzw, axis=1)
     wrong = np.flatnonzero(~(np.abs(norms - 1.0) <= _RIGID_TOLERANCE))
     if wrong.size:
         raise InputError(f"{where[wrong[0]]}: the quaternion has length {norms[wrong[0]]:.3g} instead of 1")
+    check_near(positions, where)
     T = np.tile(np.eye(4), (len(positions), 1, 1))
     if len(positions):
         T[:, :3, :3] = Rotation.from_quat(xyzw).as_matrix()

@@ -12,13 +12,13 @@ import numpy as np
 from scopemap.engine.errors import InputError, reporting
 from scopemap.input.trajectory.columns import TUM_ORDER, W_FIRST, Columns, are_frame_numbers, named_columns, stamps_s
 from scopemap.input.trajectory.poses import file_of, from_quaternions, rigid, stamped
-from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit
+from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Trajectory, Unit, numbers_file
 
 _TIMED_COLUMNS = 17
 EUROC_FILES = ("mav0/state_groundtruth_estimate0/data.csv", "state_groundtruth_estimate0/data.csv")
 _LONGEST_QUOTE = 40
-# Every number has the comma but a whole one, such as a time of 0.
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+([eE][-+]?\d+)?)?")
+# Every number has the comma but a whole one, such as a time of 0, or a power, such as Excel's 1E-05.
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
 _FEWEST_OF_POSE = 7
 _UNIT_LENGTH = 1e-2  # tolerance of a quaternion's length
 
@@ -161,7 +161,9 @@ def tum_poses(table: NumberTable, unit: Unit) -> tuple[np.ndarray, str]:
     """Return the poses (N, 4, 4), mm, of `stamp tx ty tz qx qy qz qw` rows, and unit and order of columns in words."""
     mm_per_unit, words = table.unit(unit)
     order = "" if table.columns is None else table.columns.words
-    T = from_quaternions(table.values[:, 4:], table.values[:, 1:4] * mm_per_unit, table.where)
+    with np.errstate(over="ignore"):  # refused as a position that no camera has
+        positions_mm = table.values[:, 1:4] * mm_per_unit
+    T = from_quaternions(table.values[:, 4:], positions_mm, table.where)
     return T, ", ".join(filter(None, (words, order)))
 
 
@@ -207,13 +209,17 @@ def is_euroc(table: NumberTable) -> bool:
 
 
 def read_kitti(path: Path, unit: Unit) -> Trajectory:
-    """Read KITTI rows, the upper 3x4 of a camera-to-world pose each; row = frame number, from 0."""
+    """Read KITTI rows, the upper 3x4 of a camera-to-world pose each.
+
+    Row = frame number, from 0, unless a file beside it states the numbers.
+    """
     table = read_numbers(file_of(path, ())).with_columns(12, "KITTI")
     mm_per_unit, words = table.unit(unit)
     T = np.tile(np.eye(4), (len(table.values), 1, 1))
     T[:, :3] = table.values.reshape(-1, 3, 4)
     T[:, :3, 3] *= mm_per_unit
-    return stamped(rigid(T, table.where), np.arange(len(T)), None, f"KITTI, camera-to-world, {words}, row = frame")
+    numbers, rows = _frames_of_lines(table)
+    return stamped(rigid(T, table.where), numbers, None, f"KITTI, camera-to-world, {words}, {rows}")
 
 
 def read_c3vd(path: Path, unit: Unit) -> Trajectory:
@@ -234,11 +240,26 @@ def read_c3vd(path: Path, unit: Unit) -> Trajectory:
         raise InputError(f"cannot read poses from {table.path}: neither the last row nor the last column is 0 0 0 1")
     T, source = rigid(T, table.where), f"C3VD pose.txt, {order}, camera-to-world, mm"
     if not is_timed:
-        return stamped(T, np.arange(len(T)), None, f"{source}, row = frame")
+        numbers, rows = _frames_of_lines(table)
+        return stamped(T, numbers, None, f"{source}, {rows}")
     if are_frame_numbers(table.values[:, 0]):
         return stamped(T, table.values[:, 0], None, f"{source}, whole stamps taken for frame numbers")
     times_s, words = stamps_s(table.values[:, 0])
     return stamped(T, None, times_s, f"{source}, {words}")
+
+
+def _frames_of_lines(table: NumberTable) -> tuple[np.ndarray, str]:
+    """Return the frame numbers (N,) of lines that state none, and in words whence: a file beside them, or the count."""
+    file = numbers_file(table.path)
+    if not file.is_file():
+        return np.arange(len(table.values)), "row = frame"
+    numbers = read_numbers(file).with_columns(1, "a list of frame numbers").values[:, 0]
+    if len(numbers) != len(table.values):
+        fault = f"it numbers {len(numbers)} lines, {table.path.name} has {len(table.values)}"
+        raise InputError(f"reading {file}: {fault}; export again, or remove it")
+    if not are_frame_numbers(numbers) or np.any(np.diff(numbers) <= 0):
+        raise InputError(f"reading {file}: expected ascending frame numbers, a line each")
+    return numbers, f"frame numbers by {file.name}"
 
 
 def read_poses(path: Path) -> np.ndarray:

@@ -108,6 +108,11 @@ def write_tum(path: Path, trajectory: Trajectory, *, unit: Unit = "mm", comment:
     np.savetxt(path, rows, fmt=["%.6f"] + ["%.9f"] * 7, header="\n".join(lines))
 
 
+def numbers_file(path: Path) -> Path:
+    """Return the file beside one of poses that states the frame of each line: `poses.frames.txt` of `poses.txt`."""
+    return path.with_name(f"{path.stem}.frames.txt")
+
+
 def write_kitti(path: Path, trajectory: Trajectory, *, unit: Unit = "mm") -> None:
     """Write the upper (3, 4) of each pose as one row-major line; the form has no room for times, unit or status.
 
