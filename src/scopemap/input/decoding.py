@@ -53,7 +53,7 @@ def write_encoded(file: Path, image: np.ndarray) -> None:
     A TIFF is packed by deflate: OpenCV's own LZW is read by imageio and tifffile with imagecodecs alone.
     """
     is_tiff = file.suffix.lower() in (".tif", ".tiff")
-    options = [cv2.IMWRITETIFF_COMPRESSION, cv2.IMWRITETIFF_COMPRESSION_ADOBE_DEFLATE] if is_tiff else []
+    options = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_ADOBE_DEFLATE] if is_tiff else []
     file.write_bytes(cv2.imencode(file.suffix, image, options)[1].tobytes())
 
 
