@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import scopemap.engine.config
 from docs.settings_page import settings_page
 from scopemap.engine.config import PRESETS, Config, MappingSettings, TrackingSettings, setting_names
-from scopemap.engine.config.removed import REMOVED
+from scopemap.engine.config.config import REMOVED
 from scopemap.engine.config.settings import StageSettings
 from scopemap.engine.errors import SettingsError
 from scopemap.result.result import Result

@@ -17,7 +17,7 @@ import json
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Final, Literal, cast
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
@@ -25,13 +25,50 @@ from scopemap.engine.config.depth import DepthSettings, MapisSettings, NetworkSe
 from scopemap.engine.config.input import InputSettings, MaskSettings
 from scopemap.engine.config.mapping import FusionSettings, MappingSettings
 from scopemap.engine.config.presets import PRESETS
-from scopemap.engine.config.removed import REMOVED
 from scopemap.engine.config.settings import Settings, StageSettings, hint
 from scopemap.engine.config.tracking import SmoothingSettings, TrackingSettings
 from scopemap.engine.errors import SettingsError
 
 Preset = Literal["default", "paper", "paper-strict", "realtime"]
 _QUOTED = 80  # characters of a value that an error repeats
+REMOVED: Final[dict[str, str]] = {
+    "depth.reanchor_every": "",
+    "mapping.moving_tissue": "",
+    **{
+        f"mask.{part.replace('-', '_')}": f"mask.method=no-{part}"
+        for part in ("field-of-view", "highlights", "overlays", "exposure")
+    },
+    "fusion.weighted": "fusion.method=unweighted",
+    "fusion.free_space": "fusion.method=no-free-space",
+    **dict.fromkeys(("tracking.picture_checks", "tracking.pose_checks"), "tracking.checks"),
+    **{
+        f"tracking.{name}": "tracking.photometric"
+        for name in ("start", "channels", "lamp_gamma", "gain_bias", "depth_weight")
+    },
+    **dict.fromkeys(("depth.fit_shift", "depth.disparity_floor"), "depth.fit"),
+    **{f"mapis.{name}": "mapis.previous" for name in ("recursive", "compare_warped", "perceptual_score")},
+    # Of the rest nobody chose a value: they are constants, with their last defaults.
+    **{f"smoothing.{name}": "" for name in ("alpha", "beta", "gamma", "omega")},
+    **{f"mapis.{name}": "" for name in ("filter_sigma_mm", "scale_pull", "sigma_fading", "tau", "constant_weight")},
+    **{
+        f"mapping.{name}": ""
+        for name in (
+            *("keyframe_gaps", "local_gaps", "correlated_observations", "depth_sigma_share", "scale_sigma"),
+            *("rotation_sigma_deg", "translation_sigma_share"),
+        )
+    },
+    **{
+        f"tracking.{name}": ""
+        for name in (
+            *("min_texture", "min_sharpness", "min_correlation", "min_inlier_share", "max_step", "min_keyframe_motion"),
+            *("keyframe_patience", "search_every", "max_iterations"),
+        )
+    },
+    **{f"fusion.{name}": "" for name in ("min_incidence", "depth_sigma_share", "truncation_share", "min_weight")},
+    **dict.fromkeys(("depth.shading_exponent", "mask.dark_level", "mask.files_grow_px"), ""),
+}
+"""Settings of earlier versions by their dotted names, and what took the place of each: a setting, where one value of it
+did with that value; "" where nothing did."""
 
 
 class RunSettings(Settings):
