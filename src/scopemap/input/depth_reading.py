@@ -11,6 +11,7 @@ from scopemap.input.decoding import read_decoded
 
 NUMPY = ".npy"
 _COLOUR_CHANNELS = (3, 4)
+_HEADER_BYTES = 128  # that NumPy fills up to this length
 
 
 def read_depth_file(file: Path) -> np.ndarray:
@@ -40,13 +41,19 @@ def read_depth_file(file: Path) -> np.ndarray:
 def _array_in(file: Path) -> np.ndarray:
     try:
         loaded: np.ndarray = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        if "Python objects" in str(error):
+    except (OSError, ValueError, EOFError):
+        why = "it is no array of NumPy, or damaged"
+        if _holds_objects(file):
             why = "it holds Python objects, which are not loaded; save the array itself"
-        else:
-            why = "it is no array of NumPy, or damaged"
         raise InputError(f"cannot read the depth file {file}: {why}") from None
     return loaded
+
+
+def _holds_objects(file: Path) -> bool:
+    """Return whether a file is a pickle, or an array of NumPy whose header says that it holds objects."""
+    with file.open("rb") as content:
+        start = content.read(_HEADER_BYTES)
+    return start.startswith(b"\x80") or (start.startswith(b"\x93NUMPY") and b"'|O'" in start)
 
 
 def _image_in(file: Path) -> np.ndarray:
