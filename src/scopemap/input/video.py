@@ -12,7 +12,6 @@ from pathlib import Path
 import av
 import numpy as np
 from av.container import InputContainer
-from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
@@ -52,6 +51,7 @@ class _Reading:
     """One pass over a video: packets read, pictures shown and damaged so far, and whether it broke off.
 
     shown_pts, latest_pts : the latest of the pictures shown so far, and of those in the packets; None without any.
+    smeared : number of the first picture of which data are missing; None: of none.
     """
 
     stamps: TimeStamps
@@ -61,6 +61,7 @@ class _Reading:
     broken: bool = False
     shown_pts: int | None = None
     latest_pts: int | None = None
+    smeared: int | None = None
 
     @property
     def index(self) -> int:
@@ -261,7 +262,8 @@ class VideoFile(Source):
                 reading.begin(self.rate_hz, entry.number)
             for packet in container.demux(stream) if entry is None else entry.packets:
                 if packet.size:
-                    self._look_for_smears(packet, reading)
+                    if packet.is_corrupt and reading.smeared is None:
+                        reading.smeared = reading.packets
                     reading.packets += 1
                     due.append(None if packet.dts is None else float(packet.dts * packet.time_base))
                     if in_order and packet.pts is not None and not packet.is_discard:
@@ -299,12 +301,18 @@ class VideoFile(Source):
                 with suppress(av.FFmpegError):
                     yield from (frame for frame in packet.decode() if frame.pts is not None and frame.pts > last_pts)
 
-    def _look_for_smears(self, data: Packet | VideoFrame, reading: _Reading) -> None:
-        """Warn once: FFmpeg fills what is missing from other pictures, and shows the result as if it were sound."""
-        if data.is_corrupt and not self._is_smeared:
-            self._is_smeared = True
-            found = f"the data of the video {self.path.name} are interrupted or damaged near frame {reading.index}"
-            self._warn(f"{found}: unless pieces were joined there, pictures up to the next key picture may be smeared")
+    def _look_for_smears(self, frame: VideoFrame, reading: _Reading) -> None:
+        """Warn once: FFmpeg fills what is missing from other pictures, and shows the result as if it were sound.
+
+        Where nothing follows, the video breaks off, which is said by itself.
+        """
+        if frame.is_corrupt and reading.smeared is None:
+            reading.smeared = reading.index
+        if self._is_smeared or reading.smeared is None or reading.index <= reading.smeared:
+            return
+        self._is_smeared = True
+        found = f"the data of the video {self.path.name} are interrupted or damaged near frame {reading.smeared}"
+        self._warn(f"{found}: unless pieces were joined there, pictures up to the next key picture may be smeared")
 
     def _report(self, reading: _Reading) -> None:
         stamps, read = reading.stamps, reading.shown

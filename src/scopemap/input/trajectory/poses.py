@@ -37,7 +37,7 @@ def rigid(T: np.ndarray, where: list[str]) -> np.ndarray:
 
 def check_near(positions_mm: np.ndarray, where: list[str]) -> None:
     """Raise `InputError`, with its `where`, at the first of positions (N, 3), mm, that no camera has."""
-    wrong = np.flatnonzero(~(np.abs(positions_mm) <= _FARTHEST_MM).all(axis=1))
+    wrong = np.flatnonzero((np.abs(positions_mm) > _FARTHEST_MM).any(axis=1))  # NaN has a sentence of its own
     if wrong.size:
         farthest = np.abs(positions_mm[wrong[0]]).max()
         raise InputError(f"{where[wrong[0]]}: a position of {farthest:.3g} mm is none of a camera; correct the number")
