@@ -133,7 +133,7 @@ def errors(clip: RealClip, run: Path, out: Path) -> dict[str, float]:
         kept_out = held_out_agreement(run).figures()["held_out"]
         found |= {"depth_error": kept_out["depth_error"], "dissimilarity": 1 - kept_out["ssim"]}
     return found | {
-        "lost": float(np.sum(result.frames.status == "lost")),
+        "lost": float(result.frames.lost.sum()),
         "good": float(verdict(result).word == "good"),
     }
 
