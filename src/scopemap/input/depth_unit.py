@@ -40,10 +40,11 @@ def check_values(files: FilesDepth) -> None:
             f"the depth files in {files.folder} hold no positive number: depth and disparity are positive, and 0, NaN "
             "and negative numbers mean unknown; give what the network returned"
         )
-    if all(np.ptp(values) == 0 for values in known if values.size):
+    known = [values for values in known if values.size]
+    if all(np.ptp(values) == 0 for values in known):
         raise InputError(
-            f"the depth files in {files.folder} hold one number everywhere, such as {known[0].max(initial=0):g}: they "
-            "say nothing of depth; give what the network returned"
+            f"the depth files in {files.folder} hold one number everywhere, such as {known[0][0]:g}: they say nothing "
+            "of depth; give what the network returned"
         )
 
 

@@ -33,9 +33,9 @@ def with_files_judged(
     depth = estimators.depth
     if not isinstance(depth, FilesDepth) or _is_of_data_set(sequence, depth):
         return config, estimators, []
-    check_values(depth)
     notices = list[Notice]()
     if not depth.kind_is_stated:
+        check_values(depth)
         kind, notices = _judged(sequence, config, depth)
         if kind == "measured" and not depth.kind_reason:
             check_common_scale(depth)
