@@ -254,3 +254,12 @@ def test_what_cannot_be_measured_is_refused(known: Path, tmp_path: Path, capfd: 
         assert call("measure", known, *words) == 2
     for words in (["--reference", "1,1"], ["--reference", "1,1 2,2", "--reference-mask", "x"]):
         assert call("measure", known, "--lesion", outline, "--frame", 0, *words) == 2
+
+
+def test_masks_named_by_times_are_refused(known: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """0.001 was taken for frame 1."""
+    (tmp_path / "masks").mkdir()
+    for name in ("0.001", "0.002"):
+        cv2.imwrite(str(tmp_path / f"masks/mask_{name}.png"), 255 * patch(2).astype(np.uint8))
+    said = refused(capfd, "measure", known, "--lesion", tmp_path / "masks")
+    assert "end in decimal numbers, such as mask_0.001.png" in said

@@ -25,6 +25,7 @@ from scopemap.engine.geometry.rendering import render_mesh, vertex_colours
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.decoding import by_number, read_decoded, write_image
+from scopemap.input.image_names import decimal_numbers
 from scopemap.result.result import Result
 
 _OF_VIEWS = "the outline and what frames differ by"
@@ -133,7 +134,13 @@ def _known(reference: np.ndarray | None, frame: int | None, length_mm: float | N
 def _masks_of_folder(run: Result, folder: Path) -> dict[int, np.ndarray]:
     """Return the masks (H, W) bool of the frames that have a pose, by the number of the frame."""
     tracked = set(run.tracked.trajectory.indices.tolist())
-    files = by_number(file for file in folder.iterdir() if not file.name.startswith("."))
+    found = sorted(file for file in folder.iterdir() if not file.name.startswith("."))
+    if decimal_numbers(found) is not None:
+        raise InputError(
+            f"names of masks in {folder} end in decimal numbers, such as {found[0].name}, which are times, not numbers "
+            "of frames; name each by its frame (the column index of frames.csv)"
+        )
+    files = by_number(found)
     masks = {index: _read_mask(run, file) for index, file in files.items() if index in tracked}
     if not masks:
         raise InputError(f"no mask in {folder} has the number of a frame of the result {run.path}")
