@@ -50,8 +50,10 @@ PHANTOMS = ("phantom: cut: 30 degrees between two frames", "phantom: pulled")
 FACTORS = (0.5, 2.0)
 LONGEST_S = 3600
 """A process with a changed number that runs so long counts as one that fails."""
-NOTHING, MUCH = 0.01, 0.1
-"""Changes of an error below which a number moves nothing, and above which it moves much."""
+NOTHING = 0.01
+"""Change of an error below which a number moves nothing."""
+MUCH = 0.1
+"""Change of an error above which a number moves much."""
 
 
 @dataclass(frozen=True)
