@@ -12,7 +12,15 @@ from tiny_phantom import write_tiny
 
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.config import Config, FusionSettings
-from scopemap.engine.fusion.finish import finished, simplified, smoothed, with_normals_alone, without_small_holes
+from scopemap.engine.fusion.finish import (
+    border_edges,
+    finished,
+    simplified,
+    smoothed,
+    with_even_border,
+    with_normals_alone,
+    without_small_holes,
+)
 from scopemap.engine.fusion.mesh_files import ply_bytes
 
 
@@ -92,6 +100,38 @@ def test_a_ball_with_pricks_is_whole_again() -> None:
     assert finished(ball, settings).is_watertight
     assert finished(ball, settings).volume == pytest.approx(volume, rel=1e-3)
     assert finished(ball, settings.model_copy(update={"holes": "none"})) is ball
+
+
+def test_a_border_loses_teeth_strips_and_specks_and_becomes_smooth() -> None:
+    plate = _plate(60)
+    x, y = plate.triangles_center[:, :2].T
+    comb = (y > 50) & (x // 3 % 2 == 1)
+    plate.update_faces((y < 50) | comb)
+    speck = trimesh.Trimesh(
+        np.add(_plate(3).vertices, [80.0, 0, 0]), _plate(3).faces, vertex_colors=[[9, 9, 9]] * 9, process=False
+    )
+    speck.vertex_attributes["confidence"] = np.ones(9, np.float32)
+    ragged = trimesh.util.concatenate([plate, speck])
+    even = with_even_border(ragged)
+    assert len(even.split(only_watertight=False)) == 1
+    assert even.area == pytest.approx(59 * 50, rel=0.02)
+    assert even.vertices[:, 1].max() < 52
+    middle = (even.vertices[:, 0] > 5) & (even.vertices[:, 0] < 54)
+    line = np.unique(border_edges(even))
+    top = line[middle[line] & (even.vertices[line, 1] > 25)]
+    assert even.vertices[top, 1].std() < 0.5
+    assert even.vertex_attributes["confidence"].shape == (len(even.vertices),)
+    left = even.vertices[:, 0] < 25
+    assert (np.asarray(even.visual.vertex_colors)[left, 0] == 200).all()
+
+
+def test_a_thin_surface_and_one_without_border_stay() -> None:
+    strip = _plate()
+    strip.update_faces(np.abs(strip.triangles_center[:, 0] - 11.5) < 1.5)
+    assert with_even_border(strip) is strip
+    ball = trimesh.creation.icosphere(3, 10.0)
+    np.testing.assert_array_equal(with_even_border(ball).vertices, ball.vertices)
+    assert with_even_border(trimesh.Trimesh()).is_empty
 
 
 def test_an_open_tube_becomes_a_watertight_lumen() -> None:

@@ -10,15 +10,18 @@ import numpy as np
 
 from scopemap.engine.errors import InputError, reporting
 from scopemap.report.measured_surface import MOST_FACES
-from scopemap.report.mesh_figures import ESTIMATE_COLOUR, draw_path, mesh_picture, view_of
+from scopemap.report.mesh_figures import ESTIMATE_COLOUR, MeshView, draw_path, mesh_picture, view_of, zoomed
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet
-from scopemap.report.shown_mesh import simplified
+from scopemap.report.shown_mesh import simplified, textured_surface
 from scopemap.result.result import Result
 
 _FRAMES = 180
 _FRAMES_PER_S = 24
 _PITCH_RAD = -0.35
+_FITTED = 36
+"""Views all round, by which the picture is filled."""
+_FILLED = 0.96
 _QUALITY_BITS = 4_000_000
 
 
@@ -57,14 +60,25 @@ def write_turntable(folder: Path | str, file: Path, frames: int = _FRAMES) -> No
 def _turning(run: Result, frames: int) -> Iterator[np.ndarray]:
     """Yield the pictures of a surface that turns once."""
     mesh, poses = simplified(run.mesh, MOST_FACES), run.frames["T_world_camera"][run.frames.tracked]
+    mesh = textured_surface(run, run.main_segment, mesh) or mesh
     points = np.concatenate([np.asarray(mesh.bounds), poses[:, :3, 3]])
-    centre, radius = (points.min(axis=0) + points.max(axis=0)) / 2, np.linalg.norm(np.ptp(points, axis=0)) / 2
-    for number in range(frames):
-        view = view_of(poses[0][:3, :3], centre, float(radius), 2 * np.pi * number / frames, _PITCH_RAD)
+    centre, radius = (points.min(axis=0) + points.max(axis=0)) / 2, float(np.linalg.norm(np.ptp(points, axis=0))) / 2
+    R, yaws_rad = poses[0][:3, :3], 2 * np.pi * np.arange(frames) / frames
+    shown = np.concatenate([np.asarray(mesh.vertices), poses[:, :3, 3]])
+    some = [view_of(R, centre, radius, yaw_rad, _PITCH_RAD) for yaw_rad in yaws_rad[:: max(1, frames // _FITTED)]]
+    larger = min(_largest_zoom(view, shown) for view in some)
+    for yaw_rad in yaws_rad:
+        view = zoomed(view_of(R, centre, radius, yaw_rad, _PITCH_RAD), larger)
         picture = mesh_picture(mesh, view)
         draw_path(picture, view, poses[:, :3, 3], ESTIMATE_COLOUR)
         if run.scale_known:
-            draw_scale_bar(picture, view.camera.fx / (4 * float(radius)), " at its middle")
+            draw_scale_bar(picture, view.camera.fx / (4 * radius), " at its middle")
         sheet = Sheet.over(picture)
         sheet.legend((8, 8), {"camera path, dot: start": ESTIMATE_COLOUR}, 0)
         yield sheet.rgb
+
+
+def _largest_zoom(view: MeshView, points: np.ndarray) -> float:
+    """Return the factor by which the focal length of a view may grow until a point (N, 3), world mm, leaves it."""
+    pixels = view.project(points)[1] - [view.camera.cx, view.camera.cy]
+    return float(_FILLED * view.camera.cx / max(np.abs(pixels).max(), 1e-6))

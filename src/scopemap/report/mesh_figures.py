@@ -6,8 +6,9 @@ Estimates are green, true values red, as in the paper's experiment 4 (arXiv 2508
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ TRUTH_COLOUR = "#d73027"
 _SIDE_PX = 480
 _AMBIENT = 0.35
 _UNPAINTED = 190
+_WHITE = 255
 _PLOT_PX = 400
 _MARGIN_PX = 15
 
@@ -123,31 +125,44 @@ def view_of(R: np.ndarray, centre_mm: np.ndarray, radius_mm: float, yaw_rad: flo
     return inside_view(se3(R_view, centre_mm - 4.0 * radius_mm * R_view[:, 2]), 2.1 * float(np.arcsin(0.25)))
 
 
+def zoomed(view: MeshView, factor: float) -> MeshView:
+    """Return a view with its focal length times a factor."""
+    camera = view.camera
+    return replace(view, camera=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))
+
+
 def mesh_picture(mesh: trimesh.Trimesh, view: MeshView, *, smooth: bool = True) -> np.ndarray:
     """Return the (H, W, 3) uint8 picture of a mesh, lit by a lamp at the camera, on white.
 
     Both sides of a triangle are drawn; triangles partly behind the camera are left out. A mesh without vertex colours
-    is grey. smooth : draw it twice as large and take means, which a picture that will be shrunk does not need.
+    and without a texture is grey. smooth : draw it twice as large and take means, which a picture that will be shrunk
+    does not need.
     """
-    visual, camera, colours = mesh.visual, view.camera, np.full((len(mesh.vertices), 3), _UNPAINTED)
-    if isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
+    visual: Any = mesh.visual
+    camera, colours = view.camera, np.full((len(mesh.vertices), 3), _UNPAINTED)
+    is_textured = isinstance(visual, trimesh.visual.TextureVisuals)
+    if is_textured:
+        colours[:] = _WHITE
+    elif visual.kind == "vertex":
         colours = np.asarray(visual.vertex_colors)[:, :3]
     rays = np.asarray(mesh.vertices) - view.T_world_camera[:3, 3]
     lengths = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
     cosine = np.abs((np.asarray(mesh.vertex_normals) * rays).sum(1)) / lengths
     shaded = np.round((_AMBIENT + (1 - _AMBIENT) * cosine)[:, None] * colours).astype(np.uint8)
     lit = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=shaded, process=False)
-    if not smooth:
-        return on_white(render_mesh(lit, camera, view.T_world_camera))
     # Half a pixel's sampling: the mesh's triangles are often smaller than a pixel.
-    fine = camera.resized(2 * camera.width, 2 * camera.height)
-    picture = on_white(render_mesh(lit, fine, view.T_world_camera))
-    return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    drawn = camera.resized(2 * camera.width, 2 * camera.height) if smooth else camera
+    rendering = render_mesh(lit, drawn, view.T_world_camera)
+    if is_textured:
+        tissue = render_mesh(mesh, drawn, view.T_world_camera).rgb
+        rendering = rendering._replace(rgb=(rendering.rgb.astype(np.uint16) * tissue // _WHITE).astype(np.uint8))
+    picture = on_white(rendering)
+    return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA) if smooth else picture
 
 
 def on_white(rendering: Rendering) -> np.ndarray:
     """Return the colours of a rendering, (H, W, 3) uint8, white where there is no surface."""
-    return np.where(np.isnan(rendering.depth_mm)[..., None], np.uint8(255), rendering.rgb)
+    return np.where(np.isnan(rendering.depth_mm)[..., None], np.uint8(_WHITE), rendering.rgb)
 
 
 def draw_path(

@@ -18,7 +18,7 @@ from scopemap.engine.geometry.align import align_trajectories
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
 from scopemap.report.shown_maps import MapOnPage, shown_map_numbers, shown_maps
-from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified
+from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified, textured_surface
 from scopemap.report.video_parts import video_parts
 from scopemap.result.evidence import notices_of, scale_source
 from scopemap.result.frame_table import NOT_USED
@@ -262,7 +262,8 @@ def _maps(
         looking = [p for p in pictures if in_map[p.row] == number and p.depth_mm is not None]
         looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
         seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
-        data = mesh_data(mesh, seen, run.camera) | {"errors": measure_errors(one.result)}
+        textured = textured_surface(one.result, one.segment, mesh)
+        data = mesh_data(mesh, seen, run.camera, textured) | {"errors": measure_errors(one.result)}
         if len(mesh.faces) > (most := MOST_FACES if number == 0 else FACES_OF_OTHERS):
             data["measured"] = shape_data(simplified(mesh, most))
         facts = {"frames": int((in_map == number).sum()), "all_faces": len(one.mesh.faces)}

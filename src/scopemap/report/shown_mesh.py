@@ -10,8 +10,10 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.cameras.camera import PinholeCamera
+from scopemap.engine.fusion.mesh_files import texture_jpeg
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.se3 import inverse
+from scopemap.result.result import Result
 
 _SAME_SURFACE = 0.1
 _CELLS_PER_FACE = 2.5  # faces of a surface that crosses a grid, times a cell's area, over its area
@@ -47,6 +49,22 @@ def simplified(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
             return fewer
         cell *= np.sqrt(max(len(fewer.faces) / most_faces, 1.04))
     return mesh
+
+
+def textured_surface(run: Result, segment: int, shown: trimesh.Trimesh) -> trimesh.Trimesh | None:
+    """Return the surface of a segment with its texture; None where it has none, or `shown` has fewer of its triangles.
+
+    The triangles are those of `shown`, in their order; vertices at seams are there more than once.
+    """
+    textured = run.textured if segment == run.main_segment else None
+    return textured if textured is not None and len(textured.faces) == len(shown.faces) else None
+
+
+def at_split_vertices(values: np.ndarray, mesh: trimesh.Trimesh, textured: trimesh.Trimesh) -> np.ndarray:
+    """Return values (V, ...) at a mesh's vertices for those of its `textured_surface`."""
+    found = np.empty((len(textured.vertices), *values.shape[1:]), values.dtype)
+    found[np.asarray(textured.faces)] = values[np.asarray(mesh.faces)]
+    return found
 
 
 def _clustered(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
@@ -85,11 +103,14 @@ def times_seen(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCa
     return count
 
 
-def mesh_data(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCamera) -> dict[str, Any]:
+def mesh_data(
+    mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCamera, textured: trimesh.Trimesh | None = None
+) -> dict[str, Any]:
     """Return a mesh for the page: base64 arrays; `seen` is how often each vertex was seen, 255 = in all frames.
 
-    positions: uint16 between `low` and `high`, mm. normals: int8. colours, confidence, moving, seen: uint8.
-    faces: uint32.
+    textured : of the same triangles. positions: uint16 between `low` and `high`, mm. normals: int8. colours,
+    confidence, moving, seen: uint8. faces: uint32. texture: None, or a JPEG and uint16, where each corner of the faces
+    is in it, 65535 = its right or lower end.
     """
     confidence, moving = (
         np.asarray(mesh.vertex_attributes.get(name, np.full(len(mesh.vertices), otherwise)), np.float64)
@@ -105,7 +126,15 @@ def mesh_data(mesh: trimesh.Trimesh, frames: list[SeenFrame], camera: PinholeCam
         "moving": base64_of(np.round(255 * np.clip(moving.ravel(), 0, 1)), "u1"),
         "seen": base64_of(np.round(255 * seen / max(len(frames), 1)), "u1"),
         "looked": len(frames),
+        "texture": None if textured is None else _texture_data(textured),
     }
+
+
+def _texture_data(textured: trimesh.Trimesh) -> dict[str, str]:
+    visual: Any = textured.visual
+    from_above = np.clip(visual.uv * [1, -1] + [0, 1], 0, 1)
+    places = np.round(LARGEST_LEVEL * from_above)[np.asarray(textured.faces)]
+    return {"jpg": b64encode(texture_jpeg(textured)).decode(), "places": base64_of(places, "u2")}
 
 
 def shape_data(mesh: trimesh.Trimesh) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from scopemap.report.mesh_figures import (
 )
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import SOFT, Sheet, rgb_of
+from scopemap.report.shown_mesh import textured_surface
 from scopemap.result.result import Result
 from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.result.verdict import Verdict, verdict
@@ -52,7 +53,8 @@ def summary_picture(run: Result, meshes: Sequence[trimesh.Trimesh]) -> Image.Ima
     """
     frames = _spread(run)
     seen = [] if run.path is None else [_frames_row(run, frames), _depth_row(run, frames)]
-    rows = [*seen, _mesh_row(run, meshes[0]), *_submap_rows(run, meshes)]
+    main = textured_surface(run, run.main_segment, meshes[0]) or meshes[0]
+    rows = [*seen, _mesh_row(run, main), *_submap_rows(run, meshes)]
     rows = [row for row in rows if row]
     heights = [max(picture.shape[0] for picture in row.values()) + _LABEL_PX for row in rows]
     width = _COLUMNS * (_CELL_PX + _GAP_PX) + _GAP_PX
@@ -208,10 +210,10 @@ def _opened(mesh: trimesh.Trimesh, view: MeshView) -> trimesh.Trimesh:
     """Return a mesh without the faces that turn their backs to a view: near walls do not hide what is behind them."""
     to_view = view.T_world_camera[:3, 3] - np.asarray(mesh.triangles_center)
     kept = (np.asarray(mesh.face_normals) * to_view).sum(axis=1) > 0
-    faces, colours = np.asarray(mesh.faces)[kept], vertex_colours(mesh)
-    return trimesh.Trimesh(
-        mesh.vertices, faces, vertex_colors=colours, vertex_normals=mesh.vertex_normals, process=False
-    )
+    faces, visual = np.asarray(mesh.faces)[kept], mesh.visual
+    if not isinstance(visual, trimesh.visual.TextureVisuals):
+        visual = trimesh.visual.ColorVisuals(vertex_colors=vertex_colours(mesh))
+    return trimesh.Trimesh(mesh.vertices, faces, vertex_normals=mesh.vertex_normals, visual=visual, process=False)
 
 
 def _fitted(picture: np.ndarray) -> np.ndarray:

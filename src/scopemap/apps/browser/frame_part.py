@@ -55,7 +55,7 @@ class FramePart:
             self._command("Next frame", "N", "Next"),
             self._command("Previous frame", "P", "Previous"),
         ]
-        view.follow(frame=self._follow, camera=self._draw, note=self._hide_list)
+        view.follow(frame=self._follow, note=self._hide_list)
 
     def _add_list(self) -> None:
         """Make the list of the frames that saw a place."""
@@ -172,8 +172,7 @@ class FramePart:
         self._words.content = frame_words(view)
         if self._with_camera.value and view.pose is not None:
             view.look_from_frame()
-        else:
-            self._draw()
+        self._draw()
         # After what is quick; of many frames only for the last.
         view.window.do(self._show_images, view.index)
 
@@ -190,7 +189,7 @@ class FramePart:
         if (pose := view.pose) is None:
             view.window.scene.remove_by_name(_FRUSTUM)
             return
-        camera, found = view.whole.camera, self._images.picture(view.index) if view.shows_picture else None
+        camera = view.whole.camera
         view.window.scene.add_camera_frustum(
             _FRUSTUM,
             view.vertical_fov,
@@ -199,7 +198,6 @@ class FramePart:
             color=_COLOUR,
             thickness=2.5,
             thickness_units="screen",
-            image=None if found is None else found[1],
             cast_shadow=False,
             receive_shadow=False,
             wxyz=quaternion(pose),
@@ -217,7 +215,6 @@ class FramePart:
                 self._view.note(f"The video has no frame {index} any more.")
                 return
             self._images.keep(index, rgb)
-            self._draw()
             self._show_images(index)
 
         self._view.window.job("reading the video", read, keep)

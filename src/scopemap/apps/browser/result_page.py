@@ -46,7 +46,7 @@ class ResultPage:
         view.add_note()
         self._ways = gui.add_button_group("", self._ways_now())
         self._ways.on_click(lambda event: window.do(self._go, self._ways.value))
-        view.follow(camera=self._show_ways)
+        view.follow(measuring=self._show_ways)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Verdict"):
             VerdictPart(view, self._run_again)

@@ -42,11 +42,10 @@ class ResultView:
         self.row = self.rows[0] if self.rows else 0
         self.number, self.surface = 0, ShownSurface(whole)
         self._surfaces: dict[tuple[int, int | None], ShownSurface] = {(0, None): self.surface}
-        self._inside = False
         self._click_words = LOOKING
         self._of_note: list[Callable[[], None]] = []
         self._of_frame: list[Callable[[], None]] = []
-        self._of_camera: list[Callable[[], None]] = []
+        self._of_measuring: list[Callable[[], None]] = []
         self._of_submap: list[Callable[[], None]] = []
         self._coverage: dict[int, Coverage] = {}
 
@@ -80,11 +79,6 @@ class ResultView:
         return float(2 * np.arctan(self.whole.camera.height / 2 / self.whole.camera.fy))
 
     @property
-    def shows_picture(self) -> bool:
-        """Whether the frame's picture is in the scene: not where it would hide the surface."""
-        return not (self._inside or self.measuring)
-
-    @property
     def measuring(self) -> bool:
         """Whether clicks measure."""
         return self._click_words != LOOKING
@@ -94,13 +88,13 @@ class ResultView:
         *,
         frame: Callable[[], None] | None = None,
         submap: Callable[[], None] | None = None,
-        camera: Callable[[], None] | None = None,
+        measuring: Callable[[], None] | None = None,
         note: Callable[[], None] | None = None,
     ) -> None:
-        """Call where another frame, submap or note is shown, or where `shows_picture` may have changed."""
+        """Call where another frame, submap or note is shown, or where measuring begins or ends."""
         self._of_frame += [frame] if frame else []
         self._of_submap += [submap] if submap else []
-        self._of_camera += [camera] if camera else []
+        self._of_measuring += [measuring] if measuring else []
         self._of_note += [note] if note else []
 
     def clicks_are_for(self, words: str) -> None:
@@ -109,7 +103,8 @@ class ResultView:
         self._click_words = words
         self._clicks.content = f"**{escaped(words)}**" if self.measuring else escaped(words)
         if changed:
-            self._see()
+            for call in self._of_measuring:
+                call()
 
     def show_row(self, row: int) -> None:
         """Show the frame of a row, and the surface of its segment."""
@@ -145,29 +140,24 @@ class ResultView:
         poses = self.run.tracked["T_world_camera"]
         points = np.asarray(self.surface.mesh.vertices)
         points = points if len(points) else poses[:, :3, 3]
-        self._inside = False
         if len(poses):
             self._see_with(_WHOLE_FOV)
             look_at(self.window, poses[0], points)
-        self._see()
 
     def look_from_frame(self) -> None:
         """Look from the camera of the frame that is shown."""
         if (pose := self.pose) is None:
             self.note("This frame has no pose in this submap: nothing can be seen from it.")
             return
-        ahead, self._inside = max(0.2 * self.surface.size_mm, 1e-3), True
+        ahead = max(0.2 * self.surface.size_mm, 1e-3)
         self._see_with(self.vertical_fov, self.whole.camera.width / self.whole.camera.height)
         look_from(self.window, pose[:3, 3], pose[:3, 3] + ahead * pose[:3, 2], -pose[:3, 1])
-        self._see()
 
     def look_from_spot(self, place: np.ndarray) -> None:
         """Look from the camera of the frame that is shown at a place (3,)."""
         if (pose := self.pose) is not None:
-            self._inside = True
             self._see_with(_WHOLE_FOV)
             look_from(self.window, pose[:3, 3], place, -pose[:3, 1])
-            self._see()
 
     def note(self, words: str) -> None:
         """Show a sentence that is always seen; "": none."""
@@ -206,10 +196,6 @@ class ResultView:
         from scopemap.apps.coverage.coverage import coverage
 
         self.window.job("looking for what was not seen", lambda: coverage(folder), found)
-
-    def _see(self) -> None:
-        for call in self._of_camera:
-            call()
 
     def _see_with(self, fov_rad: float, aspect: float = 1.0) -> None:
         """Let all browsers see a vertical field of view, narrow ones all of its width, `aspect` times as wide."""

@@ -9,9 +9,10 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from scopemap.apps.browser.unlit_mesh import texture_before_tone_mapping
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.surface_measures import meet_surface
-from scopemap.report.shown_mesh import simplified
+from scopemap.report.shown_mesh import simplified, textured_surface
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 
@@ -46,6 +47,17 @@ class ShownSurface:
     def colours(self) -> np.ndarray:
         """Colours (V, 3) uint8 sRGB, as in the result."""
         return vertex_colours(self.mesh)[:, :3]
+
+    @cached_property
+    def textured(self) -> trimesh.Trimesh | None:
+        """Its triangles with a texture of the video's frames; None where there is none."""
+        return textured_surface(self.run, self.segment, self.mesh)
+
+    @cached_property
+    def texture(self) -> bytes:
+        """The texture as `unlit_textured_glb` wants it."""
+        assert self.textured is not None
+        return texture_before_tone_mapping(self.textured)
 
     @cached_property
     def facing(self) -> np.ndarray:

@@ -27,18 +27,20 @@ _AMBIENT = 0.55
 class Colouring:
     """Colours (V, 3) uint8 of a surface's vertices, what they mean in a sentence, and their scale.
 
-    ramp : colours from low to high (256, 3); None: they are no scale. ticks : values below it, evenly spaced.
+    ramp : colours from low to high (256, 3); None: they are no scale. ticks : values below it, evenly spaced. picture :
+    whether they are those of the tissue, which the surface's texture shows better.
     """
 
     colours: np.ndarray
     words: str
     ramp: np.ndarray | None = None
     ticks: tuple[str, ...] = ()
+    picture: bool = False
 
 
 def colourings(surface: ShownSurface) -> dict[str, Callable[[], Colouring]]:
     """Return what a surface can be coloured by, by name; none is computed before it is called."""
-    found = {"picture": lambda: Colouring(surface.colours, _picture_words(surface.run))}
+    found = {"picture": lambda: Colouring(surface.colours, _picture_words(surface.run), picture=True)}
     if surface.is_empty:
         return found
     if "confidence" in surface.mesh.vertex_attributes:
@@ -67,8 +69,12 @@ def looking_frames(run: Result, most: int = _LOOKED_AT) -> list[SeenFrame]:
 
 def in_relief(facing: np.ndarray, colours: np.ndarray) -> np.ndarray:
     """Return colours (V, 3) uint8 of vertices, darker where they do not face a camera, by `facing_of`, (V,)."""
-    light = _AMBIENT + (1 - _AMBIENT) * facing
-    return np.asarray(np.round(colours * light[:, None]), np.uint8)
+    return np.asarray(np.round(colours * light_of(facing)[:, None]), np.uint8)
+
+
+def light_of(facing: np.ndarray) -> np.ndarray:
+    """Return the light (V,), 0..1, in relief, on vertices that face a camera so, by `facing_of`, (V,)."""
+    return _AMBIENT + (1 - _AMBIENT) * facing
 
 
 def stops_of(ramp: np.ndarray, count: int = 9) -> list[str]:

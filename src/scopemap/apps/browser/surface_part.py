@@ -10,11 +10,11 @@ import trimesh
 from scopemap.apps.browser.legends import ramp_html, words_html
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
-from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, stops_of
-from scopemap.apps.browser.unlit_mesh import unlit_glb
+from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, light_of, stops_of
+from scopemap.apps.browser.unlit_mesh import unlit_glb, unlit_textured_glb
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import COLOURS
-from scopemap.report.shown_mesh import simplified
+from scopemap.report.shown_mesh import at_split_vertices, simplified
 from scopemap.report.video_parts import video_parts
 from scopemap.result.verdict import level_of_submap
 from scopemap.result.wording import LEVEL_WORDS
@@ -78,7 +78,7 @@ class SurfacePart:
             return
         found = colourings(self._view.surface)[name]()
         self._explain(found)
-        self._shown, self._colours = None, found.colours
+        self._shown, self._colouring = None, found
         self._draw()
 
     def _explain(self, found: Colouring) -> None:
@@ -104,13 +104,17 @@ class SurfacePart:
             scene.remove_by_name(_SURFACE)
             self._words.content = "There is no surface."
             return
-        if self._shown is not None:
-            vertices, faces, colours = self._shown
-        else:
-            vertices, faces, colours = surface.vertices, surface.faces, self._colours
-            colours = in_relief(surface.facing, colours) if self._relief.value else colours
-        content = unlit_glb(vertices, faces, colours)
+        content = unlit_glb(*self._shown) if self._shown is not None else self._coloured()
         scene.add_glb(_SURFACE, content, cast_shadow=False, receive_shadow=False)
+
+    def _coloured(self) -> bytes:
+        """Return the surface as GLB: with its texture, or with the colours that mean something."""
+        surface, relief = self._view.surface, self._relief.value
+        if self._colouring.picture and (textured := surface.textured) is not None:
+            light = light_of(surface.facing) if relief else np.ones(len(surface.vertices))
+            return unlit_textured_glb(textured, at_split_vertices(light, surface.mesh, textured), surface.texture)
+        colours = self._colouring.colours
+        return unlit_glb(surface.vertices, surface.faces, in_relief(surface.facing, colours) if relief else colours)
 
     def _draw_path(self) -> None:
         view, scene = self._view, self._view.window.scene

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from typing import Any
 
 import numpy as np
+import trimesh
 
-from scopemap.engine.geometry.srgb import LINEAR
+from scopemap.engine.fusion.open_glb import (
+    WRITTEN_COLOURS,
+    WRITTEN_UV,
+    OpenGlb,
+    texture_bytes,
+    texture_picture,
+    with_gltf_names,
+)
+from scopemap.engine.geometry.srgb import LINEAR, srgb_picture
 
-# glTF 2.0, sections 3.6.2.2, 3.7.2.1 and 4.4.3
-_FLOAT = 5126
-_UINT32 = 5125
-_VERTICES = 34962
-_INDICES = 34963
-_JSON = 0x4E4F534A
-_BIN = 0x004E4942
 # The tone mapping of viser's page, three.js' ACESFilmicToneMapping: exposure, matrices, and the curve between them.
 _EXPOSURE = 0.6
 _ACES_IN = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
@@ -25,6 +25,12 @@ _ABOVE = (0.0245786, -0.000090537)
 _BELOW = (0.983729, 0.4329510, 0.238081)
 _BRIGHTEST = 0.97
 """Of the curve, which reaches 1 far out: white is shown by 1 % darker, so that colours between vertices stay right."""
+_LARGEST_IN_TEXTURE = 2.0
+"""Before the tone mapping, of a texture with 8 bits: level 240 of 255. With more, dark tissue would have few steps."""
+_ROWS = 128
+"""Of a texture at once: in floating point all of it would take gigabytes."""
+_MEDIUM = 140
+"""Level of a grey that shading darkens exactly; other colours nearly so: the tone mapping is no straight line."""
 
 
 def unlit_glb(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> bytes:
@@ -33,36 +39,48 @@ def unlit_glb(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> b
     Its material has no light (KHR_materials_unlit). Its colours are those that viser's tone mapping turns into the
     given ones.
     """
-    positions = np.ascontiguousarray(vertices, "<f4")
-    rgb = np.ascontiguousarray(before_tone_mapping(LINEAR[colours]), "<f4")
-    parts: list[tuple[np.ndarray, int, dict[str, Any]]] = [
-        (positions, _VERTICES, {"componentType": _FLOAT, "type": "VEC3"} | _limits(positions)),
-        (rgb, _VERTICES, {"componentType": _FLOAT, "type": "VEC3"}),
-        (np.ascontiguousarray(faces, "<u4").ravel(), _INDICES, {"componentType": _UINT32, "type": "SCALAR"}),
-    ]
-    views, accessors, binary = [], [], b""
-    for number, (values, target, about) in enumerate(parts):
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes, "target": target})
-        accessors.append({"bufferView": number, "count": len(values)} | about)
-        binary += values.tobytes()
-    material = {"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}
-    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}
-    tree = {
-        "asset": {"version": "2.0"},
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [material],
-        "buffers": [{"byteLength": len(binary)}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    text = json.dumps(tree).encode()
-    chunks = ((text + b" " * (-len(text) % 4), _JSON), (binary + b"\0" * (-len(binary) % 4), _BIN))
-    body = b"".join(struct.pack("<II", len(content), kind) + content for content, kind in chunks)
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+    return _glb(vertices, faces, {WRITTEN_COLOURS: before_tone_mapping(LINEAR[colours]).astype(np.float32)})
+
+
+def unlit_textured_glb(textured: trimesh.Trimesh, light: np.ndarray, jpeg: bytes) -> bytes:
+    """Return a surface with a texture as GLB, as `unlit_glb` does.
+
+    light : (V,), 0..1, by which the sRGB levels at each vertex are darkened. jpeg : its `texture_before_tone_mapping`.
+    """
+    visual: Any = textured.visual
+    medium = before_tone_mapping(np.full((1, 3), LINEAR[_MEDIUM]))
+    lit = before_tone_mapping(np.repeat(LINEAR[np.round(_MEDIUM * light).astype(int)][:, None], 3, axis=1))
+    attributes: dict[str, Any] = {WRITTEN_COLOURS: (_LARGEST_IN_TEXTURE * lit / medium).astype(np.float32)}
+    # glTF counts from the upper left.
+    attributes[WRITTEN_UV] = (visual.uv * [1, -1] + [0, 1]).astype(np.float32)
+    return _glb(textured.vertices, textured.faces, attributes, jpeg)
+
+
+def texture_before_tone_mapping(textured: trimesh.Trimesh) -> bytes:
+    """Return the texture of a surface as JPEG: what the tone mapping turns into it, over `_LARGEST_IN_TEXTURE`."""
+    picture, parts = texture_picture(textured), list[np.ndarray]()
+    for first in range(0, len(picture), _ROWS):
+        part = picture[first : first + _ROWS]
+        shares = before_tone_mapping(LINEAR[part.reshape(-1, 3)]) / _LARGEST_IN_TEXTURE
+        parts.append(srgb_picture(np.clip(shares, 0, 1)).reshape(part.shape))
+    return texture_bytes(np.concatenate(parts))
+
+
+def _glb(vertices: np.ndarray, faces: np.ndarray, attributes: dict[str, Any], jpeg: bytes = b"") -> bytes:
+    def finish(tree: dict[str, Any]) -> None:
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+        tree["materials"] = [{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}]
+        for primitive in tree["meshes"][0]["primitives"]:
+            with_gltf_names(primitive)
+            primitive["material"] = 0
+
+    mesh = trimesh.Trimesh(vertices, faces, vertex_attributes=attributes, process=False)
+    content = trimesh.exchange.gltf.export_glb(mesh.scene(), include_normals=False, tree_postprocessor=finish)
+    if not jpeg:
+        return bytes(content)
+    glb = OpenGlb(content)
+    glb.add_texture(jpeg)
+    return glb.content
 
 
 def before_tone_mapping(linear: np.ndarray) -> np.ndarray:
@@ -73,7 +91,3 @@ def before_tone_mapping(linear: np.ndarray) -> np.ndarray:
     none = _ABOVE[1] - _BELOW[2] * shown
     curve = (-once + np.sqrt(once**2 - 4 * square * none)) / (2 * square)
     return np.asarray(_EXPOSURE * curve @ np.linalg.inv(_ACES_IN).T)
-
-
-def _limits(positions: np.ndarray) -> dict[str, list[float]]:
-    return {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}

@@ -79,7 +79,7 @@ def run(
     colours: Annotated[
         Literal["texture", "albedo", "raw"] | None,
         options.advanced(
-            help="Mesh colours: without the light's fall-off (albedo, default), or from the video (texture, raw)."
+            help="Colours: pieces of the frames in mesh.glb (texture, default), or one per vertex (albedo, raw)."
         ),
     ] = None,
     mesh_faces: Annotated[

@@ -24,7 +24,7 @@ from scopemap.report.films import write_film
 from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet, rgb_of
-from scopemap.report.shown_mesh import simplified
+from scopemap.report.shown_mesh import simplified, textured_surface
 from scopemap.result.result import Result
 from scopemap.runner.reread_frames import reread_frames
 
@@ -96,7 +96,8 @@ def _pictures(run: Result, source: Path | None, painting: Painting | None) -> It
     for frame in reread_frames(run.folder, set(indices), source):
         pose, segment = smooth[frame.index], run.segment_at(frame.index)
         if segment not in meshes:
-            meshes[segment] = simplified(run.surface(segment), MOST_FACES)
+            shown = simplified(run.surface(segment), MOST_FACES)
+            meshes[segment] = textured_surface(run, segment, shown) or shown
         surface, known_mm = _surface(run, meshes[segment], frame, pose)
         if painted is not None:
             colours = render_mesh(painted, frame.camera, pose)

@@ -100,14 +100,15 @@ class FusionSettings(StageSettings):
     )
     every: int = Field(0, ge=0, description="fuse every n-th tracked frame; 0: those that show tissue anew")
     colours: Literal["texture", "albedo", "raw"] = Field(
-        "albedo",
+        "texture",
         description="albedo: without the lamp's fall-off, in one exposure for all frames; texture: as albedo, and "
         "mesh.glb shows pieces of the video's frames; raw: of the video",
     )
     holes: Literal["small", "none", "watertight"] = Field(
         "small",
         description="holes of the mesh that are closed, with confidence 0; small: those within the surface with a "
-        "border of up to 20 voxels' edges, not what no frame saw; watertight: all, what no frame saw in grey",
+        "border of up to 20 voxels' edges, not what no frame saw, and ragged borders are trimmed; none: the mesh as it "
+        "was fused; watertight: all, what no frame saw in grey",
     )
     mesh_smooth: int = Field(0, ge=0, description="iterations of Taubin's filter on the mesh; 0: none")
     mesh_faces: int | None = Field(None, ge=4, description="simplify the mesh to about so many faces; default: not")

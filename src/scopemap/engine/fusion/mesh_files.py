@@ -3,37 +3,28 @@
 from __future__ import annotations
 
 import io
-import json
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import trimesh
 
 from scopemap.engine.errors import reporting
+from scopemap.engine.fusion.open_glb import (
+    WRITTEN_COLOURS,
+    WRITTEN_UV,
+    OpenGlb,
+    texture_bytes,
+    texture_picture,
+    with_gltf_names,
+)
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.srgb import LINEAR
 
 # glTF is y-up and looks along -z, in metres; the world is y-down and looks along +z, in mm.
 T_GLTF_WORLD = np.diag([1e-3, -1e-3, -1e-3, 1.0])
-# trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
 _PLY_AXES = "unit: mm; axes: OpenCV (x right, y down, z forward)"
-_WRITTEN_COLOURS, _WRITTEN_UV = "_COLOR_0", "_TEXCOORD_0"
-_FLOAT = 5126  # glTF 2.0, sections 3.6.2.2 and 4.4.3
-_JSON = 0x4E4F534A  # glTF 2.0, section 4.4.3: "JSON"
-_BIN = 0x004E4942  # glTF 2.0, section 4.4.3: "BIN"
-_LINEAR = 9729  # glTF 2.0, section 5.26
-_LINEAR_MIPMAPS = 9987  # the same
-_CLAMPED = 33071  # the same
-# Vessels are red on red: at full resolution of the colours. The quality by hand, that of the frame store less what it
-# needs to be opened again.
-_TEXTURE_QUALITY = [
-    *(cv2.IMWRITE_JPEG_QUALITY, 92),
-    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
-]
 
 
 def save_mesh(
@@ -90,7 +81,7 @@ def read_textured(file: Path) -> trimesh.Trimesh | None:
         return None
     with reporting(f"cannot read {file}"):
         content = file.read_bytes()
-        if not _OpenGlb(content).tree.get("images"):
+        if not OpenGlb(content).tree.get("images"):
             return None
         mesh: Any = trimesh.load(io.BytesIO(content), file_type="glb", force="mesh", process=False)
         material = trimesh.visual.material.SimpleMaterial(image=mesh.visual.material.baseColorTexture)
@@ -105,9 +96,7 @@ def read_textured(file: Path) -> trimesh.Trimesh | None:
 
 def texture_jpeg(textured: trimesh.Trimesh) -> bytes:
     """Return the texture of a surface as JPEG."""
-    visual: Any = textured.visual
-    picture = np.asarray(visual.material.image)[..., :3]
-    return cv2.imencode(".jpg", picture[..., ::-1], _TEXTURE_QUALITY)[1].tobytes()
+    return texture_bytes(texture_picture(textured))
 
 
 def save_meshes_in_time(
@@ -120,7 +109,7 @@ def save_meshes_in_time(
     shown = [(mesh, start) for mesh, start in zip(meshes, starts_s, strict=True) if len(mesh.faces)]
     if not shown:
         return
-    glb = _OpenGlb(_glb([mesh for mesh, _ in shown], comment))
+    glb = OpenGlb(_glb([mesh for mesh, _ in shown], comment))
     times_s = np.array([start for _, start in shown]) - shown[0][1]
     samplers, channels = [], []
     for number, node in enumerate(glb.mesh_nodes):
@@ -129,52 +118,6 @@ def save_meshes_in_time(
         channels.append({"sampler": number, "target": {"node": node, "path": "scale"}})
     glb.tree["animations"] = [{"name": "segments", "samplers": samplers, "channels": channels}]
     glb_file.write_bytes(glb.content)
-
-
-class _OpenGlb:
-    """A GLB whose JSON can be changed, and to which arrays can be added."""
-
-    def __init__(self, glb: bytes) -> None:
-        (length,) = struct.unpack_from("<I", glb, 12)
-        self.tree, self._binary = json.loads(glb[20 : 20 + length]), bytearray(glb[28 + length :])
-        self._binary.extend(b"\0" * (-len(self._binary) % 4))
-
-    @property
-    def mesh_nodes(self) -> list[int]:
-        """The nodes with a mesh, by the numbers of their meshes."""
-        nodes = [(node["mesh"], number) for number, node in enumerate(self.tree["nodes"]) if "mesh" in node]
-        return [number for _, number in sorted(nodes)]
-
-    def view(self, content: bytes) -> int:
-        """Add bytes, and return the number of their buffer view."""
-        self._binary.extend(b"\0" * (-len(self._binary) % 4))
-        view = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": len(content)}
-        self.tree["bufferViews"].append(view)
-        self._binary.extend(content)
-        return len(self.tree["bufferViews"]) - 1
-
-    def accessor(self, values: np.ndarray, kind: str) -> int:
-        """Add values and return their number."""
-        content = np.ascontiguousarray(values, "<f4")
-        rows = content.reshape(len(content), -1)
-        limits = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
-        about = {"bufferView": self.view(content.tobytes()), "componentType": _FLOAT, "count": len(content)}
-        self.tree["accessors"].append(about | {"type": kind} | limits)
-        return len(self.tree["accessors"]) - 1
-
-    def sampler(self, times_s: np.ndarray, values: np.ndarray, kind: str) -> dict[str, Any]:
-        """Add the values (F, ...) of an animation at times (F,), s."""
-        return {"input": self.accessor(times_s, "SCALAR"), "output": self.accessor(values, kind)}
-
-    @property
-    def content(self) -> bytes:
-        """The file."""
-        self.tree["buffers"][0]["byteLength"] = len(self._binary)
-        text = json.dumps(self.tree).encode()
-        self._binary.extend(b"\0" * (-len(self._binary) % 4))
-        chunks = ((text + b" " * (-len(text) % 4), _JSON), (bytes(self._binary), _BIN))
-        body = b"".join(struct.pack("<II", len(part), kind) + part for part, kind in chunks)
-        return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
 def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
@@ -188,13 +131,8 @@ def ply_bytes(mesh: trimesh.Trimesh, comments: list[str]) -> bytes:
 
 def _textured_glb(textured: trimesh.Trimesh, comment: str) -> bytes:
     """Return a surface with a texture as GLB; the texture is the colour, so it is shown as it is where a viewer can."""
-    glb = _OpenGlb(_glb([textured], comment))
-    view = glb.view(texture_jpeg(textured))
-    glb.tree["images"] = [{"bufferView": view, "mimeType": "image/jpeg"}]
-    filters = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMPED, "wrapT": _CLAMPED}
-    glb.tree["samplers"] = [filters]
-    glb.tree["textures"] = [{"source": 0, "sampler": 0}]
-    glb.tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    glb = OpenGlb(_glb([textured], comment))
+    glb.add_texture(texture_jpeg(textured))
     return glb.content
 
 
@@ -218,9 +156,7 @@ def _glb(meshes: Sequence[trimesh.Trimesh], comment: str) -> bytes:
         tree["asset"]["extras"] = {"unit": "m", "axes": "y up", "comment": comment}
         for primitive in (primitive for part in tree["meshes"] for primitive in part["primitives"]):
             primitive["material"] = 0
-            attributes = primitive["attributes"]
-            for name in {_WRITTEN_COLOURS, _WRITTEN_UV} & set(attributes):
-                attributes[name[1:]] = attributes.pop(name)
+            attributes = with_gltf_names(primitive)
             if "COLOR_0" in attributes:
                 tree["accessors"][attributes["COLOR_0"]]["normalized"] = True
 
@@ -231,8 +167,8 @@ def _written_visual(mesh: trimesh.Trimesh) -> dict[str, Any]:
     """Return the colours of a mesh's vertices, or where they are in its texture, as trimesh writes attributes."""
     if isinstance(mesh.visual, trimesh.visual.TextureVisuals):
         # glTF counts from the upper left.
-        return {_WRITTEN_UV: (mesh.visual.uv * [1, -1] + [0, 1]).astype(np.float32)}
-    return {_WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])}
+        return {WRITTEN_UV: (mesh.visual.uv * [1, -1] + [0, 1]).astype(np.float32)}
+    return {WRITTEN_COLOURS: _linear_16_bit(vertex_colours(mesh)[:, :3])}
 
 
 def _linear_16_bit(srgb: np.ndarray) -> np.ndarray:

@@ -47,7 +47,7 @@ function listenToScene(scene) {
 
 function start() {
   try {
-    view = new SurfaceView(element("scene"), ramp);
+    view = new SurfaceView(element("scene"), ramp, () => setRow(row));
   } catch (fault) {
     element("no-gl").hidden = false;
   }

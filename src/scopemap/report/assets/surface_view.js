@@ -1,20 +1,21 @@
 // The meshes of a run in WebGL 2: on the screen with path and camera, and into pictures for the panels.
 
 const MESH_VERTEX = `#version 300 es
-in vec3 position; in vec3 normal; in vec3 colour; in vec3 scalars;
+in vec3 position; in vec3 normal; in vec3 colour; in vec3 scalars; in vec2 place;
 uniform vec3 low, spread; uniform mat4 view, lens;
-out vec3 vEye, vNormal, vColour; out vec3 vScalars;
+out vec3 vEye, vNormal, vColour; out vec3 vScalars; out vec2 vPlace;
 void main() {
   vec4 eye = view * vec4(low + position * spread, 1.0);
-  vEye = eye.xyz; vNormal = mat3(view) * normal; vColour = colour; vScalars = scalars;
+  vEye = eye.xyz; vNormal = mat3(view) * normal; vColour = colour; vScalars = scalars; vPlace = place;
   gl_Position = lens * eye;
 }`;
 
 // purpose 0: for the screen; 1: as the lamp at the lens shows it; 2: log depth in 16 bits.
 const MESH_FRAGMENT = `#version 300 es
 precision highp float;
-in vec3 vEye, vNormal, vColour; in vec3 vScalars;
-uniform int purpose, paint; uniform bool cut, lamp; uniform float gain; uniform vec2 depthRange; uniform sampler2D ramp;
+in vec3 vEye, vNormal, vColour; in vec3 vScalars; in vec2 vPlace;
+uniform int purpose, paint; uniform bool cut, lamp, textured; uniform float gain; uniform vec2 depthRange;
+uniform sampler2D ramp, tissue;
 out vec4 result;
 void main() {
   vec3 ray = normalize(-vEye);
@@ -26,7 +27,8 @@ void main() {
     return;
   }
   float facing = abs(dot(normalize(vNormal), ray));
-  vec3 base = purpose == 0 ? min(gain * vColour, 1.0) : vColour;
+  vec3 base = textured ? texture(tissue, vPlace).rgb : vColour;
+  if (purpose == 0) base = min(gain * base, 1.0);
   if (paint == 1) base = texture(ramp, vec2(sqrt(vScalars.y), 0.5)).rgb;
   if (paint == 2) base = texture(ramp, vec2(vScalars.x, 0.5)).rgb;
   if (paint == 4) base = texture(ramp, vec2(vScalars.z, 0.5)).rgb;
@@ -72,12 +74,19 @@ precision highp float;
 in vec2 vPlace; uniform sampler2D picture; out vec4 result;
 void main() { result = vec4(texture(picture, vPlace).rgb, 0.92); }`;
 
+// The rows of an array, each of so many values, that are asked for.
+function rowsOf(values, count, rows) {
+  const found = new values.constructor(count * rows.length);
+  for (let i = 0; i < rows.length; i++) for (let k = 0; k < count; k++) found[count * i + k] = values[count * rows[i] + k];
+  return found;
+}
+
 class SurfaceView {
-  // canvas: on the page. runs' meshes are given by `show`. ramp: 768 bytes, the colours of 256 levels.
-  constructor(canvas, ramp) {
+  // canvas: on the page. ramp: 768 bytes, the colours of 256 levels. changed: called when a mesh looks different.
+  constructor(canvas, ramp, changed) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
     if (!gl) throw new Error("WebGL 2 is missing");
-    Object.assign(this, { canvas, gl, uploaded: new Map(), lines: [], picture: null, paint: 0, cut: true, background: [1, 1, 1] });
+    Object.assign(this, { canvas, gl, changed, uploaded: new Map(), lines: [], picture: null, paint: 0, cut: true, background: [1, 1, 1] });
     this.programs = {
       mesh: this.#program(MESH_VERTEX, MESH_FRAGMENT),
       line: this.#program(LINE_VERTEX, LINE_FRAGMENT),
@@ -125,29 +134,46 @@ class SurfaceView {
 
   #uploadedMesh(mesh) {
     if (this.uploaded.has(mesh)) return this.uploaded.get(mesh);
-    const gl = this.gl, vao = gl.createVertexArray(), at = this.programs.mesh.attributes;
+    const gl = this.gl, vao = gl.createVertexArray(), at = this.programs.mesh.attributes, faces = bytesOf(mesh.faces);
+    // Where a vertex is in the texture depends on the face.
+    const corners = mesh.texture ? new Uint32Array(faces) : null;
     const scalars = new Uint8Array(3 * mesh.vertices);
     new Uint8Array(bytesOf(mesh.confidence)).forEach((value, i) => (scalars[3 * i] = value));
     new Uint8Array(bytesOf(mesh.seen)).forEach((value, i) => (scalars[3 * i + 1] = value));
     new Uint8Array(bytesOf(mesh.moving)).forEach((value, i) => (scalars[3 * i + 2] = value));
     gl.bindVertexArray(vao);
     const arrays = [
-      ["position", bytesOf(mesh.positions), 3, gl.UNSIGNED_SHORT], ["normal", bytesOf(mesh.normals), 3, gl.BYTE],
-      ["colour", bytesOf(mesh.colours), 3, gl.UNSIGNED_BYTE], ["scalars", scalars, 3, gl.UNSIGNED_BYTE],
-    ];
+      ["position", new Uint16Array(bytesOf(mesh.positions)), 3, gl.UNSIGNED_SHORT], ["normal", new Int8Array(bytesOf(mesh.normals)), 3, gl.BYTE],
+      ["colour", new Uint8Array(bytesOf(mesh.colours)), 3, gl.UNSIGNED_BYTE], ["scalars", scalars, 3, gl.UNSIGNED_BYTE],
+    ].map(([name, values, count, kind]) => [name, corners ? rowsOf(values, count, corners) : values, count, kind]);
+    if (corners) arrays.push(["place", bytesOf(mesh.texture.places), 2, gl.UNSIGNED_SHORT]);
     for (const [name, values, count, kind] of arrays) {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
       gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
       gl.enableVertexAttribArray(at[name]);
       gl.vertexAttribPointer(at[name], count, kind, true, 0, 0);
     }
-    const faces = bytesOf(mesh.faces);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
+    if (!corners) {
+      gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+      gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
+    }
     gl.bindVertexArray(null);
-    const ready = { vao, count: faces.byteLength / 4, gain: this.#gainOf(new Uint8Array(bytesOf(mesh.colours))) };
+    const ready = { vao, count: faces.byteLength / 4, gain: this.#gainOf(new Uint8Array(bytesOf(mesh.colours))), texture: null, indexed: !corners };
+    if (corners) this.#decodeTexture(mesh, ready);
     this.uploaded.set(mesh, ready);
     return ready;
+  }
+
+  // Until its picture is decoded a surface has the colours of its vertices.
+  async #decodeTexture(mesh, ready) {
+    const gl = this.gl, image = Object.assign(new Image(), { src: `data:image/jpeg;base64,${mesh.texture.jpg}` });
+    await image.decode();
+    const texture = this.#texture(gl.LINEAR);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, gl.RGB, gl.UNSIGNED_BYTE, image);
+    gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    ready.texture = texture;
+    this.changed();
   }
 
   // Albedo has no light of its own: it is shown as bright as its bright parts allow, its median at most medium.
@@ -163,7 +189,7 @@ class SurfaceView {
 
   // Draw a mesh from a pose through a lens into what is bound. purpose and the rest: see the shader.
   #drawMesh(mesh, pose, lens, near, far, { purpose = 0, paint = 0, cut = false, lamp = false, gain = null, depthRange = [1, 2] } = {}) {
-    const gl = this.gl, { program, uniforms } = this.programs.mesh, ready = this.#uploadedMesh(mesh), { vao, count } = ready;
+    const gl = this.gl, { program, uniforms } = this.programs.mesh, ready = this.#uploadedMesh(mesh), { vao, count, texture } = ready;
     gl.useProgram(program);
     gl.uniform3fv(uniforms.low, mesh.low);
     gl.uniform3fv(uniforms.spread, mesh.high.map((value, k) => value - mesh.low[k]));
@@ -175,11 +201,16 @@ class SurfaceView {
     gl.uniform1i(uniforms.lamp, lamp);
     gl.uniform1f(uniforms.gain, gain ?? ready.gain);
     gl.uniform2fv(uniforms.depthRange, depthRange);
+    gl.uniform1i(uniforms.textured, texture !== null);
     gl.uniform1i(uniforms.ramp, 0);
+    gl.uniform1i(uniforms.tissue, 1);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.bindTexture(gl.TEXTURE_2D, texture ?? this.ramp);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.ramp);
     gl.bindVertexArray(vao);
-    gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
+    if (ready.indexed) gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
+    else gl.drawArrays(gl.TRIANGLES, 0, count);
     gl.bindVertexArray(null);
   }
 
