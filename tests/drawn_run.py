@@ -11,10 +11,12 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
+from PIL import Image
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import Config
 from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.engine.notices import of_input
@@ -56,6 +58,31 @@ def tube() -> trimesh.Trimesh:
     confidence = {"confidence": np.linspace(0, 1, len(vertices)).astype(np.float32)}
     faces = np.concatenate([faces, lid])
     return trimesh.Trimesh(vertices, faces, vertex_colors=colours, vertex_attributes=confidence, process=False)
+
+
+def textured_tube() -> trimesh.Trimesh:
+    """The tube with a texture: green left of the middle, blue right of it; each triangle has vertices of its own."""
+    mesh = tube()
+    left = mesh.triangles_center[:, 0] < 0
+    picture = np.full((64, 64, 3), [20, 60, 200], np.uint8)
+    picture[:, :32] = [20, 160, 40]
+    uv = np.repeat(np.where(left[:, None], [0.2, 0.7], [0.8, 0.3]), 3, axis=0)
+    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(picture))
+    corners = np.asarray(mesh.faces).ravel()
+    return trimesh.Trimesh(
+        np.asarray(mesh.vertices)[corners],
+        np.arange(len(corners)).reshape(-1, 3),
+        vertex_normals=np.asarray(mesh.vertex_normals)[corners],
+        visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
+        process=False,
+    )
+
+
+def draw_textured_run(folder: Path) -> Path:
+    """Write the run's folder, and let its surface have a texture."""
+    draw_run(folder)
+    save_mesh(tube(), glb_file=folder / "mesh.glb", textured=textured_tube())
+    return folder
 
 
 def pose_of(index: int) -> np.ndarray:

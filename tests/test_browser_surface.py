@@ -9,14 +9,16 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from drawn_run import CAMERA, IN_RESULT, draw_run, pose_of, tube
+from drawn_run import CAMERA, IN_RESULT, draw_run, draw_textured_run, pose_of, tube
 
 from scopemap.apps.browser.seen_by import frames_that_saw
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
 from scopemap.apps.browser.surface_colours import colourings, depth_differences, in_relief
-from scopemap.apps.browser.unlit_mesh import before_tone_mapping, unlit_glb
+from scopemap.apps.browser.unlit_mesh import before_tone_mapping, unlit_glb, unlit_textured_glb
+from scopemap.engine.fusion.open_glb import OpenGlb
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.srgb import LINEAR, srgb_picture
+from scopemap.report.shown_mesh import at_split_vertices
 from scopemap.result.result import Result
 
 FRAME = 4
@@ -61,6 +63,32 @@ def test_a_mesh_without_light_is_the_mesh() -> None:
     assert (read.faces == mesh.faces).all()
     assert b"KHR_materials_unlit" in content
     assert len(content) < 30 * len(mesh.vertices) + 12 * len(mesh.faces) + 2000
+
+
+def test_a_texture_is_shown_as_it_is_and_darker_in_relief(tmp_path: Path) -> None:
+    surface = ShownSurface(Result(draw_textured_run(tmp_path)))
+    assert surface.textured is not None
+    light = at_split_vertices(np.where(surface.vertices[:, 2] < 40, 1.0, 0.6), surface.mesh, surface.textured)
+    content = unlit_textured_glb(surface.textured, light, surface.texture)
+    scene = trimesh.load(io.BytesIO(content), file_type="glb", process=False)
+    (read,) = scene.geometry.values()
+    np.testing.assert_allclose(read.vertices, surface.mesh.vertices[surface.faces].reshape(-1, 3), atol=1e-5)
+    # What the page makes of it: the linear texture times the colours of the vertices, tone mapped.
+    picture = np.asarray(read.visual.material.baseColorTexture)[..., :3]
+    factor = OpenGlb(content)
+    accessor = factor.tree["accessors"][factor.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    assert accessor["max"] == pytest.approx([2.0] * 3, rel=1e-3)
+    shown = srgb_picture(tone_mapped(2.0 * LINEAR[picture[32, [5, 60]]])).astype(int)
+    assert np.abs(shown - [[20, 160, 40], [20, 60, 200]]).max() <= 8
+    low = LINEAR[picture[32, [5, 60]]] * accessor["min"]
+    darker = srgb_picture(tone_mapped(low)).astype(int)
+    assert np.abs(darker - 0.6 * shown).max() <= 25
+
+
+def test_a_surface_of_fewer_triangles_has_no_texture(tmp_path: Path) -> None:
+    run = Result(draw_textured_run(tmp_path))
+    assert ShownSurface(run, most_faces=500).textured is None
+    assert ShownSurface(run.others[0]).textured is None
 
 
 def test_colours_mean_what_they_say(folder: Path) -> None:

@@ -49,8 +49,8 @@ def _path(folder: Path) -> set[str]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)  # type: ignore[arg-type]
-    # A checkpoint is written where the run takes more than ten seconds, which these need not. The texture is made of few
-    # frames, not of each one; ARCHITECTURE.md has its files below the table.
+    # A checkpoint is written where the run takes more than ten seconds, which these need not. The texture is made of
+    # few frames, not of each one; ARCHITECTURE.md has its files below the table.
     texture = {"runner/texturing.py"} | {f"engine/fusion/texture_{part}.py" for part in ("views", "alignment")}
     assert texture <= files
     return (files - texture - {"result/checkpoint.py", "engine/kept.py"}) | {"apps/run/command.py", "runner/run.py"}

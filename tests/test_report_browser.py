@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, pose_of
+from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, draw_textured_run, pose_of
 from front_door import call
 
 from scopemap.apps.measure.measure import measure
@@ -113,6 +113,17 @@ def test_it_opens_silently_and_draws_the_mesh(
     assert opened.page.evaluate("document.documentElement.scrollWidth") == size[0]
     assert opened.complaints == []
     assert [url for url in opened.requests if not url.startswith("data:")] == [report.resolve().as_uri()]
+
+
+def test_the_surface_has_its_texture(browser: Any, tmp_path: Path) -> None:
+    opened = Opened(browser, write_report(draw_textured_run(tmp_path))[0])
+    opened.slide(6)
+    opened.page.locator("#mask").uncheck()
+    seen = opened.picture("#rendered")[10:-10]
+    left, right = seen[:, 20 : seen.shape[1] // 3], seen[:, -seen.shape[1] // 3 : -20]
+    assert np.median(left[..., 1] - left[..., 2]) > 30
+    assert np.median(right[..., 2] - right[..., 1]) > 30
+    assert opened.complaints == []
 
 
 def test_the_verdict_is_seen_without_scrolling(browser: Any, report: Path) -> None:
