@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -88,6 +89,17 @@ def test_the_same_view_is_not_touched_or_only_resized() -> None:
     assert half.only_resizes
     assert np.abs(half.image(image) - blocks).max() <= 1
     assert not Rectifier(PINHOLE, working_camera(PINHOLE, (320, 240), zoom=0.9)).only_resizes
+
+
+def test_a_larger_view_is_that_of_a_new_rectifier(source: CameraModel) -> None:
+    small = Rectifier(source, working_camera(source, (160, 120)))
+    larger, anew = small.enlarged(640, 480), Rectifier(source, small.target.resized(640, 480))
+    picture = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    picture = cv2.GaussianBlur(picture, (0, 0), 2)
+    known = larger.valid & anew.valid
+    inside = cv2.erode(known.astype(np.uint8), np.ones((13, 13)), borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    assert inside.mean() > 0.5
+    assert np.abs(larger.image(picture).astype(int) - anew.image(picture))[inside].max() <= 2
 
 
 def test_fine_texture_does_not_alias() -> None:
