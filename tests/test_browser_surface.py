@@ -18,7 +18,8 @@ from scopemap.apps.browser.unlit_mesh import before_tone_mapping, unlit_glb, unl
 from scopemap.engine.fusion.open_glb import OpenGlb
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.srgb import LINEAR, srgb_picture
-from scopemap.report.shown_mesh import at_split_vertices
+from scopemap.report.pale_parts import PALE, faded
+from scopemap.report.shown_mesh import at_split_vertices, in_texture
 from scopemap.result.result import Result
 
 FRAME = 4
@@ -69,7 +70,7 @@ def test_a_texture_is_shown_as_it_is_and_darker_in_relief(tmp_path: Path) -> Non
     surface = ShownSurface(Result(draw_textured_run(tmp_path)))
     assert surface.textured is not None
     light = at_split_vertices(np.where(surface.vertices[:, 2] < 40, 1.0, 0.6), surface.mesh, surface.textured)
-    content = unlit_textured_glb(surface.textured, light, surface.texture)
+    content = unlit_textured_glb(surface.textured, light, surface.texture(pale=False))
     scene = trimesh.load(io.BytesIO(content), file_type="glb", process=False)
     (read,) = scene.geometry.values()
     np.testing.assert_allclose(read.vertices, surface.mesh.vertices[surface.faces].reshape(-1, 3), atol=1e-5)
@@ -85,6 +86,27 @@ def test_a_texture_is_shown_as_it_is_and_darker_in_relief(tmp_path: Path) -> Non
     assert np.abs(darker - 0.6 * shown).max() <= 25
 
 
+def test_what_few_frames_saw_is_pale_in_colours_and_in_the_texture(tmp_path: Path) -> None:
+    surface = ShownSurface(Result(draw_textured_run(tmp_path)))
+    assert surface.textured is not None
+    # The tube's confidence grows from 0 to 1.
+    assert surface.sure[0] == 0
+    assert (surface.sure[len(surface.sure) * 2 // 3 :] == 1).all()
+    found = colourings(surface)["picture, pale where unsure"]()
+    assert "Pale" in found.words
+    pale = faded(found.colours, surface.sure)
+    assert np.abs(pale[0].astype(int) - PALE).max() < np.abs(found.colours[0].astype(int) - PALE).max() / 3
+    assert (pale[-1] == found.colours[-1]).all()
+    shares = in_texture(np.full(len(surface.textured.vertices), 0.4), surface.textured)
+    height, width = 64, 64
+    assert shares.shape == (height, width)
+    # The triangles on the left have their corners at 0.2 of the texture's width and 0.7 of its height.
+    assert shares[round(0.3 * height - 0.5), round(0.2 * width - 0.5)] == pytest.approx(0.4, abs=0.02)
+    assert shares[-1, width // 2] == 1
+    whole, less = (cv2.imdecode(np.frombuffer(surface.texture(pale=pale), np.uint8), 1) for pale in (False, True))
+    assert whole.shape == less.shape == (height, width, 3)
+
+
 def test_a_surface_of_fewer_triangles_has_no_texture(tmp_path: Path) -> None:
     run = Result(draw_textured_run(tmp_path))
     assert ShownSurface(run, most_faces=500).textured is None
@@ -94,7 +116,7 @@ def test_a_surface_of_fewer_triangles_has_no_texture(tmp_path: Path) -> None:
 def test_colours_mean_what_they_say(folder: Path) -> None:
     surface = ShownSurface(Result(folder))
     found = colourings(surface)
-    assert list(found) == ["picture", "confidence", "times seen", "depth deviation"]
+    assert list(found) == ["picture, pale where unsure", "picture", "confidence", "times seen", "depth deviation"]
     assert (found["picture"]().colours == np.asarray(tube().visual.vertex_colors)[:, :3]).all()
     viridis = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[:, 0, ::-1]
     assert (found["confidence"]().colours[[0, -1]] == viridis[[0, 255]]).all()
@@ -117,7 +139,7 @@ def test_what_is_not_known_is_not_offered(tmp_path: Path) -> None:
         file.unlink()
     mesh = tube()
     run.mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.visual.vertex_colors, process=False)
-    assert list(colourings(ShownSurface(run))) == ["picture"]
+    assert list(colourings(ShownSurface(run))) == ["picture, pale where unsure", "picture"]
     run.mesh = trimesh.Trimesh()
     assert list(colourings(ShownSurface(run))) == ["picture"]
 

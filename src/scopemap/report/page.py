@@ -17,6 +17,7 @@ from scopemap.engine.errors import reporting
 from scopemap.report.frame_pictures import FOLDER as PICTURES
 from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.page_data import MEASUREMENTS, checked_measurements, page_data, shown_meshes
+from scopemap.report.pale_parts import LEAST_COLOUR, PALE, SURE_CONFIDENCE, WORDS
 from scopemap.report.shown_mesh import base64_of
 from scopemap.report.summary_picture import summary_picture
 from scopemap.result.checksums import SUMS, write_checksums
@@ -87,7 +88,8 @@ def page_html(runs: list[dict[str, Any]]) -> str:
     levels = np.arange(256, dtype=np.uint8)[:, None]
     maps = {"turbo": cv2.COLORMAP_TURBO, "ramp": cv2.COLORMAP_VIRIDIS}
     colours = {name: base64_of(cv2.applyColorMap(levels, number)[:, 0, ::-1], "u1") for name, number in maps.items()}
-    content = without_nan({"runs": runs, "licences": _LICENCES} | colours)
+    pale = {"sure": SURE_CONFIDENCE, "level": PALE / 255, "least": LEAST_COLOUR, "words": WORDS}
+    content = without_nan({"runs": runs, "licences": _LICENCES, "pale": pale} | colours)
     names = ", ".join(run["name"] for run in runs)
     parts = {
         # A file's name may hold bytes that are no UTF-8; in the data JSON escapes them.

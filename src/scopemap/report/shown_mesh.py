@@ -6,17 +6,21 @@ from base64 import b64encode
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import trimesh
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.fusion.mesh_files import texture_jpeg
+from scopemap.engine.fusion.open_glb import texture_picture
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.result.result import Result
 
 _SAME_SURFACE = 0.1
 _CELLS_PER_FACE = 2.5  # faces of a surface that crosses a grid, times a cell's area, over its area
+_SHIFT = 4  # bits of a pixel
+_BLUR_PX = 3
 LARGEST_LEVEL = 65535
 """Of a position, in 16 bits."""
 
@@ -65,6 +69,25 @@ def at_split_vertices(values: np.ndarray, mesh: trimesh.Trimesh, textured: trime
     found = np.empty((len(textured.vertices), *values.shape[1:]), values.dtype)
     found[np.asarray(textured.faces)] = values[np.asarray(mesh.faces)]
     return found
+
+
+def in_texture(values: np.ndarray, textured: trimesh.Trimesh) -> np.ndarray:
+    """Return values (V,), 0..1, at the vertices of a surface with a texture as a picture of that, (H, W) float32.
+
+    Each triangle has one value, and 1 is where there is none. They change slowly: edges between triangles are blurred.
+    """
+    visual: Any = textured.visual
+    height, width = texture_picture(textured).shape[:2]
+    from_above = (visual.uv * [1, -1] + [0, 1]) * [width, height] - 0.5
+    places = np.round(from_above * 2**_SHIFT).astype(np.int32)[np.asarray(textured.faces)]
+    levels = np.round(1 + 254 * values[np.asarray(textured.faces)].mean(axis=1)).tolist()
+    drawn = np.zeros((height, width), np.uint8)
+    for corners, level in zip(places, levels, strict=True):
+        cv2.fillConvexPoly(drawn, corners, level, shift=_SHIFT)
+    # Linear interpolation looks at the pixel beside a chart, too.
+    beside = cv2.dilate(drawn, np.ones((3, 3), np.uint8))
+    shares = np.where(drawn > 0, drawn, np.where(beside > 0, beside, np.uint8(255))).astype(np.float32)
+    return np.asarray((cv2.blur(shares, (_BLUR_PX, _BLUR_PX)) - 1) / 254)
 
 
 def _clustered(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:

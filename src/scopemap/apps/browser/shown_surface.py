@@ -10,9 +10,11 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from scopemap.apps.browser.unlit_mesh import texture_before_tone_mapping
+from scopemap.engine.fusion.open_glb import texture_picture
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.surface_measures import meet_surface
-from scopemap.report.shown_mesh import simplified, textured_surface
+from scopemap.report.pale_parts import certainty, faded
+from scopemap.report.shown_mesh import at_split_vertices, in_texture, simplified, textured_surface
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 
@@ -37,6 +39,7 @@ class ShownSurface:
         self.run, self.segment = run, run.main_segment if segment is None else segment
         self.mesh = simplified(run.surface(self.segment), most_faces)
         self.faces = np.asarray(self.mesh.faces)
+        self._textures: dict[bool, bytes] = {}
 
     @property
     def is_empty(self) -> bool:
@@ -54,10 +57,20 @@ class ShownSurface:
         return textured_surface(self.run, self.segment, self.mesh)
 
     @cached_property
-    def texture(self) -> bytes:
-        """The texture as `unlit_textured_glb` wants it."""
-        assert self.textured is not None
-        return texture_before_tone_mapping(self.textured)
+    def sure(self) -> np.ndarray:
+        """How sure it is at its vertices, (V,), 0 to 1."""
+        return certainty(self.mesh)
+
+    def texture(self, *, pale: bool) -> bytes:
+        """Return the texture as `unlit_textured_glb` wants it; pale : what is not sure has lost its colour."""
+        if pale not in self._textures:
+            assert self.textured is not None
+            picture = texture_picture(self.textured)
+            if pale:
+                sure = at_split_vertices(self.sure, self.mesh, self.textured)
+                picture = faded(picture, in_texture(sure, self.textured))
+            self._textures[pale] = texture_before_tone_mapping(picture)
+        return self._textures[pale]
 
     @cached_property
     def facing(self) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 
 from scopemap.apps.browser.shown_surface import ShownSurface
 from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.report.pale_parts import WORDS as PALE_WORDS
 from scopemap.report.shown_mesh import SeenFrame, times_seen
 from scopemap.result.result import Result
 
@@ -18,6 +19,7 @@ _LOOKED_AT = 25
 _SAME_SURFACE = 0.1
 """Relative difference of depth up to which a frame sees a vertex, as for `times_seen`."""
 _WORST_PERCENTILE = 95
+_PICTURE, _PALE = "picture", "picture, pale where unsure"
 _UNKNOWN = (150, 150, 150)
 _AMBIENT = 0.55
 """Of the light in relief, from everywhere; the rest is that of a lamp at the camera."""
@@ -28,7 +30,8 @@ class Colouring:
     """Colours (V, 3) uint8 of a surface's vertices, what they mean in a sentence, and their scale.
 
     ramp : colours from low to high (256, 3); None: they are no scale. ticks : values below it, evenly spaced. picture :
-    whether they are those of the tissue, which the surface's texture shows better.
+    whether they are those of the tissue, which the surface's texture shows better. pale : whether what is not sure
+    loses its colour.
     """
 
     colours: np.ndarray
@@ -36,13 +39,16 @@ class Colouring:
     ramp: np.ndarray | None = None
     ticks: tuple[str, ...] = ()
     picture: bool = False
+    pale: bool = False
 
 
 def colourings(surface: ShownSurface) -> dict[str, Callable[[], Colouring]]:
     """Return what a surface can be coloured by, by name; none is computed before it is called."""
-    found = {"picture": lambda: Colouring(surface.colours, _picture_words(surface.run), picture=True)}
+    words = _picture_words(surface.run)
+    as_it_is = {_PICTURE: lambda: Colouring(surface.colours, words, picture=True)}
     if surface.is_empty:
-        return found
+        return as_it_is
+    found = {_PALE: lambda: Colouring(surface.colours, f"{words} {PALE_WORDS}", picture=True, pale=True)} | as_it_is
     if "confidence" in surface.mesh.vertex_attributes:
         found["confidence"] = lambda: _confidence(surface)
     has_depth = any(map(surface.run.depth.has, surface.run.tracked["index"].tolist()))

@@ -14,6 +14,7 @@ from scopemap.apps.browser.surface_colours import Colouring, colourings, in_reli
 from scopemap.apps.browser.unlit_mesh import unlit_glb, unlit_textured_glb
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import COLOURS
+from scopemap.report.pale_parts import faded
 from scopemap.report.shown_mesh import at_split_vertices, simplified
 from scopemap.report.video_parts import video_parts
 from scopemap.result.verdict import level_of_submap
@@ -110,10 +111,13 @@ class SurfacePart:
     def _coloured(self) -> bytes:
         """Return the surface as GLB: with its texture, or with the colours that mean something."""
         surface, relief = self._view.surface, self._relief.value
-        if self._colouring.picture and (textured := surface.textured) is not None:
-            light = light_of(surface.facing) if relief else np.ones(len(surface.vertices))
-            return unlit_textured_glb(textured, at_split_vertices(light, surface.mesh, textured), surface.texture)
-        colours = self._colouring.colours
+        found = self._colouring
+        if found.picture and (textured := surface.textured) is not None:
+            light = at_split_vertices(
+                light_of(surface.facing) if relief else np.ones(len(surface.vertices)), surface.mesh, textured
+            )
+            return unlit_textured_glb(textured, light, surface.texture(pale=found.pale))
+        colours = faded(found.colours, surface.sure) if found.pale else found.colours
         return unlit_glb(surface.vertices, surface.faces, in_relief(surface.facing, colours) if relief else colours)
 
     def _draw_path(self) -> None:

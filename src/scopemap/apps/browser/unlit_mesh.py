@@ -12,7 +12,6 @@ from scopemap.engine.fusion.open_glb import (
     WRITTEN_UV,
     OpenGlb,
     texture_bytes,
-    texture_picture,
     with_gltf_names,
 )
 from scopemap.engine.geometry.srgb import LINEAR, srgb_picture
@@ -56,9 +55,9 @@ def unlit_textured_glb(textured: trimesh.Trimesh, light: np.ndarray, jpeg: bytes
     return _glb(textured.vertices, textured.faces, attributes, jpeg)
 
 
-def texture_before_tone_mapping(textured: trimesh.Trimesh) -> bytes:
-    """Return the texture of a surface as JPEG: what the tone mapping turns into it, over `_LARGEST_IN_TEXTURE`."""
-    picture, parts = texture_picture(textured), list[np.ndarray]()
+def texture_before_tone_mapping(picture: np.ndarray) -> bytes:
+    """Return a texture (H, W, 3) uint8 as JPEG: what the tone mapping turns into it, over `_LARGEST_IN_TEXTURE`."""
+    parts = list[np.ndarray]()
     for first in range(0, len(picture), _ROWS):
         part = picture[first : first + _ROWS]
         shares = before_tone_mapping(LINEAR[part.reshape(-1, 3)]) / _LARGEST_IN_TEXTURE

@@ -61,7 +61,8 @@ class Rectifier:
         for name in ("only_resizes", "_halved"):
             found.__dict__.pop(name, None)
         found.target = self.target.resized(width, height)
-        found._x, found._y = (cv2.resize(places, size, interpolation=cv2.INTER_LINEAR) for places in (self._x, self._y))
+        both = (self._x, self._y)
+        found._x, found._y = (cv2.resize(one, size, interpolation=cv2.INTER_LINEAR).astype(np.float32) for one in both)
         found._valid = cv2.resize(self._valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         found._shrink = self.source.central.fx / found.target.fx
         return found

@@ -84,6 +84,7 @@ function drawScene() {
   view.background = colour("--scene");
   view.paint = Number(element("paint").value);
   view.cut = element("cut").checked;
+  view.pale = data.pale;
   const near = Math.max(0.004 * radius, distance - 2 * radius);
   view.draw(run.maps[shown], from, {
     near, far: distance + 3 * radius, fieldOfView: from.fieldOfView, lines: [...pathLines(), ...handLines()],
@@ -137,8 +138,9 @@ function showMap(number) {
 const rampStops = (levels) => [0, 32, 64, 96, 128, 160, 192, 224, 255].map((k) => `rgb(${levels.subarray(3 * k, 3 * k + 3).join(" ")})`);
 
 function writeLegend() {
-  const found = legendOf(run, run.maps[shown], Number(element("paint").value));
-  element("scene-legend").replaceChildren(...(found ? [colourBar(rampStops(ramp), found[0]), found[1]] : []));
+  const paint = Number(element("paint").value), found = legendOf(run, run.maps[shown], paint);
+  const words = paint === 0 ? [data.pale.words] : [];
+  element("scene-legend").replaceChildren(...(found ? [colourBar(rampStops(ramp), found[0]), found[1]] : words));
 }
 
 // What the colours of depth and of its difference are in numbers; without a scale in multiples of the nearest depth.

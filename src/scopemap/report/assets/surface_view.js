@@ -10,11 +10,13 @@ void main() {
   gl_Position = lens * eye;
 }`;
 
+// ${data.pale.sure.toFixed(4)}, PALE and LEAST_COLOUR are those of report/pale_parts.py.
+// pale: confidence from which on colours are full, level of the grey, share of colour that is left; 0: nothing is pale.
 // purpose 0: for the screen; 1: as the lamp at the lens shows it; 2: log depth in 16 bits.
 const MESH_FRAGMENT = `#version 300 es
 precision highp float;
 in vec3 vEye, vNormal, vColour; in vec3 vScalars; in vec2 vPlace;
-uniform int purpose, paint; uniform bool cut, lamp, textured; uniform float gain; uniform vec2 depthRange;
+uniform int purpose, paint; uniform bool cut, lamp, textured; uniform vec3 pale; uniform float gain; uniform vec2 depthRange;
 uniform sampler2D ramp, tissue;
 out vec4 result;
 void main() {
@@ -33,6 +35,10 @@ void main() {
   if (paint == 2) base = texture(ramp, vec2(vScalars.x, 0.5)).rgb;
   if (paint == 4) base = texture(ramp, vec2(vScalars.z, 0.5)).rgb;
   if (paint == 3) base = vec3(0.74, 0.72, 0.70);
+  if (paint == 0 && pale.x > 0.0) {
+    float sure = clamp(vScalars.x * (1.0 - vScalars.z) / pale.x, 0.0, 1.0);
+    base = mix(vec3(pale.y), base, mix(pale.z, 1.0, sure));
+  }
   if (purpose == 1) {
     float light = lamp ? pow(max(facing, 0.02) / dot(vEye, vEye), 1.0 / 2.2) : 1.0;
     result = vec4(min(gain * light * base, 1.0), 1.0);
@@ -86,7 +92,7 @@ class SurfaceView {
   constructor(canvas, ramp, changed) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
     if (!gl) throw new Error("WebGL 2 is missing");
-    Object.assign(this, { canvas, gl, changed, uploaded: new Map(), lines: [], picture: null, paint: 0, cut: true, background: [1, 1, 1] });
+    Object.assign(this, { canvas, gl, changed, uploaded: new Map(), lines: [], picture: null, paint: 0, cut: true, pale: null, background: [1, 1, 1] });
     this.programs = {
       mesh: this.#program(MESH_VERTEX, MESH_FRAGMENT),
       line: this.#program(LINE_VERTEX, LINE_FRAGMENT),
@@ -188,7 +194,7 @@ class SurfaceView {
   }
 
   // Draw a mesh from a pose through a lens into what is bound. purpose and the rest: see the shader.
-  #drawMesh(mesh, pose, lens, near, far, { purpose = 0, paint = 0, cut = false, lamp = false, gain = null, depthRange = [1, 2] } = {}) {
+  #drawMesh(mesh, pose, lens, near, far, { purpose = 0, paint = 0, cut = false, lamp = false, pale = null, gain = null, depthRange = [1, 2] } = {}) {
     const gl = this.gl, { program, uniforms } = this.programs.mesh, ready = this.#uploadedMesh(mesh), { vao, count, texture } = ready;
     gl.useProgram(program);
     gl.uniform3fv(uniforms.low, mesh.low);
@@ -199,6 +205,7 @@ class SurfaceView {
     gl.uniform1i(uniforms.paint, paint);
     gl.uniform1i(uniforms.cut, cut);
     gl.uniform1i(uniforms.lamp, lamp);
+    gl.uniform3f(uniforms.pale, pale?.sure ?? 0, pale?.level ?? 0, pale?.least ?? 1);
     gl.uniform1f(uniforms.gain, gain ?? ready.gain);
     gl.uniform2fv(uniforms.depthRange, depthRange);
     gl.uniform1i(uniforms.textured, texture !== null);
@@ -276,7 +283,7 @@ class SurfaceView {
     const lens = lensOf(width, height, fieldOfView);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     this.#clear(width, height, [...this.background, 1]);
-    this.#drawMesh(mesh, pose, lens, near, far, { paint: this.paint, cut: this.cut });
+    this.#drawMesh(mesh, pose, lens, near, far, { paint: this.paint, cut: this.cut, pale: this.pale });
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     gl.disable(gl.DEPTH_TEST);
