@@ -18,6 +18,8 @@ class ShownWindow:
 
     def __init__(self, *, anonymous: bool = False) -> None:
         self.window = BrowserWindow(0, anonymous=anonymous)
+        self.sent: dict[str, bytes] = {}
+        """What the browser got, by the names of files."""
 
     def show(self, page: Page) -> None:
         """Show a page and do what it asks for at once."""
@@ -65,7 +67,7 @@ class ShownWindow:
 
     def _tell(self, handle: Any) -> None:
         for call in handle._impl.update_cb:
-            call(SimpleNamespace(client=object(), target=handle))
+            call(SimpleNamespace(client=SimpleNamespace(send_file_download=self.sent.__setitem__), target=handle))
         self.settle()
 
     @property

@@ -12,7 +12,7 @@ import pytest
 from drawn_run import CAMERA, changed, draw_run, drawn_result
 from front_door import call
 
-from scopemap.apps.browser.next_steps import NextRun, arguments_again, next_runs, source_of
+from scopemap.apps.browser.next_steps import NextRun, arguments_again, next_runs, plain_step, source_of
 from scopemap.apps.run.command import run as run_command
 from scopemap.engine.config.config import Config
 from scopemap.input.opening import open_sequence
@@ -45,9 +45,22 @@ def test_choices_and_values() -> None:
     (scopes,) = next_runs("Run again with --scope.", result)
     assert "colonoscope" in scopes.choices
     (one,) = next_runs("Run again with --set mapping.method=local.", result)
-    assert one.label(*one.choices) == "Run again with --set mapping.method=local"
+    assert one.label(*one.choices) == "Run again with mapping.method=local"
     assert one.arguments(*one.choices) == ["--set", "mapping.method=local"]
     assert next_runs("Look at the 2 submaps in maps/.", result) == next_runs("", result) == []
+
+
+def test_a_step_in_plain_words_names_no_option() -> None:
+    steps = {wording.next_step: plain_step(wording.next_step) for wording in WORDINGS.values()}
+    for step, plain in steps.items():
+        assert "--" not in plain
+        assert step == plain if "--" not in step else plain != step
+        assert not plain or plain.endswith(".")
+    assert plain_step("Calibrate (--camera), or run again with --fov or --scope.") == "Calibrate."
+    assert plain_step("Use the segments in which it holds still, or a part with --frames A:B.") == (
+        "Use the segments in which it holds still."
+    )
+    assert plain_step("Run again with --set mapping.method=local.") == ""
 
 
 def test_a_calibrated_lens_is_not_guessed_again() -> None:

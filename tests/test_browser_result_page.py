@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from dataclasses import replace
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from drawn_run import CAMERA, FRAMES, IN_RESULT, draw_run, pose_of
+import trimesh
+from drawn_run import CAMERA, FRAMES, IN_RESULT, draw_run, pose_of, tube
 from front_door import call
 from shown_window import ShownWindow, shown_window
 
 from scopemap.apps.browser.files_part import export_place
 from scopemap.apps.browser.marks import CLICKED
+from scopemap.apps.browser.next_steps import plain_step
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.unseen_part import unseen_words
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.apps.coverage.coverage import BLIND, CAUTION, coverage
 from scopemap.engine.notices import Notice
+from scopemap.report.page import write_report
 from scopemap.report.page_data import read_measurements
 from scopemap.result.result import Result
 from scopemap.result.summary import summary_lines
@@ -52,7 +58,7 @@ def test_it_says_what_the_summary_of_the_run_says(tmp_path: Path) -> None:
         assert word.replace(". ", "\n", 1) in shown.words.replace("### ", "")
         for line in lines:
             name, _, fact = line.strip().partition("  " if line.startswith("  ") else ": ")
-            assert f"{name}: {fact.strip()}" in shown.words.replace("Caution. ", "Caution: ").replace(
+            assert f"{name}: {plain_step(fact.strip())}" in shown.words.replace("Caution. ", "Caution: ").replace(
                 "Note. ", "Note: "
             )
         # Without a workspace nothing can be started.
@@ -67,19 +73,19 @@ def test_a_caution_starts_the_run_that_mends_it(tmp_path: Path, monkeypatch: pyt
     folder = draw_run(tmp_path / "one", name=str(tmp_path / "video.mp4"), notices=NOT_ADJUSTED, camera=camera)
     with Workspace(tmp_path) as workspace, shown_window() as shown:
         shown.show(ResultPage(folder, workspace))
-        shown.choose("Dropdown", "--scope", "laparoscope")
-        shown.press("Run again with --scope")
+        shown.choose("Dropdown", "Which endoscope was it?", "laparoscope")
+        shown.press("Run again with this endoscope")
         (run,) = workspace.runs.runs
         assert run.source == tmp_path / "video.mp4"
         assert run.arguments[:2] == ("--config", str(folder / "config.toml"))
         assert run.arguments[-2:] == ("--scope", "laparoscope")
-        assert "video.mp4, run again with --scope laparoscope" in shown.words
+        assert "video.mp4, run again as seen by a laparoscope" in shown.words
         # What it ends in is the page of its own result.
         draw_run(run.out)
         run.status = "done"
         shown.until(lambda: "Colour by" in shown.labels("Dropdown"))
         shown.show(ResultPage(folder, workspace))
-        shown.press("Run again with --set mapping.method=local")
+        shown.press("Run again with mapping.method=local")
         assert workspace.runs.runs[-1].arguments[-2:] == ("--set", "mapping.method=local")
 
 
@@ -90,7 +96,7 @@ def test_an_input_that_is_another_file_now_is_said(tmp_path: Path) -> None:
     folder = draw_run(tmp_path / "one", name=str(video), notices=NOT_ADJUSTED, input_content=content)
     with Workspace(tmp_path) as workspace, shown_window() as shown:
         shown.show(ResultPage(folder, workspace))
-        shown.press("Run again with --set mapping.method=local")
+        shown.press("Run again with mapping.method=local")
         assert "is another file now" in shown.window._error.content.replace("\\", "")
         assert not workspace.runs.runs
 
@@ -274,14 +280,32 @@ def test_an_export_is_written_beside_the_result(tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
     with shown_window(anonymous=True) as shown:
         shown.show(ResultPage(folder))
-        shown.choose("Dropdown", "Format", "stl")
-        for file in ("stl.stl", "stl_2.stl"):
+        shown.choose("Dropdown", "Format", "tum")
+        for file in ("tum.txt", "tum_2.txt"):
             shown.press("Write")
             shown.until(lambda file=file: f"RESULT/exports/{file}" in shown.words)  # type: ignore[misc]
             assert (folder / "exports" / file).is_file()
-        assert "Download" in shown.labels()
         assert str(tmp_path) not in shown.words
     assert export_place(folder, "colmap") == folder / "exports" / "colmap"
+
+
+def test_report_and_surface_come_in_one_click(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    page = write_report(folder)[0].read_bytes()
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        with urlopen(f"{shown.window.url}result/report.html") as answer:
+            assert answer.read() == page
+        files = {"report": "video_report.html", "printing (STL)": "video.stl", "3D Slicer": "video.zip"}
+        for label in ("Download the report", "Surface for printing (STL)", "Surface for 3D Slicer"):
+            name = next(name for words, name in files.items() if label.endswith(words))
+            shown.press(label)
+            shown.until(lambda name=name: name in shown.sent)  # type: ignore[misc]
+        sent = shown.sent
+        assert sent["video_report.html"] == page
+        assert len(trimesh.load(io.BytesIO(sent["video.stl"]), file_type="stl").faces) == len(tube().faces)
+        with zipfile.ZipFile(io.BytesIO(sent["video.zip"])) as archive:
+            assert set(archive.namelist()) == {"slicer/surface.ply", "slicer/path.mrk.json"}
 
 
 def test_a_result_without_a_surface_can_be_looked_at(tmp_path: Path) -> None:

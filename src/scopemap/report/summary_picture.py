@@ -42,7 +42,8 @@ _LINE_LETTERS = 190
 _LABEL_PX = 26
 _COLUMNS = 4
 _LEAST_REASONS = 2
-_TONES = {"good": "#17794a", "doubtful": "#a35a00", "bad": "#b3261e"}
+NOT_A_DEVICE = "Research software, not a medical device."
+TONES = {"good": "#17794a", "doubtful": "#a35a00", "bad": "#b3261e"}
 _UNKNOWN = 32
 
 
@@ -81,9 +82,9 @@ def _head_lines(found: Verdict) -> list[str]:
 
 
 def _write_head(sheet: Sheet, found: Verdict, lines: list[str]) -> None:
-    sheet.rgb[:9] = rgb_of(_TONES[found.level])
-    sheet.text((_GAP_PX, 18), found.word.capitalize(), 38, _TONES[found.level])
-    sheet.text((_GAP_PX, 66), "research software, not a medical device", 14, SOFT)
+    sheet.rgb[:9] = rgb_of(TONES[found.level])
+    sheet.text((_GAP_PX, 18), found.word.capitalize(), 38, TONES[found.level])
+    sheet.text((_GAP_PX, 66), NOT_A_DEVICE, 14, SOFT)
     sheet.text((330, 16), found.advice, 19)
     for place, line in enumerate(lines):
         sheet.text((330, 42 + _LINE_PX * place), line, 14, SOFT)

@@ -1,53 +1,90 @@
-"""Files of a result: exports and a film, written beside it and downloaded; where the report is."""
+"""Files of a result: its report and its surface in one click, other forms and a film; all are named after the video."""
 
 from __future__ import annotations
 
+import io
+import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import escaped
 from scopemap.apps.export.formats import FORMATS, export_run
-from scopemap.report.page import PAGE
+from scopemap.report.page import PAGE, PICTURE
 
 EXPORTS = "exports"
 """Folder of a result with what the window wrote; `verify` names it as added."""
 _FILM = "film of the video beside the surface"
 _FILM_FILE = "film.mp4"
+_SURFACES = {
+    "Surface for viewing (GLB)": "glb",
+    "Surface for 3D Slicer": "slicer",
+    "Surface for printing (STL)": "stl",
+}
 _MOST_SENT = 100_000_000
+_PLACE = "/result/"
+_BESIDE = (PICTURE, "mesh.ply", "mesh.glb", "trajectory.tum", "frames.csv", "provenance.json")
+"""What the report links to."""
 
 
 class FilesPart:
-    """Controls of exports."""
+    """Controls of the report and of exports."""
 
     def __init__(self, view: ResultView) -> None:
         self._view, window, gui = view, view.window, view.window.gui
-        self._file: Path | None = None
         page = view.whole.folder / PAGE
         if page.is_file():
-            where = PAGE if window.anonymous else str(page)
-            gui.add_markdown(f"The report is one file to keep, print or send: `{where}`")
-        self._to = gui.add_dropdown("Format", [_FILM, *FORMATS])
-        window.on(gui.add_button("Write"), self._write)
+            window.files.update({_PLACE + name: view.whole.folder / name for name in (PAGE, *_BESIDE)})
+            gui.add_html(f'<a href="{_PLACE}{PAGE}" target="_blank" rel="noopener">Open the report</a>')
+            self._on_press("Download the report", partial(self._send, page))
+            gui.add_markdown("It is one file to keep, print or send.")
+        if not view.surface.is_empty:
+            for label, name in _SURFACES.items():
+                self._on_press(label, partial(self._write, name))
+        with gui.add_folder("All other forms", expand_by_default=False):
+            self._to = gui.add_dropdown("Format", [_FILM, *FORMATS])
+            self._on_press("Write", lambda client: self._write(self._to.value, client))
         self._words = gui.add_markdown("")
-        self._download = gui.add_button("Download", visible=False)
-        self._download.on_click(lambda event: window.do(self._send, event.client))
 
-    def _write(self) -> None:
-        name, run = self._to.value, self._view.run
+    def _on_press(self, label: str, call: Callable[[Any], None]) -> None:
+        """Make a button whose press calls with the browser that it came from."""
+        window = self._view.window
+        window.gui.add_button(label).on_click(lambda event: window.do(call, event.client))
+
+    def _write(self, name: str, client: Any) -> None:
+        run = self._view.run
         out = export_place(run.folder, name)
-        self._view.window.job(f"writing {out.name}", writer(run.folder, name, out), lambda found: self._say(out))
+        words = f"writing {out.name}"
+        self._view.window.job(words, writer(run.folder, name, out), lambda found: self._send(out, client))
 
-    def _say(self, out: Path) -> None:
-        where = f"RESULT/{EXPORTS}/{out.name}" if self._view.window.anonymous else str(out)
-        self._file = out if out.is_file() and out.stat().st_size <= _MOST_SENT else None
-        self._words.content = f"Written: {escaped(where)}"
-        self._download.visible = self._file is not None
+    def _send(self, file: Path, client: Any) -> None:
+        """Say where a file or folder is, and send it, a folder as ZIP, to a browser, unless it is too large."""
+        where = f"RESULT/{file.parent.name}/{file.name}" if self._view.window.anonymous else str(file)
+        parts = [file] if file.is_file() else [part for part in sorted(file.rglob("*")) if part.is_file()]
+        is_sent = client is not None and sum(part.stat().st_size for part in parts) <= _MOST_SENT
+        if is_sent:
+            content = file.read_bytes() if file.is_file() else zipped(file, parts)
+            client.send_file_download(self._name(file), content)
+        said = "Sent to your browser. It is also" if is_sent else "Too large to be sent to your browser. It is"
+        self._words.content = f"{said} here: {escaped(where)}"
 
-    def _send(self, client: Any) -> None:
-        if self._file is not None and client is not None:
-            client.send_file_download(self._file.name, self._file.read_bytes())
+    def _name(self, file: Path) -> str:
+        """Return the name of a file that is sent: that of the video, and what it is."""
+        source = Path(str(self._view.whole.provenance.get("input", "")))
+        video = Path(self._view.window.names.of(source, "video")).stem or "result"
+        ending = file.suffix if file.is_file() else ".zip"
+        return f"{video}{ending}" if file.stem.split("_")[0] in _SURFACES.values() else f"{video}_{file.stem}{ending}"
+
+
+def zipped(folder: Path, parts: list[Path]) -> bytes:
+    """Return files of a folder as ZIP, with the folder's name before theirs."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for part in parts:
+            archive.write(part, part.relative_to(folder.parent))
+    return content.getvalue()
 
 
 def export_place(folder: Path, name: str) -> Path:

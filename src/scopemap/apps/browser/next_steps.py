@@ -17,6 +17,12 @@ _SCOPES = tuple(kind for kind in InputSettings.model_fields["scope"].annotation.
 _CAMERA = {"scope", "fov"}
 """Options of a lens that is not known: without effect where a calibration is."""
 
+_QUESTIONS = {"scope": "Which endoscope was it?", "fov": "Its horizontal field of view, degrees"}
+_BUTTONS = {"scope": "Run again with this endoscope", "fov": "Run again with this field of view"}
+# A part of a sentence that names an option of the command: in brackets, after "; ", or after "or", "and", "with".
+_IN_BRACKETS = re.compile(r" \([^()]*--[^()]*\)")
+_CLAUSE = re.compile(r"(?:;|,? (?:or|and)|,? with) [^,.;]*--[^,.;]*")
+
 
 @dataclass(frozen=True)
 class NextRun:
@@ -30,9 +36,16 @@ class NextRun:
     choices: tuple[str, ...] = ()
     number: tuple[float, float, float] | None = None
 
+    @property
+    def question(self) -> str:
+        """What is asked for beside the button, "": nothing."""
+        return _QUESTIONS.get(self.option, "")
+
     def label(self, value: str = "") -> str:
-        """Return the words of the button that chooses a value, or takes the one that is set beside it."""
-        return f"Run again with --{self.option} {value}".rstrip()
+        """Return the words of the button that takes a value, or the one that is set beside it; a setting is named."""
+        if self.option == "scope" and value:
+            return f"Run again as seen by a {value}"
+        return _BUTTONS.get(self.option, f"Run again with {value}")
 
     def arguments(self, value: str) -> list[str]:
         """Return the arguments of the option with a value."""
@@ -57,6 +70,12 @@ def next_runs(step: str, run: Result) -> list[NextRun]:
         elif option == "fov":
             found.append(NextRun(option, number=(70.0, 5.0, 170.0)))
     return found
+
+
+def plain_step(step: str) -> str:
+    """Return a next step without options of the command: what the window offers as a button it does not say."""
+    others = [one for one in re.split(r"(?<=\.) ", step) if not one.startswith("Run again with --")]
+    return _CLAUSE.sub("", _IN_BRACKETS.sub("", " ".join(others)))
 
 
 def source_of(run: Result) -> Path | None:

@@ -12,6 +12,7 @@ import numpy as np
 from scopemap.apps.browser.scene import look_at, look_from
 from scopemap.apps.browser.shown_surface import ShownSurface
 from scopemap.apps.browser.window import escaped
+from scopemap.report.summary_picture import NOT_A_DEVICE, TONES
 from scopemap.result.frame_table import NOT_USED
 from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
@@ -178,7 +179,10 @@ class ResultView:
 
     def add_headline(self) -> None:
         """Make the place of the verdict in a word, and of what the result may be used for."""
-        self._head = self.window.gui.add_markdown("")
+        gui, tone = self.window.gui, TONES[verdict(self.whole).level]
+        gui.add_html(f'<div style="height:8px;margin:0 8px;border-radius:4px;background:{tone}"></div>')
+        self._head = gui.add_markdown("")
+        gui.add_markdown(f"*{NOT_A_DEVICE}*")
         self.say_sizes()
 
     def coverage(self, then: Callable[[Coverage], None]) -> None:

@@ -6,10 +6,12 @@ import contextlib
 import http
 import importlib.util
 import io
+import mimetypes
 import re
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -41,8 +43,10 @@ def check_installed() -> None:
         raise InputError(NOT_INSTALLED)
 
 
-def start_server(port: int = 0, host: str = LOOPBACK) -> Any:
+def start_server(port: int = 0, host: str = LOOPBACK, files: Mapping[str, Path] | None = None) -> Any:
     """Return viser's server at a port of this machine; 0: any free one.
+
+    files : that are served beside viser's page, by their paths, such as "/result/report.html"; it may change later.
 
     Requests that name another host than this machine (unless `host` lets others in), and those of pages of another
     origin, are refused: a page in the web must not see an operation or press its buttons. viser's tunnel is closed.
@@ -55,7 +59,10 @@ def start_server(port: int = 0, host: str = LOOPBACK) -> Any:
 
     _refuse_taken(host, port)
     # It prints a banner.
-    with _guarded(only_own=host in _OWN_NAMES), contextlib.redirect_stdout(io.StringIO()):
+    with (
+        _guarded(only_own=host in _OWN_NAMES, files={} if files is None else files),
+        contextlib.redirect_stdout(io.StringIO()),
+    ):
         server = viser.ViserServer(host, port, verbose=False)
     # viser keeps all of a file that is sent in memory, however large: `uploads.py` takes files instead.
     for refused in (_messages.ShareUrlRequest, _messages.FileTransferStartUpload, _messages.FileTransferPart):
@@ -86,15 +93,16 @@ def _refuse_taken(host: str, port: int) -> None:
 
 
 @contextlib.contextmanager
-def _guarded(*, only_own: bool) -> Iterator[None]:
-    """Context in which servers of websockets refuse foreign requests: viser itself has no such setting."""
+def _guarded(*, only_own: bool, files: Mapping[str, Path]) -> Iterator[None]:
+    """Context in which servers of websockets refuse foreign requests, and serve files, as viser itself cannot."""
     import websockets.asyncio.server as websockets
 
     serve = websockets.serve
 
     @wraps(serve)
     def guarded(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        return serve(*arguments, process_request=_checked(process_request, only_own=only_own), **options)
+        checked = _checked(process_request, only_own=only_own, files=files)
+        return serve(*arguments, process_request=checked, **options)
 
     websockets.serve = guarded  # type: ignore[assignment,misc]
     try:
@@ -103,12 +111,14 @@ def _guarded(*, only_own: bool) -> Iterator[None]:
         websockets.serve = serve  # type: ignore[misc]
 
 
-def _checked(answer: Callable[..., Any], *, only_own: bool) -> Callable[..., Any]:
-    """Return what answers a request as `answer` does, where it may be answered."""
+def _checked(answer: Callable[..., Any], *, only_own: bool, files: Mapping[str, Path]) -> Callable[..., Any]:
+    """Return what answers a request with one of some files, or as `answer` does, where it may be answered."""
 
     def checked(connection: Any, request: Any) -> Any:
         if not _is_own(request.headers.get_all("Host"), request.headers.get_all("Origin"), only_own=only_own):
             return connection.respond(http.HTTPStatus.FORBIDDEN, "only for pages of this machine\n")
+        if (file := files.get(urlsplit(request.path).path)) is not None and file.is_file():
+            return _file_response(file)
         # Compressed it could not be given a title.
         if "Accept-Encoding" in request.headers:
             del request.headers["Accept-Encoding"]
@@ -123,6 +133,15 @@ def _checked(answer: Callable[..., Any], *, only_own: bool) -> Callable[..., Any
         return response
 
     return checked
+
+
+def _file_response(file: Path) -> Any:
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    kind, content = mimetypes.guess_type(file.name)[0] or "application/octet-stream", file.read_bytes()
+    headers = _HEADERS | {"Content-Type": kind, "Content-Length": str(len(content)), "Connection": "close"}
+    return Response(http.HTTPStatus.OK, "OK", Headers(headers), content)
 
 
 def _is_own(hosts: list[str], origins: list[str], *, only_own: bool) -> bool:

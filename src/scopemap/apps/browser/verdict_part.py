@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from scopemap.apps.browser.next_steps import NextRun, next_runs, source_of
+from scopemap.apps.browser.next_steps import NextRun, next_runs, plain_step, source_of
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import escaped
 from scopemap.engine.notices import Level
@@ -13,8 +13,6 @@ from scopemap.result.verdict import Reason, verdict
 
 _NAMES: dict[Level, str] = {"bad": "Not usable", "doubtful": "Caution", "note": "Note"}
 _GOOD = "The surface agrees with its own video. Its true shape was not measured."
-_DETAILS = ("frames", "surface", "time")
-"""Facts that reasons state, too, or that few need."""
 _MOST_BUTTONS = 3
 
 
@@ -27,8 +25,6 @@ class VerdictPart:
         self._can_run = view.workspace is not None and source_of(view.whole) is not None
         if found.level == "good":
             gui.add_markdown(_GOOD)
-        facts = {name: f"- **{name}**: {escaped(fact)}" for name, fact in summary_facts(view.whole).items()}
-        gui.add_markdown("\n".join(fact for name, fact in facts.items() if name not in _DETAILS))
         for reason in found.reasons:
             if reason.level in ("bad", "doubtful"):
                 self._add(reason)
@@ -40,25 +36,34 @@ class VerdictPart:
         good = [reason for reason in found.reasons if reason.level == "good"]
         if good:
             gui.add_markdown("\n".join(f"- {escaped(reason.text)}" for reason in good))
+        if self._can_run:
+            self._improve(found.reasons)
         with gui.add_folder("Details", expand_by_default=False):
-            gui.add_markdown("\n".join(facts[name] for name in _DETAILS if name in facts))
+            facts = summary_facts(view.whole).items()
+            gui.add_markdown("\n".join(f"- **{name}**: {escaped(fact)}" for name, fact in facts))
 
     def _add(self, reason: Reason) -> None:
-        step = f" {escaped(reason.next_step)}" if reason.next_step else ""
-        self._view.window.gui.add_markdown(f"**{_NAMES[reason.level]}.** {escaped(reason.text)}{step}")
-        if self._can_run:
-            for run in next_runs(reason.next_step, self._view.whole):
-                self._offer(run)
+        words = " ".join(filter(None, (reason.text, plain_step(reason.next_step))))
+        self._view.window.gui.add_markdown(f"**{_NAMES[reason.level]}.** {escaped(words)}")
+
+    def _improve(self, reasons: list[Reason]) -> None:
+        """Offer the runs that the reasons name, each option once."""
+        runs = [run for reason in reasons for run in next_runs(reason.next_step, self._view.whole)]
+        offered = {(run.option, run.choices): run for run in runs}
+        if offered:
+            with self._view.window.gui.add_folder("Improve this result"):
+                for run in offered.values():
+                    self._offer(run)
 
     def _offer(self, run: NextRun) -> None:
         gui, window = self._view.window.gui, self._view.window
         if run.number is not None:
             first, low, high = run.number
-            number = gui.add_number(f"--{run.option}", first, min=low, max=high, step=0.01)
+            number = gui.add_number(run.question, first, min=low, max=high, step=0.01)
             button = gui.add_button(run.label())
             window.on(button, lambda: self._again(run, f"{number.value:g}"))
         elif len(run.choices) > _MOST_BUTTONS:
-            choice = gui.add_dropdown(f"--{run.option}", run.choices)
+            choice = gui.add_dropdown(run.question, run.choices)
             window.on(gui.add_button(run.label()), lambda: self._again(run, choice.value))
         else:
             for value in run.choices:

@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -47,7 +48,9 @@ class BrowserWindow:
     """
 
     def __init__(self, port: int = 0, host: str = LOOPBACK, *, anonymous: bool = False) -> None:
-        self.server, self.anonymous = start_server(port, host), anonymous
+        self.files: dict[str, Path] = {}
+        """Files that are served beside the page, by their paths there."""
+        self.server, self.anonymous = start_server(port, host, self.files), anonymous
         self.names = Names(anonymous=anonymous)
         self.gui, self.scene = self.server.gui, self.server.scene
         self.url = url_of(host, self.server.get_port())
