@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -258,11 +259,14 @@ def test_blind_spots_are_those_of_the_command(tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
     assert call("coverage", folder, "--quiet") == 0
     facts = json.loads((folder / "coverage" / "coverage.json").read_text())
+    shutil.rmtree(folder / "coverage")
     with shown_window() as shown:
         shown.show(ResultPage(folder))
         shown.press("What was not seen")
         shown.until(lambda: "was not seen, estimated (90 % interval" in shown.words)
         assert f"{100 * facts['total']['share']:.0f} % of the wall" in shown.words
+        # What the window found is kept as by the command.
+        assert json.loads((folder / "coverage" / "coverage.json").read_text()) == facts
         spots = [label for label in shown.labels() if label[0].isdigit()]
         assert len(spots) == len(facts["blind_spots"])
         shown.press("1. ")
@@ -272,6 +276,11 @@ def test_blind_spots_are_those_of_the_command(tmp_path: Path) -> None:
         hidden = found.surface.triangles_center[np.nan_to_num(found.unseen) > BLIND]
         apart = np.linalg.norm(hidden - facts["blind_spots"][0]["position_mm"], axis=1)
         np.testing.assert_allclose(shown.window.server.initial_camera.look_at, hidden[apart.argmin()], rtol=1e-6)
+        # Its border is outlined: each of its corners is of a face that was not seen.
+        outline = shown.nodes["/page/blind_spot/outline"].points
+        corners = np.asarray(found.surface.vertices)[np.unique(np.asarray(found.surface.faces)[found.unseen_faces])]
+        assert len(outline) >= 3
+        assert np.abs(outline.reshape(-1, 1, 3) - corners).sum(-1).min(1).max() < 1e-3
         shown.choose("Dropdown", "Colour by", "coverage")
         assert "The surface is closed where it has gaps: flat lids close its open ends." in shown.words
 

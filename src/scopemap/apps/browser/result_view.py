@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +14,8 @@ import numpy as np
 from scopemap.apps.browser.scene import look_at, look_from
 from scopemap.apps.browser.shown_surface import ShownSurface
 from scopemap.apps.browser.window import escaped
+from scopemap.engine.errors import InputError
+from scopemap.report.page import PAGE, write_report
 from scopemap.report.summary_picture import NOT_A_DEVICE, TONES
 from scopemap.result.frame_table import NOT_USED
 from scopemap.result.result import Result
@@ -197,9 +201,7 @@ class ResultView:
         if number in self._coverage:
             then(self._coverage[number])
             return
-        from scopemap.apps.coverage.coverage import coverage
-
-        self.window.job("looking for what was not seen", lambda: coverage(folder), found)
+        self.window.job("looking for what was not seen", lambda: _kept_coverage(folder), found)
 
     def _see_with(self, fov_rad: float, aspect: float = 1.0) -> None:
         """Let all browsers see a vertical field of view, narrow ones all of its width, `aspect` times as wide."""
@@ -207,3 +209,16 @@ class ResultView:
         for client in self.window.server.get_clients().values():
             narrow = max(1.0, aspect / max(client.camera.aspect, 1e-3))
             client.camera.fov = float(2 * np.arctan(np.tan(fov_rad / 2) * narrow))
+
+
+def _kept_coverage(folder: Path) -> Coverage:
+    """Return what was not seen of a result; it is kept beside that and in its report, where they can be written."""
+    from scopemap.apps.coverage.coverage import coverage
+    from scopemap.report.page_data import COVERAGE
+
+    found = coverage(folder)
+    with suppress(InputError):
+        found.save(folder / COVERAGE)
+        if (folder / PAGE).is_file():
+            write_report(folder)
+    return found

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
+import trimesh
+from PIL import Image
 
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import escaped
@@ -17,8 +21,7 @@ _MOST_LISTED = 20
 _LEAST_SHARE = 0.05
 """Of what was not seen: smaller spots are folded away."""
 _MARK = "/page/blind_spot"
-_INK = (155, 34, 38)
-_SHARE = 0.012
+_INK = (255, 190, 11)
 
 
 class UnseenPart:
@@ -52,8 +55,9 @@ class UnseenPart:
         self._words.content = escaped(f"{unseen_words(found)} {count}{largest}")
         large = [spot for spot in shown if share_of(found, spot) >= _LEAST_SHARE]
         small = shown[len(large) :]
-        self._outer.visible = self._place.visible = bool(shown)
+        self._outer.visible = self._place.visible = True
         with self._place:
+            self._view.window.gui.add_image(map_picture(found), label="Unrolled: where, and by what clock direction")
             self._add(found, large, 1)
             if small:
                 with self._view.window.gui.add_folder(f"{len(small)} smaller", expand_by_default=False):
@@ -66,14 +70,15 @@ class UnseenPart:
             label = f"{number}. near frame {spot.frame}, {share} % of what was not seen"
             hint = f"{np.format_float_positional(float(f'{spot.area:.3g}'), trim='-')} {unit} {spot.where(along)}"
             button = self._view.window.gui.add_button(label, hint=hint, color="gray")
-            self._view.window.on(button, self._fly, number, spot, unseen_place(found, spot))
+            self._view.window.on(button, self._fly, number, spot, found)
 
-    def _fly(self, number: int, spot: BlindSpot, place: np.ndarray) -> None:
-        view = self._view
+    def _fly(self, number: int, spot: BlindSpot, found: Coverage) -> None:
+        view, place = self._view, unseen_place(found, spot)
         view.show_frame(spot.frame)
         view.look_from_spot(place)
-        scene, radius = view.window.scene, _SHARE * view.surface.size_mm
-        scene.add_icosphere(f"{_MARK}/ball", radius, _INK, position=tuple(place), cast_shadow=False)
+        scene = view.window.scene
+        lines = unseen_outline(found, place)
+        scene.add_line_segments(f"{_MARK}/outline", lines, _INK, thickness=4.0, thickness_units="screen")
         scene.add_label(f"{_MARK}/words", f"blind spot {number}", position=tuple(place), anchor="bottom-center")
         view.note(f"Blind spot {number}, seen from frame {spot.frame}, the nearest.")
 
@@ -93,10 +98,33 @@ def share_of(found: Coverage, spot: BlindSpot) -> float:
     return min(1.0, spot.area / max(found.total.share * found.total.area, 1e-12))
 
 
+def map_picture(found: Coverage) -> np.ndarray:
+    """Return the unrolled map of what was not seen, (H, W, 3) uint8."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "map.png"
+        found.draw(file)
+        return np.asarray(Image.open(file).convert("RGB"))
+
+
 def unseen_place(found: Coverage, spot: BlindSpot) -> np.ndarray:
     """Return the middle (3,) of the face that was not seen and is nearest to a spot's position, which may be in air."""
-    from scopemap.apps.coverage.coverage import BLIND
-
-    middles = np.asarray(found.surface.triangles_center)[np.nan_to_num(found.unseen) > BLIND]
+    middles = np.asarray(found.surface.triangles_center)[found.unseen_faces]
     position = np.array(spot.position_mm)
     return middles[np.linalg.norm(middles - position, axis=1).argmin()] if len(middles) else position
+
+
+def unseen_outline(found: Coverage, place: np.ndarray) -> np.ndarray:
+    """Return the border, segments (N, 2, 3), of the faces that were not seen and are connected around a place."""
+    faces = np.asarray(found.surface.faces)
+    hidden = np.flatnonzero(found.unseen_faces)
+    if not len(hidden):
+        return np.zeros((0, 2, 3))
+    adjacent = np.asarray(found.surface.face_adjacency)
+    inside = adjacent[found.unseen_faces[adjacent].all(axis=1)]
+    middles = np.asarray(found.surface.triangles_center)
+    nearest = hidden[np.linalg.norm(middles[hidden] - place, axis=1).argmin()]
+    parts = trimesh.graph.connected_components(inside, nodes=hidden, min_len=1)
+    patch = next(part for part in parts if nearest in part)
+    edges = np.sort(faces[patch][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    border = trimesh.grouping.group_rows(edges, require_count=1)
+    return np.asarray(found.surface.vertices)[edges[border]]

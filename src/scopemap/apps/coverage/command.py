@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -38,25 +37,17 @@ def coverage(
     from scopemap.report.page_data import COVERAGE
 
     folder = out or run / COVERAGE
-    files = {name: folder / name for name in ("coverage.json", "map.csv", "map.png", "coverage.ply")}
-    for file in files.values():
-        options.check_output(file, (file.suffix,), overwrite)
+    from scopemap.apps.coverage.coverage import FILES
     from scopemap.apps.coverage.coverage import coverage as covered
     from scopemap.apps.measure.findings import FINDING_ENDINGS, write_findings
-    from scopemap.engine.errors import reporting
-    from scopemap.result.json_numbers import without_nan
 
+    for name in FILES:
+        options.check_output(folder / name, (Path(name).suffix,), overwrite)
     if export is not None:
         options.check_output(export, FINDING_ENDINGS, overwrite)
     options.warn_of_damage(run, silent=quiet)
     found = covered(run)
-    with reporting(f"cannot write to {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(without_nan(found.facts), indent=2) + "\n"
-        files["coverage.json"].write_text(text, encoding="utf-8")
-    found.map.write(files["map.csv"])
-    found.draw(files["map.png"])
-    found.write_surface(files["coverage.ply"])
+    found.save(folder)
     if export is not None:
         write_findings(run, found.findings, found.scale, export)
     if out is None and (run / PAGE).is_file():
@@ -65,4 +56,4 @@ def coverage(
         print_json(found.facts | {"out": str(folder)})
     elif not quiet:
         typer.echo(str(found))
-        typer.echo(f"{folder}: {', '.join(files)}")
+        typer.echo(f"{folder}: {', '.join(FILES)}")

@@ -7,6 +7,7 @@ in a lumen with 1.3 times the area where it was not seen: what a fold hides has 
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +26,7 @@ from scopemap.engine.errors import InputError, reporting
 from scopemap.report.coverage_picture import COLOURS, OUTSIDE, draw_coverage
 from scopemap.report.sheet import rgb_of
 from scopemap.result.frame_table import FrameTable
+from scopemap.result.json_numbers import without_nan
 from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
 
@@ -51,6 +53,10 @@ _SEGMENT_DEG = 20.0
 _LEAST_SPOT_RADII = 0.25  # square root of the smallest area listed
 _SHOWN = 10
 _ALL_ROUND = 0.35  # length of the mean direction below which a blind spot is all round
+
+
+FILES = ("coverage.json", "map.csv", "map.png", "coverage.ply")
+"""What `Coverage.save` writes."""
 
 
 class Share(NamedTuple):
@@ -211,10 +217,21 @@ class Coverage:
         colours[self.unseen <= BLIND], colours[self.unseen > BLIND] = seen, hidden
         return trimesh.Trimesh(self.surface.vertices, self.surface.faces, face_colors=colours, process=False)
 
-    def write_surface(self, file: Path) -> None:
-        """Write the painted surface as PLY; raises `InputError` where that fails."""
-        with reporting(f"cannot write {file}"):
-            self.painted.export(file)
+    def save(self, folder: Path) -> None:
+        """Write `FILES` into a folder; raises `InputError` where that fails."""
+        facts, table, picture, surface = (folder / name for name in FILES)
+        with reporting(f"cannot write to {folder}"):
+            folder.mkdir(parents=True, exist_ok=True)
+            facts.write_text(json.dumps(without_nan(self.facts), indent=2) + "\n", encoding="utf-8")
+            self.painted.export(surface)
+        self.map.write(table)
+        self.draw(picture)
+
+    @property
+    def unseen_faces(self) -> np.ndarray:
+        """Which faces (F,) of the closed surface were probably not seen."""
+        found: np.ndarray = np.nan_to_num(self.unseen) > BLIND
+        return found
 
 
 def coverage(folder: Path) -> Coverage:
