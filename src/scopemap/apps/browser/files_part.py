@@ -35,7 +35,10 @@ class FilesPart:
     def __init__(self, view: ResultView) -> None:
         self._view, window, gui = view, view.window, view.window.gui
         page = view.whole.folder / PAGE
-        if page.is_file():
+        window.files.clear()
+        if page.is_file() and window.anonymous:
+            gui.add_markdown(f"The report, which names the video, is in the result's folder: {PAGE}")
+        elif page.is_file():
             window.files.update({_PLACE + name: view.whole.folder / name for name in (PAGE, *_BESIDE)})
             gui.add_html(f'<a href="{_PLACE}{PAGE}" target="_blank" rel="noopener">Open the report</a>')
             self._on_press("Download the report", partial(self._send, page))
