@@ -13,7 +13,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+from drawn_run import IN_RESULT, draw_run
 from window_without_browser import element, elements, press, settle, until, words
 
 from scopemap.apps.browser import command
@@ -23,7 +26,7 @@ from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.start_page import StartPage
 from scopemap.apps.browser.window import BrowserWindow
-from scopemap.apps.browser.workspace import Workspace
+from scopemap.apps.browser.workspace import Workspace, thumbnail
 from scopemap.result.result import Result
 from scopemap.result.run_view import read_map, view_folder
 from scopemap.result.verdict import verdict
@@ -75,6 +78,16 @@ def test_paths_out_of_the_folder_are_refused_in_the_page(opened: tuple[BrowserWi
     element(window, "Other path")._impl.value = "deep/clip.mp4"
     press(window, "Choose this path")
     assert isinstance(window._page, InputPage)
+
+
+def test_a_result_is_known_by_its_picture(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path / "one")
+    run = Result(folder)
+    seen = [index for index in run.pictured if index < IN_RESULT]
+    expected = cv2.imread(str(run.picture_file(seen[len(seen) // 2])))[..., ::-1]
+    np.testing.assert_array_equal(thumbnail(folder), expected)
+    shutil.rmtree(folder / "frames")
+    assert thumbnail(folder).shape == (1, 1, 3)
 
 
 def test_switches_make_the_command(opened: tuple[BrowserWindow, Workspace]) -> None:

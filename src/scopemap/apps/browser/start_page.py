@@ -14,7 +14,7 @@ from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage, words_of
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.window import escaped
-from scopemap.apps.browser.workspace import DEMONSTRATION, VIDEO_KINDS, Workspace, made_and_word
+from scopemap.apps.browser.workspace import DEMONSTRATION, VIDEO_KINDS, Workspace, made_and_word, thumbnail
 from scopemap.engine.errors import InputError
 from scopemap.result.run_view import read_state, view_folder
 
@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 _HELLO = """### A surface from an endoscope video
 
-scopemap finds how the camera moved and reconstructs the tissue surface. Everything stays on this machine."""
+scopemap finds how the camera moved and reconstructs the tissue surface. Everything stays on this machine.
+
+*Research software, not a medical device.*"""
 _CHOOSE = "choose ..."
 _LOOK = "Look at it"
 _STOP = "Stop"
@@ -153,6 +155,13 @@ class StartPage:
             return
         with gui.add_folder("Your results"):
             first = gui.add_dropdown("Result", tuple(results))
+            picture = gui.add_image(thumbnail(results[first.value]))
+
+            def show(label: str) -> None:
+                if label in results:
+                    picture.image = thumbnail(results[label])
+
+            self._window.on(first, show)
             self._window.on(gui.add_button("Look at this result"), lambda: self._show_result(results, first.value))
             if len(results) > 1:
                 second = gui.add_dropdown("Compare with", tuple(results), initial_value=list(results)[1])

@@ -11,9 +11,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import cv2
+import numpy as np
+
 from scopemap.apps.browser.runs import BrowserRun, RunQueue
 from scopemap.apps.browser.uploads import Receiver
 from scopemap.engine.errors import InputError, ScopemapError
+from scopemap.input.decoding import read_decoded
 from scopemap.input.opening import VIDEO_ENDINGS
 from scopemap.result.result import Result
 from scopemap.result.result_folder import UNFINISHED
@@ -32,6 +36,7 @@ _MOST_NAMED = 80
 _VIDEOS = {*VIDEO_ENDINGS, ".dcm", ".bag"}
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 _MOST_LISTED = 200
+_NO_PICTURE = 200
 VIDEO_KINDS = ",".join(("video/*", *sorted(_VIDEOS)))
 """Kinds of files that are taken for videos, as browsers have them."""
 
@@ -161,6 +166,15 @@ def made_and_word(folder: Path) -> str:
     made = datetime.fromtimestamp((folder / _MARK).stat().st_mtime)
     run = Result(folder)
     return f"{made:%Y-%m-%d %H:%M}, {LEVEL_WORDS[level_of_submap(run)]}"
+
+
+def thumbnail(folder: Path) -> np.ndarray:
+    """Return the picture of a frame in the middle of a finished result, (h, w, 3) uint8; a grey pixel: it has none."""
+    run = Result(folder)
+    inside = set(run.tracked["index"].tolist())
+    seen = [index for index in run.pictured if index in inside]
+    found = read_decoded(run.picture_file(seen[len(seen) // 2]), cv2.IMREAD_COLOR) if seen else None
+    return np.full((1, 1, 3), _NO_PICTURE, np.uint8) if found is None else np.ascontiguousarray(found[..., ::-1])
 
 
 def _is_result(path: Path) -> bool:
