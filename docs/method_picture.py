@@ -151,7 +151,9 @@ def _level(config: Config) -> str:
 
 
 def _mesh(config: Config) -> str:
-    colours = {"raw": "the video's colours", "albedo": "colours without the lamp"}[config.fusion.colours]
+    colours = {"raw": "the video's colours", "texture": "texture of few frames", "albedo": "colours without the lamp"}[
+        config.fusion.colours
+    ]
     return colours + {"none": "", "small": ", small holes closed"}[config.fusion.holes]
 
 
