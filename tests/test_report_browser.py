@@ -116,9 +116,8 @@ def test_it_opens_silently_and_draws_the_mesh(
 
 
 def test_the_surface_has_its_texture(browser: Any, tmp_path: Path) -> None:
-    opened = Opened(browser, write_report(draw_textured_run(tmp_path))[0])
-    seen = opened.picture("#rendered")[10:-10]
-    green = (seen[..., 1] - seen[..., 2])[:, 20:-20]
+    seen = Opened(browser, write_report(draw_textured_run(tmp_path))[0]).picture("#rendered")[10:-10, 20:-20]
+    green = seen[..., 1] - seen[..., 2]
     assert np.median(green[:, :80]) > 30 > -30 > np.median(green[:, -80:])
 
 
