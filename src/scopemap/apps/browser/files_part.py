@@ -40,7 +40,8 @@ class FilesPart:
             gui.add_markdown(f"The report, which names the video, is in the result's folder: {PAGE}")
         elif page.is_file():
             window.files.update({_PLACE + name: view.whole.folder / name for name in (PAGE, *_BESIDE)})
-            gui.add_html(f'<a href="{_PLACE}{PAGE}" target="_blank" rel="noopener">Open the report</a>')
+            link = f'<a href="{_PLACE}{PAGE}" target="_blank" rel="noopener" style="color:#228be6">Open the report</a>'
+            gui.add_html(f'<div style="margin:4px 8px;font-size:15px">{link}</div>')
             self._on_press("Download the report", partial(self._send, page))
             gui.add_markdown("It is one file to keep, print or send.")
         if not view.surface.is_empty:
