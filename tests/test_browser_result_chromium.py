@@ -120,6 +120,8 @@ def test_colours_are_those_of_the_surface_and_keys_move_the_time_line(shown: tup
     looked, _, _ = shown
     looked.tab("Surface")
     looked.page.locator("label", has_text="Shading").first.click()
+    looked.page.get_by_role("combobox", name="Colour by").click()
+    looked.page.get_by_role("option", name="picture", exact=True).click()
     near = lambda: (np.abs(looked.picture() - BRIGHT).max(-1) <= 2).sum()  # noqa: E731
     looked.until(lambda: near() > 2000, "the tissue's own colour")
     looked.tab("Frames")

@@ -16,6 +16,7 @@ from scopemap import Config, CustomDepth, Reconstructor, Result, open_sequence, 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.frame import Frame
+from scopemap.engine.fusion.finish import finished
 from scopemap.runner.provenance import Limits
 
 CAMERA = PinholeCamera(100.0, 100.0, 79.5, 63.5, 160, 128)
@@ -174,7 +175,8 @@ def test_beyond_the_limit_of_stored_frames_the_result_is_what_was_shown(folder: 
         tracked = np.stack([np.asarray(step.frame.T_world_camera) for step in steps])
         is_shown = np.array_equal(result.trajectory.T_world_camera, tracked)
         assert is_shown == (stored < FRAMES)
-        assert np.allclose(shown.bounds, result.mesh.bounds, rtol=0, atol=1e-3) == is_shown
+        bounds = finished(shown, result.config.fusion).bounds
+        assert np.allclose(bounds, result.mesh.bounds, rtol=0, atol=1e-3) == is_shown
         assert result.provenance["surface"]["frames"] > 0
         codes[stored] = {notice["code"] for notice in result.provenance["notices"]}
     assert "mapping-adjusted" in codes[FRAMES]
