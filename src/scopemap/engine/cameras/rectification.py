@@ -52,7 +52,7 @@ class Rectifier:
         self._shrink = source.central.fx / target.fx
 
     def enlarged(self, width: int, height: int) -> Rectifier:
-        """Return the rectifier to the same view at a larger size, in a thousandth of the time that a new one takes.
+        """Return the rectifier to the same view at a larger size, without solving the lens at each of its pixels.
 
         Within a pixel of the target a lens bends lines by less than a hundredth of a pixel, so its map is interpolated
         linearly; along the border of what is `valid` it is wrong by up to half of such a pixel.

@@ -107,7 +107,7 @@ class FusionSettings(StageSettings):
     holes: Literal["small", "none", "watertight"] = Field(
         "small",
         description="holes of the mesh that are closed, with confidence 0; small: those within the surface with a "
-        "border of up to 20 voxels' edges, not what no frame saw, and ragged borders are trimmed; none: the mesh as it "
+        "border of up to 20 voxels' edges, not what no frame saw, and borders are smoothed; none: the mesh as it "
         "was fused; watertight: all, what no frame saw in grey",
     )
     mesh_smooth: int = Field(0, ge=0, description="iterations of Taubin's filter on the mesh; 0: none")
