@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,11 @@ from typing import Any
 import pytest
 from tiny_phantom import write_tiny
 
+import scopemap
 from scopemap import Config, open_sequence, reconstruct
 from scopemap_bench.scripts import earns, measuring
 from scopemap_bench.scripts.real import RealClip
+from scopemap_bench.scripts.with_number import constant_of
 
 QUICK = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 2}
 
@@ -21,6 +24,24 @@ def test_each_switch_turns_something_off() -> None:
     for switch in earns.SWITCHES:
         name, value = switch.split("=")
         assert Config.load(settings={name: value}) != default
+
+
+def test_each_idea_is_another_value_of_a_constant_of_the_engine() -> None:
+    engine = Path(scopemap.__file__).parent / "engine"
+    for idea in earns.IDEAS:
+        name, value = idea.split("=")
+        module, _, constant = name.rpartition(".")
+        tree = ast.parse((engine / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8"))
+        (known,) = (found[1] for node in tree.body if (found := constant_of(node)) and found[0] == constant)
+        assert known != ast.literal_eval(value)
+
+
+def test_a_constant_is_changed_for_one_run(tmp_path: Path) -> None:
+    clip = RealClip("a clip", write_tiny(tmp_path / "phantom"), arguments=("--frames", "0:2"))
+    earns.run_with(clip, "tracking.tracker._PATIENCE=0", tmp_path / "run")
+    assert (tmp_path / "run" / "provenance.json").is_file()
+    with pytest.raises(subprocess.CalledProcessError):
+        earns.run_with(RealClip("none", tmp_path / "none"), "tracking.tracker._PATIENCE=0", tmp_path / "failed")
 
 
 def test_the_phantoms_are_eight_and_those_of_the_other_tables() -> None:
