@@ -53,7 +53,7 @@ def test_left_out_tracks_contradict_a_wrong_focal_length_and_ask_for_the_right_o
 def test_of_many_keyframes_those_in_the_middle_tell_of_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(11)
     T, points, observations = world(rng)
-    monkeypatch.setattr(lens, "WINDOW", len(T) - 1)
+    monkeypatch.setattr(lens, "MOST_AT_ONCE", len(T) - 1)
     seen = replace(observations, pixel=observations.pixel + rng.normal(0, 0.1, observations.pixel.shape))
     problem = BundleProblem(tracked(T, rng), points, seen, LOOSE, LINE, 0.85 * FOCAL_PX)
     found = lens_test(problem, adjust(problem).state)
@@ -71,12 +71,12 @@ def test_a_shifted_centre_alone_contradicts_no_lens() -> None:
     assert not lens_test(problem, adjust(problem).state).contradicts
 
 
-@pytest.mark.parametrize(("held_px", "is_worse"), [(0.99 * 0.74, False), (1.04, True), (0.78, False)])
+@pytest.mark.parametrize(("held_px", "adjustment_is_worse"), [(0.99 * 0.74, False), (1.04, True), (0.78, False)])
 def test_an_adjustment_is_worse_where_left_out_tracks_prefer_the_poses_as_tracked(
-    held_px: float, is_worse: bool
+    held_px: float, adjustment_is_worse: bool
 ) -> None:
-    assert LensTest(held_px=held_px, tracked_px=0.74).is_worse == is_worse
-    assert not LensTest(held_px=held_px).is_worse  # not tested
+    assert LensTest(held_px=held_px, tracked_px=0.74).adjustment_is_worse == adjustment_is_worse
+    assert not LensTest(held_px=held_px).adjustment_is_worse  # not tested
 
 
 def test_a_scene_that_is_not_rigid_contradicts_no_lens() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pipeline_steps import stepped
 from tiny_phantom import write_tiny
 
 from scopemap import Config, Result, open_sequence, reconstruct
@@ -39,7 +40,7 @@ def _engine_alone(folder: Path, config: Config) -> tuple[SegmentSurface, list[Fr
     sequence, execution = open_sequence(folder), _Noting()
     with closing(FrameStore()) as store:
         pipeline = Pipeline(config, create_estimators(config, sequence), store)
-        table = FrameTable.of(pipeline.step(pipeline.preprocess(frame)).row for frame in sequence.frames())
+        table = FrameTable.of(stepped(pipeline, frame).row for frame in sequence.frames())
         tracked = tracked_frames(table)
         (submap,) = pipeline.adjust(tracked, execution).submaps
         (segment,) = submap.segments

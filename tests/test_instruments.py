@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pipeline_steps import stepped
 from tiny_phantom import write_tiny
 
 from scopemap import open_sequence
@@ -167,7 +168,7 @@ def test_instruments_have_no_depth_and_are_not_usable_and_a_covered_frame_says_s
         pipeline = Pipeline(config, replace(create_estimators(config, sequence), depth=network))
         first, second, third, *_ = sequence.frames()
         network.columns = slice(0, 20)
-        step = pipeline.step(pipeline.preprocess(first))
+        step = stepped(pipeline, first)
         bare = Masker(config.mask)(first)
         if way == "off":
             np.testing.assert_array_equal(step.frame.valid, bare.valid)
@@ -178,8 +179,8 @@ def test_instruments_have_no_depth_and_are_not_usable_and_a_covered_frame_says_s
         np.testing.assert_array_equal(step.frame.valid[:, 30:], bare.valid[:, 30:])
         assert np.isfinite(step.frame.depth_mm[:, 30:]).all()
         network.columns = slice(0, first.valid.shape[1])
-        covered = pipeline.step(pipeline.preprocess(second)).track
+        covered = stepped(pipeline, second).track
         assert covered.status == "lost"
         assert covered.reason == "only 0% of the image is usable: instruments cover 100%"
         network.columns = slice(0, 0)
-        assert pipeline.step(pipeline.preprocess(third)).track.status != "lost"
+        assert stepped(pipeline, third).track.status != "lost"

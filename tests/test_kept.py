@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pipeline_steps import stepped
 from tiny_phantom import write_tiny
 
 from scopemap.engine.config import Config
@@ -100,7 +101,7 @@ def test_what_changes_is_kept(preset: str, changes: dict[str, Any], tmp_path: Pa
         before: dict[int, dict[str, Any]] = {}
         changed: set[str] = set()
         for frame in sequence.frames():
-            step = pipeline.step(pipeline.preprocess(frame))
+            step = stepped(pipeline, frame)
             run.take(step)
             pictures(step)
             pipeline.mapper.settle()

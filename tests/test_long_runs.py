@@ -105,7 +105,7 @@ def test_a_keyframe_leaves_little_in_memory(tmp_path: Path) -> None:
 
     # The last 32 keyframes; and the 64 strongest descriptors, of 400 keyframes at most: 16 KiB each.
     assert _bytes_each(put, 50, 40) < 24_000
-    assert plane_scene.only(backend.adjust()).loops > 0
+    assert plane_scene.only(backend.adjust()).loop_frames
 
 
 def test_of_many_maps_the_last_ones_go_on(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -124,7 +124,8 @@ def test_the_pipeline_uses_the_masks_that_the_settings_name(tmp_path: Path) -> N
     sequence = open_sequence(images)
     estimators = create_estimators(config, sequence)
     assert estimators_provenance(estimators)["masks"].startswith("3 files")
-    preprocessed = Pipeline(config, estimators).preprocess(frames_of(sequence)[1])
+    pipeline = Pipeline(config, estimators)
+    preprocessed = pipeline.match(pipeline.estimate(frames_of(sequence)[1]))
     assert not preprocessed.frame.valid[:, :160].any()
     assert preprocessed.frame.valid[:, 160:].any()
     assert create_masks(MaskSettings(), sequence.rectifier) is None

@@ -52,7 +52,7 @@ def test_masked_pixels_are_not_linked(folder: Path) -> None:
     config = Config.load(settings={"networks.flow": "none", "networks.perceptual": "structure"})
     sequence = open_sequence(folder)
     pipeline = Pipeline(config, create_estimators(config, sequence))
-    preprocessed_frames = [pipeline.preprocess(frame) for frame in sequence.frames()]
+    preprocessed_frames = [pipeline.match(pipeline.estimate(frame)) for frame in sequence.frames()]
     assert not preprocessed_frames[0].frame.valid.all()
     for past, preprocessed in itertools.pairwise(preprocessed_frames):
         assert preprocessed.correspondence is not None
@@ -67,7 +67,7 @@ def test_measured_depth_needs_no_link(folder: Path) -> None:
     assert Mapis(config.mapis).needs_previous("depth")
     sequence = open_sequence(folder)
     pipeline = Pipeline(config, create_estimators(config, sequence))
-    assert all(pipeline.preprocess(frame).correspondence is None for frame in sequence.frames())
+    assert all(pipeline.match(pipeline.estimate(frame)).correspondence is None for frame in sequence.frames())
 
 
 def test_facts_of_the_parts_do_not_overwrite_each_other(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

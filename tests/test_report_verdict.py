@@ -156,20 +156,20 @@ def test_few_frames_or_no_surface_are_not_usable() -> None:
     ("facts", "words"),
     [
         ({"camera": {"origin": "assumed"}}, "lens is assumed"),
-        (notices(Notice("mapping-not-rigid", {"merged": "", "sigma_px": 0.98})), "no rigid scene fits the views"),
+        (notices(Notice("mapping-not-rigid", {"sigma_px": 0.98})), "no rigid scene fits the views"),
         (notices(Notice("mapping-none")), "not adjusted: no other view confirms"),
         (notices(Notice("camera-at-rest")), "is at rest while the tissue moves"),
         (notices(Notice("camera-distorted", {"share": 0.12})), "has radial distortion"),
         (notices(Notice("input-interlaced")), "is interlaced"),
         (notices(Notice("camera-contradicted", ANOTHER_LENS)), "another lens (focal length -8 %)"),
         (
-            notices(Notice("mapping-depth-disagrees", {"merged": "", "adjusted": 0.2, "tracked": 0.1})),
+            notices(Notice("mapping-depth-disagrees", {"adjusted": 0.2, "tracked": 0.1})),
             "would differ by 20 % (10 % before)",
         ),
         (notices(moving(30)), "moves on its own in 30 of 60"),
         (notices(Notice("shape-not-determined", {"error_px": 0.3, "other_px": 0.31})), "does not determine the shape"),
         (
-            notices(Notice("mapping-not-determined", {"error_px": 0.3, "other_px": 0.31, "merged": ""})),
+            notices(Notice("mapping-not-determined", {"error_px": 0.3, "other_px": 0.31})),
             "rests on the depth network alone",
         ),
         (notices(Notice("depth-triangulated", {"triangulated": 3, "keyframes": 6})), "in only 3 of 6 keyframes"),
@@ -301,6 +301,12 @@ def test_every_notice_has_words_and_survives_json(code: str) -> None:
     assert found == notice
     with pytest.raises(ValueError, match=code):
         Notice(code, values | {"more": 1})
+
+
+def test_a_notice_of_another_version_is_read_by_the_values_that_are_known() -> None:
+    older = {"code": "mapping-not-rigid", "values": {"sigma_px": 0.98, "merged": ""}}
+    unknown = [{"code": "of-a-later-version", "values": {}}, {"code": "mapping-not-rigid", "values": {}}]
+    assert notices_of({"notices": [older, *unknown]}) == [Notice("mapping-not-rigid", {"sigma_px": 0.98})]
 
 
 def test_words_are_of_notices_alone() -> None:

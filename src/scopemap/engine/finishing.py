@@ -97,7 +97,7 @@ class SegmentFinishing:
         if final.keyframes and flow.name != "none":
             self._depths = KeyframeDepths(final.view, final.T_world_camera, final.keyframes, camera, flow)
 
-    def carve(self) -> None:
+    def find_free_space(self) -> None:
         """Find what frames look through; the pixels that show it are left out."""
         if self._fusion.settings.free_space:
             some = views_among(list(self._final.T_world_camera))

@@ -24,7 +24,7 @@ from scopemap.engine.tracking.track import FrameTracker, Track, motion_between
 
 @dataclass(frozen=True)
 class Step:
-    """All results for a frame: refined depth (at the size of `raw_mm`'s estimate) and, unless lost, pose as tracked.
+    """All results for a frame: refined depth (at the network's size) and, unless lost, pose as tracked.
 
     skipped : whether nothing was estimated of it.
     """

@@ -84,7 +84,7 @@ class Pipeline:
         # In the tracker's thread, so with its flow: that between keyframes is the back end's.
         adjustment = LocalAdjustment(mapping, estimators.corner_flow) if local else None
         self.odometry = Odometry(config, tracker, mapper, adjustment)
-        self.fusion = SurfaceFusion(config.fusion, store, corrected=mapping.at_end)
+        self.fusion = SurfaceFusion(config.fusion, store, corrected=mapping.global_adjustment)
 
     @property
     def stages(self) -> dict[str, Preprocessing | Matching | Odometry]:
@@ -160,7 +160,7 @@ class Pipeline:
         with closing(finishing):
             if self.config.mapping.triangulate_depth and (execution.keeps_depth or self.config.fusion.enabled):
                 finishing.triangulate(camera)
-            execution.timed("free space", finishing.carve)
+            execution.timed("free space", finishing.find_free_space)
             final = execution.final(execution.in_thread(finishing.corrected(), "correct"))
             chosen = execution.in_thread(finishing.chosen(final), "write")
             with closing(chosen):
@@ -177,15 +177,5 @@ class Pipeline:
         """
         config = self.config
         relocalises = config.tracking.relocalisation_keyframes > 0 and config.smoothing.method == "none"
-        merges = self.fusion.at_end and self.mapper.adjusts and config.mapping.min_loop_inliers > 0
+        merges = self.fusion.at_end and self.mapper.has_keyframes and config.mapping.min_loop_inliers > 0
         return self._has_own_tracker and relocalises and merges
-
-    def preprocess(self, frame: Frame) -> PreprocessedFrame:
-        """Estimate and match: all that needs no motion."""
-        return self.match(self.estimate(frame))
-
-    def step(self, preprocessed: PreprocessedFrame) -> Step:
-        """Track and fuse."""
-        step = self.track(preprocessed)
-        self.fuse(step)
-        return step

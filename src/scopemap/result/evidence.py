@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from scopemap.engine.notices import Level, Notice
+from scopemap.engine.notices import KINDS, Level, Notice
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.result.frame_table import ELSEWHERE, NOT_USED, FrameTable
 from scopemap.result.input_part import part_of_input
@@ -171,12 +171,13 @@ def evidence_of_segment(facts: Mapping[str, Any]) -> Evidence:
 def notices_of(provenance: Mapping[str, Any]) -> list[Notice]:
     """Return the notices in the provenance of a run, or in what it has of a segment, each once.
 
-    Those of another version that this one does not know are left out.
+    Those of another version that this one does not know are left out, and so are values that it does not know.
     """
     found = list[Notice]()
     for one in provenance.get("notices", []):
-        with suppress(KeyError, ValueError):
-            found.append(Notice(one["code"], one["values"]))
+        with suppress(KeyError):
+            code, values = one["code"], one["values"]
+            found.append(Notice(code, {name: values[name] for name in KINDS[code].values}))
     return list({(notice.code, text_of(notice)): notice for notice in found}.values())
 
 

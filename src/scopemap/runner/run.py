@@ -202,7 +202,7 @@ class Run:
     def adjusted(self) -> Adjusted:
         """The adjusted submaps, and what was tracked backwards. Raises `InputError` where no frame was tracked."""
         check_tracked(self.table, self.sequence.path, self.pipeline.preprocessing.estimators.masks)
-        if self.pipeline.config.mapping.at_end:
+        if self.pipeline.config.mapping.global_adjustment:
             self.progress("adjusting keyframes", 0, 0)
         trim_memory()
         found = self.pipeline.adjust(tracked_frames(self.table), _InThreads(self))

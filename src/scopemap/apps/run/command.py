@@ -172,7 +172,7 @@ def run(
     if not (quiet or as_json or missing_weights(resolved)) and (cost := network_cost(resolved, sequence)):
         typer.echo(cost, err=True)
     with _window(out) if in_app else nullcontext():
-        adjusts = resolved.mapping.at_end
+        adjusts = resolved.mapping.global_adjustment
         with _shown(out, sequence.used_count, adjusts, quiet or as_json, watched or in_app) as (shown, interruption):
             result = reconstruct_with_report(
                 sequence, resolved, out, overwrite=overwrite, observers=shown.observers, progress=shown.progress

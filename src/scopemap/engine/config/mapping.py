@@ -63,11 +63,6 @@ class MappingSettings(StageSettings):
         """Whether keyframes are adjusted at all, as they come or after the last frame."""
         return self.local_window > 0 or self.global_adjustment
 
-    @property
-    def at_end(self) -> bool:
-        """Whether keyframes are adjusted after the last frame."""
-        return self.global_adjustment
-
 
 class FusionSettings(StageSettings):
     """Volumetric fusion. TSDF parameters that are not set follow the scene (`engine/fusion/surface_fusion.py`)."""

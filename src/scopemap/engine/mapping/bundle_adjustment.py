@@ -34,6 +34,7 @@ from scopemap.engine.mapping.bundle_problem import (
     Points,
     Reprojection,
     State,
+    held_to_result,
     jacobians,
     reproject,
     reprojection_errors,
@@ -46,10 +47,8 @@ _INVERSE_DEPTH_STEP = (0.1, 10.0)  # by hand: factor of the inverse depth in one
 _POINT_STEPS = 5  # by hand: of the points alone, after the keyframes
 _ADDED_WITH = 2  # by hand: keyframes before a new one that move with it, and steps of each search
 _ADDED_ITERATIONS = 6  # by hand
-WINDOW = 300  # by hand
+MOST_AT_ONCE = 300  # by hand
 """Most keyframes that are adjusted at once."""
-HELD_SIGMA = 0.01  # by hand
-"""Least standard deviation of ln depth of points that an earlier window adjusted."""
 
 
 class BundleSolution(NamedTuple):
@@ -70,7 +69,7 @@ class BundleSolution(NamedTuple):
         return self.state.sigma_px
 
 
-def adjust_in_windows(problem: BundleProblem, window: int = WINDOW) -> BundleSolution:
+def adjust_in_windows(problem: BundleProblem, window: int = MOST_AT_ONCE) -> BundleSolution:
     """Return the solution of windows of successive keyframes, one after the other; of one window that of `adjust`."""
     start, count = problem.begin, len(problem.T_camera_world)
     if count <= window:
@@ -119,13 +118,13 @@ def _with_window(
     own = np.union1d(seen.point[some], np.flatnonzero((points.host >= first) & (points.host < end)))
     place = np.full(len(state.T_camera_world), -1)
     place[keyframes] = np.arange(len(keyframes))
-    known, log_scale = points.host[own] < first, state.log_scale[points.host[own]]
-    log_depth = np.where(known, state.log_depth[own] - log_scale, points.log_depth[own])
-    sigma = np.where(known, np.clip(found.log_depth_sigma[own], HELD_SIGMA, points.sigma[own]), points.sigma[own])
+    host, known = points.host[own], points.host[own] < first
+    points = Points(place[host], points.pixel[own], points.log_depth[own], points.sigma[own])
+    points = held_to_result(points, known, state.log_depth[own], state.log_scale[host], found.log_depth_sigma[own])
     part = replace(
         problem,
         T_camera_world=problem.T_camera_world[keyframes],
-        points=Points(place[points.host[own]], points.pixel[own], log_depth, sigma),
+        points=points,
         observations=Observations(np.searchsorted(own, seen.point[some]), place[observer[some]], seen.pixel[some]),
         neighbours=place[problem.neighbours[(place[problem.neighbours] >= 0).all(1)]],
         start=State(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.log_focal),

@@ -20,6 +20,7 @@ from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.geometry.se3 import inverse
 
 _LEAST_Z = 1e-3  # guard: points nearer to the camera's plane, over their distance, are behind it
+_HELD_SIGMA = 0.01  # by hand: least standard deviation of ln depth of points that were adjusted before
 _AT_ONCE = 20_000  # guard: observations whose derivatives are in memory at once, 1 kB each
 
 
@@ -160,6 +161,27 @@ def part_of(problem: BundleProblem, chosen: np.ndarray) -> BundleProblem:
         observations=Observations(number[seen.point[kept]], seen.keyframe[kept], seen.pixel[kept]),
         start=start and start._replace(log_depth=start.log_depth[chosen]),
     )
+
+
+def held_to_result(
+    points: Points, known: np.ndarray, log_depth: np.ndarray, log_scale: np.ndarray, sigma: np.ndarray
+) -> Points:
+    """Return the points of an adjustment with those that are known (P,) held to what was found of them before.
+
+    log_depth, log_scale, sigma : (P,) ln depth that was found, ln scale of its host, and standard deviation of the
+    former.
+    """
+    sigma = np.where(known, np.clip(sigma, _HELD_SIGMA, points.sigma), points.sigma)
+    return replace(points, log_depth=np.where(known, log_depth - log_scale, points.log_depth), sigma=sigma)
+
+
+def middle(problem: BundleProblem, state: State, most: int) -> tuple[BundleProblem, State]:
+    """Return the problem and the state of at most so many keyframes, those in the middle."""
+    count = len(problem.T_camera_world)
+    if count <= most:
+        return problem, state
+    first = (count - most) // 2
+    return successive(problem, first, first + most), successive_state(problem, state, first, first + most)
 
 
 def successive(problem: BundleProblem, first: int, end: int) -> BundleProblem:

@@ -1,4 +1,4 @@
-"""Correction: the one place that changes poses and depth of frames that were tracked.
+"""Correction: what corrects depth while frames are tracked, and poses and depth of all frames after the last one.
 
 KeyframeCorrection   while frames are tracked: the depth of a keyframe as adjusted in its window, and of the frames that
                      are tracked against it
@@ -59,7 +59,7 @@ class KeyframeCorrection(NamedTuple):
 class KeyframeStep(NamedTuple):
     """By how much a keyframe was moved as it came; the frames before it, tracked against an earlier one, were not.
 
-    T_camera_arrived : (4, 4), pose as tracked in the camera as moved. before, after : correction of the depth of the
+    T_camera_arrived : (4, 4), pose as aligned, in the camera as moved. before, after : correction of the depth of the
     frames before it, and its own.
     """
 
@@ -88,13 +88,18 @@ class KeyframeStep(NamedTuple):
 class FrameCorrection:
     """Correction of every frame's pose and depth, interpolated between adjusted keyframes.
 
-    index : (K,) int, numbers of the keyframes' frames, increasing. T_world_world : (K, 4, 4), from the common world as
-    tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
-    T_world_world_before : as `T_world_world`, of the frames that lead to the keyframe, which its step parts from it;
-    None: there is none. steps : (K,) of the keyframes; (): none was moved as it came. sigma_px : robust standard
+    Of frames A, K and B in this order, of which K is the keyframe: K moves by `T_adjusted_tracked`, and its depth by
+    `log_scale` and its field. B was tracked against K, and moves with it by the same. A was tracked before K was moved
+    as it came, by its step: it moves by `T_adjusted_arriving`, and its depth by the step's factor, too. A frame between
+    two keyframes takes a weighted mean of what both say, but where a loss, or another reference, parts it from one.
+
+    index : (K,) int, numbers of the keyframes' frames, increasing. T_adjusted_tracked : (K, 4, 4), from the common
+    world as tracked, near a keyframe, to the adjusted one. log_scale : (K,) ln of the factor of a keyframe's depth.
+    T_adjusted_arriving : as `T_adjusted_tracked`, for the frames before the keyframe, which its own window did not
+    move; None: there is none. steps : (K,) of the keyframes; (): none was moved as it came. sigma_px : robust standard
     deviation of the reprojection errors; NaN without observations. refused : why no adjustment is kept, so that
-    keyframes stay as tracked, or as the pose graph merges maps; None: one is kept. loops : number of accepted loop
-    closures. loop_frames : the two frames of each. depth_fields : (K,) further factors of each pixel's depth; (): none.
+    keyframes stay as tracked, or as the pose graph merges maps; None: one is kept. loop_frames : the two
+    frames of each accepted loop closure. depth_fields : (K,) further factors of each pixel's depth; (): none.
     S_common_map : by number of each merged map, Sim(3) from its world to the common one. tracked : poses as tracked by
     number of the frame, where known. depth_mm : typical depth, the unit of translations beside rad. lens : what
     left-out tracks tell of it. shape : what other starts of the adjustment tell of it. S_world_adjusted : Sim(3) from
@@ -102,13 +107,12 @@ class FrameCorrection:
     """
 
     index: np.ndarray
-    T_world_world: np.ndarray
+    T_adjusted_tracked: np.ndarray
     log_scale: np.ndarray
     sigma_px: float = float("nan")
-    T_world_world_before: np.ndarray | None = None
+    T_adjusted_arriving: np.ndarray | None = None
     steps: Sequence[KeyframeStep] = ()
     refused: Notice | None = None
-    loops: int = 0
     loop_frames: Sequence[Sequence[int]] = ()
     depth_fields: tuple[DepthCorrectionField, ...] = ()
     S_common_map: Mapping[int, Similarity] = field(default_factory=dict)
@@ -128,15 +132,11 @@ class FrameCorrection:
     @property
     def notice(self) -> Notice:
         """What was adjusted and how well it fits, or why nothing was."""
-        if not np.isfinite(self.sigma_px):
-            return Notice("mapping-without-observations", {"keyframes": len(self.index)})
         if self.refused:
-            merged = len(self.S_common_map)
-            by_loops = f", {merged} maps merged by {self.loops} loop closures" if merged > 1 else ""
-            return replace(self.refused, values={**self.refused.values, "merged": by_loops})
-        rotation_deg = np.degrees(rotation_angle_rad(self.T_world_world[:, :3, :3]).max())
+            return self.refused
+        rotation_deg = np.degrees(rotation_angle_rad(self.T_adjusted_tracked[:, :3, :3]).max())
         changes = [np.abs(depth_field.values).mean() for depth_field in self.depth_fields]
-        facts: dict[str, float] = {"keyframes": len(self.index), "loops": self.loops}
+        facts: dict[str, float] = {"keyframes": len(self.index), "loops": len(self.loop_frames)}
         facts["maps"] = max(len(self.S_common_map), 1)
         facts |= {"rotation_deg": float(rotation_deg), "sigma_px": float(self.sigma_px)}
         return Notice("mapping-adjusted", facts | {"depth_change": float(np.expm1(np.median(changes or [0.0])))})
@@ -153,18 +153,18 @@ class FrameCorrection:
         arrived = [S.transform_poses(T @ step.T_camera_arrived) for S, T, step in places]
         return replace(
             self,
-            T_world_world_before=self.T_world_world @ tracked @ inverse(np.stack(arrived)),
+            T_adjusted_arriving=self.T_adjusted_tracked @ tracked @ inverse(np.stack(arrived)),
             steps=steps,
         )
 
     def in_world(self, T_new_world: np.ndarray) -> FrameCorrection:
         """Return the correction to another common world; `T_new_world` (4, 4) takes points of this one to it."""
         moved = Similarity(1.0, T_new_world[:3, :3], T_new_world[:3, 3])
-        before = self.T_world_world_before
+        before = self.T_adjusted_arriving
         return replace(
             self,
-            T_world_world=T_new_world @ self.T_world_world @ inverse(T_new_world),
-            T_world_world_before=None if before is None else T_new_world @ before @ inverse(T_new_world),
+            T_adjusted_tracked=T_new_world @ self.T_adjusted_tracked @ inverse(T_new_world),
+            T_adjusted_arriving=None if before is None else T_new_world @ before @ inverse(T_new_world),
             S_common_map={number: moved.after(S) for number, S in self.S_common_map.items()},
             S_world_adjusted=moved.after(self.S_world_adjusted).after(moved.inverse()),
         )
@@ -210,18 +210,18 @@ class FrameCorrection:
 
         T_world_camera : (4, 4), as tracked, in the common world.
         """
-        T: np.ndarray = self._T_world_world(k, index) @ T_world_camera
+        T: np.ndarray = self._T_adjusted_tracked(k, index) @ T_world_camera
         reference, number = self._reference(index), int(self.index[k])
         if reference is not None and number in self.tracked:
             keyframe = self._world(number).transform_poses(self.tracked[number].T_world_camera)
-            centre = (self.T_world_world[k] @ keyframe)[:3, 3]
+            centre = (self.T_adjusted_tracked[k] @ keyframe)[:3, 3]
             T[:3, 3] = centre + np.exp(self.log_scale[reference]) * (T[:3, 3] - centre)
         return T
 
-    def _T_world_world(self, k: int, index: int) -> np.ndarray:
+    def _T_adjusted_tracked(self, k: int, index: int) -> np.ndarray:
         """Return the correction (4, 4) of a frame near keyframe k, which it follows or leads to."""
-        leads = index < self.index[k] and self.T_world_world_before is not None
-        corrections = self.T_world_world_before if leads else self.T_world_world
+        leads = index < self.index[k] and self.T_adjusted_arriving is not None
+        corrections = self.T_adjusted_arriving if leads else self.T_adjusted_tracked
         T: np.ndarray = np.asarray(corrections)[k]
         return T
 
@@ -259,7 +259,8 @@ class FrameCorrection:
         frames = (int(self.index[before]), index, int(self.index[after]))
         if all(frame in self.tracked for frame in frames):
             first, own, last = (self._world(f).transform_poses(self.tracked[f].T_world_camera) for f in frames)
-            last = inverse(self._T_world_world(after, index)) @ self.T_world_world[after] @ last  # as it arrived
+            T_arrived_adjusted = inverse(self._T_adjusted_tracked(after, index))
+            last = T_arrived_adjusted @ self.T_adjusted_tracked[after] @ last
             motion_before, motion_after = self._motion(first, own), self._motion(own, last)
             if motion_before + motion_after > _AT_REST:
                 return motion_before / (motion_before + motion_after)

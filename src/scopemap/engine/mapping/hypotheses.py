@@ -7,7 +7,7 @@
 | 3 | another shape, beside 1 and 2 | the same | mirrored, and flat (`other_starts.py`) |
 | 4 | other maps merged with it, one by one | the same, of all of them | as their loop closures have them |
 | 5 | another lens (`lens.py`) | the focal length, or the kind of lens, too | where 1 has ended; 4, if 1 was refused |
-| 6 | as tracked, if all of these are refused | nothing | |
+| 6 | as tracked, or as loop closures merge the maps, if all of these are refused | nothing | |
 | 7 | segments (`segments.py`), after 6 | as 1, of each by itself | as tracked |
 
 Where loops close, 1, 2 and 4 begin where the pose graph has the keyframes. `BundleProblem` holds what is free, and in
@@ -34,7 +34,7 @@ from scopemap.engine.mapping.judge import (
     Interval,
     MapErrors,
     ShapeTest,
-    refusal_by_lens,
+    refusal_by_tracked_poses,
     refusal_by_views,
     refusal_of_interval,
 )
@@ -83,12 +83,12 @@ def _alone(keyframes: Keyframes, main: int) -> tuple[Keyframes, AdjustedMaps]:
     Where no adjustment confirms the network's scale, that of the chain of frames stays: it is consistent.
     """
     if keyframes.log_scales.any():
-        without = keyframes.without_drift(1.0)
+        without = keyframes.with_path(keeps_drift=False)
         found = _of_map(without, main)
         if not found.correction.refused:
             return without, found
         del found  # for memory
-    keyframes = keyframes.without_drift(0.0)
+    keyframes = keyframes.with_path(keeps_drift=True)
     return keyframes, _of_map(keyframes, main)
 
 
@@ -106,7 +106,7 @@ def _unless_worse(keyframes: MapKeyframes, found: AdjustedMaps) -> AdjustedMaps:
     if found.correction.refused:
         return found
     lens = lens_test(found.problem, found.solution)
-    if (worse := refusal_by_lens(lens)) is None:
+    if (worse := refusal_by_tracked_poses(lens)) is None:
         return found._replace(correction=replace(found.correction, lens=lens))
     as_tracked = replace(keyframes.uncorrected(lens.held_px), refused=worse, lens=lens)
     return found._replace(correction=as_tracked, errors=found.errors._replace(is_adjusted=False))
@@ -124,7 +124,7 @@ def _merged(
     found, worlds, merged, refused = alone, {main: keyframes.unit(main)}, {main}, 0
     for number in [*keyframes.merged_worlds(main, allowed)][1:]:
         few = {main, keyframes.partner(number, merged), number}
-        # Each try costs an adjustment: no more of them fail than maps are merged, and one.
+        # Each try costs an adjustment: it stops once more of them failed than maps are merged.
         if refused > len(merged) or number not in (S := keyframes.merged_worlds(main, few)):
             continue
         together = _adjusted(keyframes, S, main)
@@ -191,21 +191,21 @@ def adjust_maps(keyframes: MapKeyframes, problem: BundleProblem, loops: np.ndarr
     """Return the bundle adjustment of keyframes, judged; loops : (A, 2) int, those of the accepted loop closures."""
     found, shape = _solution(keyframes, problem)
     fields: tuple[DepthCorrectionField, ...] = ()
-    refused = refusal_by_views(found.sigma_px, keyframes.settings.max_sigma_px, shape)
+    loop_frames = keyframes.index[loops].tolist()
+    refused = refusal_by_views(found.sigma_px, keyframes.settings.max_sigma_px, shape, len(keyframes.index))
     if refused is None:
         fields = keyframes.depth_fields(problem.points, found)
         # Other starts have judged the shape, where they could; else the depths do.
         refused = None if shape.is_tested else keyframes.refusal_by_depth(found, fields)
     graph_contradicts = False
     if refused is None:
-        correction = replace(keyframes.correction(found), depth_fields=fields, shape=shape, loops=len(loops))
+        correction = replace(keyframes.correction(found), depth_fields=fields, shape=shape, loop_frames=loop_frames)
     elif len(keyframes.S_common_map) > 1 and problem.start is not None:
         by_graph = found._replace(state=problem.start._replace(sigma_px=found.sigma_px))
-        correction = replace(keyframes.correction(by_graph), refused=refused, loops=len(loops))
+        correction = replace(keyframes.correction(by_graph), refused=refused, loop_frames=loop_frames)
         graph_contradicts = keyframes.refusal_by_depth(by_graph) is not None
     else:
         correction = replace(keyframes.uncorrected(found.sigma_px), refused=refused, shape=shape)
-    correction = replace(correction, loop_frames=keyframes.index[loops].tolist() if correction.loops else [])
     within_px, between_px = _errors_of_maps(keyframes, problem, found.state, main)
     before_px, _ = _errors_of_maps(keyframes, problem, problem.begin, main)
     errors = MapErrors(
@@ -214,7 +214,7 @@ def adjust_maps(keyframes: MapKeyframes, problem: BundleProblem, loops: np.ndarr
         largest_px=_largest(within_px),
         graph_px=math.inf if graph_contradicts else _largest(before_px),
         between_px=between_px,
-        loops=correction.loops,
+        loops=len(correction.loop_frames),
         support=_loop_support(loops, keyframes.map_of, main),
     )
     return AdjustedMaps(correction, errors, problem, found.state)

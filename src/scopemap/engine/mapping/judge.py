@@ -1,14 +1,14 @@
-"""Judge: whether an adjustment is kept. All limits on that are here, and all that applies them.
+"""Judge: whether an adjustment is kept. All limits on that are here, and nearly all that applies them.
 
 | what is adjusted | it is kept where | else |
 |---|---|---|
 | a keyframe as it comes, with the few before it | `keeps_window` | it is as tracked, with its reference's correction |
-| all keyframes of a map, or of merged maps | there is no `refusal_by_views`, `_by_depth`, `_by_lens` | as tracked |
+| all keyframes of a map, or of merged maps | there is no `refusal_by_views`, `_depth`, `_tracked_poses` | segments |
 | several maps together | `MapErrors.fit` | they stay apart |
 | successive keyframes that one scene explains | there is no `refusal_of_interval` | they are as tracked |
 | two such intervals together | `union_rank` | they stay two segments |
 | the same from another start | `is_clearly_less`, `is_same_shape` | the shape stays, or is not determined |
-| the same with another lens | `LensTest.contradicts`, `LensKinds.better_than` | the lens stays |
+| the same with another lens | `LensTest.contradicts`, `LensKinds.better_than` (reported only) | the lens stays |
 
 A window, a whole map and merged maps are refused first where the reprojection errors that they leave stay large. Small
 errors of what was adjusted prove little, so what an adjustment has not used judges it, too:
@@ -16,7 +16,9 @@ errors of what was adjusted prove little, so what an adjustment has not used jud
 - tracks that were left out: part of the points is adjusted, others are placed in the keyframes that were found
   (`halves`, `placed`). Their errors are compared (`left_out_px`) with those of another hypothesis, or as tracked
 - other starts: none of them may explain the left-out tracks as well by another shape (`ShapeTest`)
-- predicted depth away from the corners: keyframes that see the same surface must agree on it
+- predicted depth away from the corners: keyframes that see the same surface must agree on it. A whole map is judged by
+  it only where other starts could not (`ShapeTest.is_tested`). An interval is compared with its poses as tracked more
+  strictly, by it and by left-out tracks, than a whole map: to leave a second as tracked costs little
 
 Which loop closures are accepted is another question (`loop_closure.py`, `pose_graph.py`), and so is triangulated depth
 (`multiview_depth.py`).
@@ -25,7 +27,7 @@ Which loop closures are accepted is another question (`loop_closure.py`, `pose_g
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -144,12 +146,15 @@ def left_out_px(left_out: BundleProblem, state: State, unit: np.ndarray | float 
 # ---- all keyframes: why an adjustment is refused; None: it is not
 
 
-def refusal_by_views(sigma_px: float, max_sigma_px: float, shape: ShapeTest) -> Notice | None:
-    """Return why the views refuse an adjustment; sigma_px : of its reprojection errors, robust standard deviation."""
-    if not sigma_px <= max_sigma_px:  # NaN: nothing was observed
-        return _refusal("mapping-not-rigid", {"sigma_px": sigma_px})
+def refusal_by_views(sigma_px: float, max_sigma_px: float, shape: ShapeTest, keyframes: int) -> Notice | None:
+    """Return why the views refuse an adjustment of so many keyframes.
+
+    sigma_px : of its reprojection errors, robust standard deviation; NaN without observations.
+    """
+    if not_rigid := _not_rigid(sigma_px, max_sigma_px, keyframes):
+        return not_rigid
     if shape.refuses(sigma_px):
-        return _refusal("mapping-not-determined", {"error_px": shape.error_px, "other_px": shape.other_px})
+        return Notice("mapping-not-determined", {"error_px": shape.error_px, "other_px": shape.other_px})
     return None
 
 
@@ -165,20 +170,22 @@ def refusal_by_depth(
     both = (depth_disagreement(camera, *each, NEAR_GAPS) for each in (before, after))
     for was, now in zip(*both, strict=True):
         if now > _MAX_DEPTH_FACTOR * max(was, _DEPTH_ERROR):
-            return _refusal("mapping-depth-disagrees", {"tracked": was, "adjusted": now})
+            return Notice("mapping-depth-disagrees", {"tracked": was, "adjusted": now})
     return None
 
 
-def refusal_by_lens(lens: LensTest) -> Notice | None:
+def refusal_by_tracked_poses(lens: LensTest) -> Notice | None:
     """Return that the poses as tracked explain left-out tracks better."""
-    if not lens.is_worse:
+    if not lens.adjustment_is_worse:
         return None
-    return _refusal("mapping-worse", {"error_px": lens.held_px, "tracked_px": lens.tracked_px})
+    return Notice("mapping-worse", {"error_px": lens.held_px, "tracked_px": lens.tracked_px})
 
 
-def _refusal(code: str, values: Mapping[str, float]) -> Notice:
-    """Return the notice; `FrameCorrection.notice` adds how many maps loop closures have merged all the same."""
-    return Notice(code, {**values, "merged": ""})
+def _not_rigid(sigma_px: float, most_px: float, keyframes: int) -> Notice | None:
+    """Return that no rigid scene leaves such errors, or, where they are NaN, that so many keyframes share nothing."""
+    if math.isnan(sigma_px):
+        return Notice("mapping-without-observations", {"keyframes": keyframes})
+    return None if sigma_px <= most_px else Notice("mapping-not-rigid", {"sigma_px": sigma_px})
 
 
 Outcome = Literal["determined", "decided", "not determined", "not tested"]
@@ -272,7 +279,7 @@ class LensTest(NamedTuple):
         return self.free_px <= _MOST_FREE_PX and is_significant
 
     @property
-    def is_worse(self) -> bool:
+    def adjustment_is_worse(self) -> bool:
         """Whether the poses as tracked explain the left-out tracks better than the adjustment with the lens held."""
         return self.held_px > _MOST_OVER_TRACKED * self.tracked_px + _NOISE_PX
 
@@ -358,27 +365,27 @@ class Interval(NamedTuple):
     tracked_disagreement: float
 
     @property
-    def is_adjusted(self) -> bool:
+    def prefers_adjustment(self) -> bool:
         """Whether left-out tracks and depth prefer the adjustment to the poses as tracked."""
         agrees = self.disagreement <= max(_MOST_AFTER, self.tracked_disagreement)
         return self.error_px <= self.tracked_px and agrees
 
 
 def refusal_of_interval(interval: Interval, max_sigma_px: float) -> Notice | None:
-    """Return why the keyframes of an interval stay as tracked: left-out tracks or depth prefer that; None: they do not.
+    """Return that no rigid scene explains an interval, so that its keyframes stay as tracked; None: one does.
 
-    It is known before they are adjusted all together: a clip that gets nothing from that does not pay for it twice.
+    Where left-out tracks or depth prefer the poses as tracked, none does either. It is known before the keyframes are
+    adjusted all together: a clip that gets nothing from that does not pay for it twice.
     """
-    if interval.is_adjusted and interval.error_px <= max_sigma_px:
-        return None
-    return _refusal("mapping-not-rigid", {"sigma_px": interval.error_px})
+    most_px = max_sigma_px if interval.prefers_adjustment else -math.inf
+    return _not_rigid(interval.error_px, most_px, interval.last - interval.first + 1)
 
 
 def union_rank(union: Interval, parts: Sequence[Interval], max_sigma_px: float) -> tuple[bool, float] | None:
     """Return the rank of a union in the order of merging, the least first; None where no one scene explains it."""
     growth = union.error_px / max(mean_of_known([part.error_px for part in parts]), 1e-9)
     fits = union.error_px <= RIGID_SIGMA_PX or (union.error_px <= max_sigma_px and growth <= _MOST_OVER_PARTS)
-    if fits and union.is_adjusted:
+    if fits and union.prefers_adjustment:
         return False, union.error_px
     agreed = max(mean_of_known([part.tracked_disagreement for part in parts]), _GOOD_AGREEMENT)
     return (True, union.tracked_disagreement) if union.tracked_disagreement <= agreed else None

@@ -51,8 +51,8 @@ class Keyframes:
     log_scales : (K,) ln of the factor by which the estimated depth of each was scaled, `Frame.depth_scale`. grids_mm :
     K rows, depths (h, w) as `depth_grid` gives them, of `grid_shape`. tracks, loops : what was matched of them; loops
     are rows of the kind `LOOP`. camera, settings : of the run. anchored : as `scale_by_network` takes it.
-    most_observations : about so many are adjusted. log_drift, T_map_camera : (K,) ln of the drift of their scale, and
-    (K, 4, 4) poses without it, each in the world of its map, as `without_drift` sets them.
+    most_observations : about so many are adjusted. log_drift, T_map_camera : (K,) ln of the drift of their scale that
+    is divided out, and (K, 4, 4) poses without it, each in the world of its map, as `with_path` sets them.
     """
 
     frames: Sequence[int]
@@ -88,9 +88,9 @@ class Keyframes:
         pairs = pairs[errors_px(problem, problem.tracked) < _MAX_PART_ERROR * self.camera.fx]
         return split_maps(self.poses, pairs, relocalised)
 
-    def without_drift(self, share: float) -> Keyframes:
-        """Return the keyframes without this share of the drift of their scale, 1 or 0; needed before what follows."""
-        log_drift, T_map_camera = path_without_drift(self.poses, share * self.log_scales)
+    def with_path(self, *, keeps_drift: bool) -> Keyframes:
+        """Return the keyframes with or without the drift of their scale; needed before what follows."""
+        log_drift, T_map_camera = path_without_drift(self.poses, (0.0 if keeps_drift else 1.0) * self.log_scales)
         return replace(self, log_drift=log_drift, T_map_camera=T_map_camera)
 
     def unit(self, number: int) -> Similarity:
@@ -210,10 +210,10 @@ class MapKeyframes:
     def correction(self, found: BundleSolution) -> FrameCorrection:
         """Return the correction by a solution, without depth correction fields."""
         state = found.state
-        T_world_world = inverse(state.T_camera_world) @ inverse(self.T_world_camera)
+        T_adjusted_tracked = inverse(state.T_camera_world) @ inverse(self.T_world_camera)
         depth_mm = float(np.exp(np.median(state.log_depth))) if len(state.log_depth) else 1.0
         log_scale = state.log_scale - self.log_drift
-        correction = FrameCorrection(self.index, T_world_world, log_scale, found.sigma_px, depth_mm=depth_mm)
+        correction = FrameCorrection(self.index, T_adjusted_tracked, log_scale, found.sigma_px, depth_mm=depth_mm)
         return self._with_steps(correction)
 
     def uncorrected(self, sigma_px: float) -> FrameCorrection:

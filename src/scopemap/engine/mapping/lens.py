@@ -20,8 +20,8 @@ from functools import partial
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from scopemap.engine.mapping.bundle_adjustment import WINDOW, adjust, linearised
-from scopemap.engine.mapping.bundle_problem import BundleProblem, State, successive, successive_state
+from scopemap.engine.mapping.bundle_adjustment import MOST_AT_ONCE, adjust, linearised
+from scopemap.engine.mapping.bundle_problem import BundleProblem, State, middle
 from scopemap.engine.mapping.judge import LEAST_COMPARED, MOST_LENS_RATIO, LensTest, halves, left_out_px, placed
 
 # Of the adjustment with the focal length free.
@@ -44,7 +44,7 @@ def lens_test(problem: BundleProblem, solution: State) -> LensTest:
 
     Of more keyframes than are adjusted at once, those in the middle are tested.
     """
-    problem, solution = _middle(problem, solution)
+    problem, solution = middle(problem, solution, MOST_AT_ONCE)
     observed = np.unique(problem.observations.point)
     if len(observed) < 2 * LEAST_COMPARED or len(problem.T_camera_world) < 2:
         return LensTest()
@@ -60,16 +60,6 @@ def lens_test(problem: BundleProblem, solution: State) -> LensTest:
     change = free.log_focal - math.log(problem.focal_px)
     held_px, free_px, tracked_px = (left_out_px(left_out, placed(left_out, s)) for s in (held, free, left_out.tracked))
     return LensTest(held_px, free_px, change, math.sqrt(covariance[-1, -1]), tracked_px)
-
-
-def _middle(problem: BundleProblem, solution: State) -> tuple[BundleProblem, State]:
-    """Return a problem and its solution, of the keyframes in the middle where there are more than a window has."""
-    count = len(problem.T_camera_world)
-    if count <= WINDOW:
-        return problem, solution
-    first = (count - WINDOW) // 2
-    last = first + WINDOW
-    return successive(problem, first, last), successive_state(problem, solution, first, last)
 
 
 @dataclass(frozen=True)
@@ -89,7 +79,7 @@ class LensKinds:
         """
         if not self.kinds or math.isnan(test.held_px):
             return test
-        problem, solution = _middle(problem, solution)
+        problem, solution = middle(problem, solution, MOST_AT_ONCE)
         seen = _Seen(problem, solution, self.bend)
         best = {kind: seen.best_focal(bend) for kind, bend in self.kinds.items()}
         held_px = seen.error_px(self.bend, problem.focal_px)

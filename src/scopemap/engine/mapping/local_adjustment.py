@@ -19,8 +19,16 @@ from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.kept import Kept
-from scopemap.engine.mapping.bundle_adjustment import HELD_SIGMA, BundleSolution, adjust
-from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundleProblem, Observations, Points, State
+from scopemap.engine.mapping.bundle_adjustment import BundleSolution, adjust
+from scopemap.engine.mapping.bundle_problem import (
+    CORRELATED,
+    TRACKED,
+    BundleProblem,
+    Observations,
+    Points,
+    State,
+    held_to_result,
+)
 from scopemap.engine.mapping.correction import KeyframeCorrection, KeyframeStep
 from scopemap.engine.mapping.depth_correction import fit_depth_corrections
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
@@ -84,7 +92,7 @@ class LocalAdjustment:
     def adjusted(self, keyframe: Frame, reference: int, map_number: int) -> AdjustedKeyframe:
         """Return a new keyframe with its pose adjusted and its depth corrected.
 
-        keyframe : with its pose as tracked, against the keyframe of frame `reference`, and its depth as estimated. It
+        keyframe : with its pose as aligned, against the keyframe of frame `reference`, and its depth as estimated. It
         is adjusted with those before it where one of them, or what one of them was tracked against, is the reference.
         Elsewhere, where these observe hardly any of its points, and where no rigid scene explains the observations, it
         takes over the correction of the reference.
@@ -145,7 +153,7 @@ class LocalAdjustment:
         return self._corrections.get(reference, KeyframeCorrection())
 
     def _take(self, keyframe: Frame, reference: int, known: KeyframeMatches | None = None) -> KeyframeMatches:
-        """Put a keyframe in the window, as tracked; return its matches. known : what was matched of it before."""
+        """Put a keyframe in the window, as aligned; return its matches. known : what was matched of it before."""
         assert keyframe.T_world_camera is not None
         matches = self._tracks.add(keyframe, known=known)
         points, _ = self._tracks.collected([self._tracks.keyframe_count - 1])
@@ -162,9 +170,8 @@ class LocalAdjustment:
         T = np.stack(T_camera_world)
         start = State(T, np.array(log_scale), np.concatenate(log_depth), math.log(focal_px))
         held = max(count - _FREE, 0)
-        known, sigma = points.host < held, np.clip(np.concatenate(found_sigma), HELD_SIGMA, points.sigma)
-        estimated = np.where(known, start.log_depth - start.log_scale[points.host], points.log_depth)
-        points = replace(points, log_depth=estimated, sigma=np.where(known, sigma, points.sigma))
+        host_scale, found = start.log_scale[points.host], np.concatenate(found_sigma)
+        points = held_to_result(points, points.host < held, start.log_depth, host_scale, found)
         facts = (points, observations, TRACKED, np.arange(count - 1)[:, None] + [0, 1], focal_px)
         return BundleProblem(T, *facts, start=start, correlated=CORRELATED, held=held)
 

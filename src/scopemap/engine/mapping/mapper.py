@@ -242,8 +242,8 @@ class Mapper:
             self._relocalised.add(((part.map, part.lost_before), (found_in.map, found_in.lost_before)))
 
     @property
-    def adjusts(self) -> bool:
-        """Whether keyframes are adjusted after the last frame."""
+    def has_keyframes(self) -> bool:
+        """Whether there are keyframes to adjust after the last frame."""
         return self._backend is not None and bool(self._backend.keyframe_count)
 
     def add_found(self, track: Track) -> None:
@@ -321,12 +321,12 @@ class Mapper:
         correction. Small submaps, but for the first, are left out.
         """
         self._tracked = self._poses()
-        not_first = self._split_maps() | self._extended
+        begins_elsewhere = self._split_maps() | self._extended
         frames = Counter(pose.map for pose in self._tracked.values())
         found: list[Submap] = []
         while frames:
             main = max(frames, key=lambda number: frames[number])
-            submap = self._submap(main, frames, not_first)
+            submap = self._submap(main, frames, begins_elsewhere)
             found.append(submap)
             for number in submap.maps:
                 del frames[number]
@@ -350,7 +350,7 @@ class Mapper:
         self._tracked = {index: pose._replace(map=number(pose)) for index, pose in self._tracked.items()}
         return {pose.map for pose in self._tracked.values()} - before
 
-    def _submap(self, main: int, among: Collection[int], not_first: Collection[int]) -> Submap:
+    def _submap(self, main: int, among: Collection[int], begins_elsewhere: Collection[int]) -> Submap:
         """Return the submap of a map and of those among others that are merged with it, adjusted."""
         if self._backend is None or not self._backend.keyframes(main):
             frames = self._frames_of((main,))
@@ -361,16 +361,18 @@ class Mapper:
         frames = self._frames_of(maps)
         adjusted[-1] = replace(adjusted[-1], last=max(frames))
         before, segments = -1, []
-        for segment in self._from_first_frame(adjusted, min(frames), not_first):
+        for segment in self._from_first_frame(adjusted, min(frames), begins_elsewhere):
             own = frozenset(index for index in frames if before < index <= segment.last)
             segments.append(replace(segment, frames=own))
             before = segment.last
         return Submap(main, maps, frames, self._frames_of((main,)), tuple(segments))
 
-    def _from_first_frame(self, segments: Sequence[Segment], first: int, not_first: Collection[int]) -> list[Segment]:
+    def _from_first_frame(
+        self, segments: Sequence[Segment], first: int, begins_elsewhere: Collection[int]
+    ) -> list[Segment]:
         """Return the segments in the world of the first frame: that of maps that begin elsewhere is another one."""
         tracked = self._tracked[first]
-        if tracked.map not in not_first:
+        if tracked.map not in begins_elsewhere:
             return [*segments]
         assert segments[0].correction is not None
         T_first_world = inverse(segments[0].correction.pose(first, tracked.T_world_camera))

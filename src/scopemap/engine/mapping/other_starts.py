@@ -24,7 +24,7 @@ from scopemap.engine.mapping.bundle_adjustment import (
     adjust_one_by_one,
     log_depth_sigma,
 )
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State, successive, successive_state
+from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State, middle
 from scopemap.engine.mapping.judge import (
     KNOWN_SIGMA,
     LEAST_COMPARED,
@@ -81,11 +81,7 @@ def with_other_starts(
     whether it explains the observations; where it does not, it cannot win. Of many keyframes those in the middle are
     tested; all, where another start wins there.
     """
-    tested, keyframes, count = problem, found.state, len(problem.T_camera_world)
-    if count > MOST_KEYFRAMES:
-        first = (count - MOST_KEYFRAMES) // 2
-        tested = successive(problem, first, first + MOST_KEYFRAMES)
-        keyframes = successive_state(problem, found.state, first, first + MOST_KEYFRAMES)
+    tested, keyframes = middle(problem, found.state, MOST_KEYFRAMES)
     best, test = _test(tested, keyframes, is_rigid=is_rigid)
     if test.replaced and tested is not problem:
         best, test = _test(problem, found.state, is_rigid=is_rigid)

@@ -50,10 +50,10 @@ _ITERATIONS = 12
 class Segment:
     """A part of a submap's time that one scene explains.
 
-    last : number of the frame of its last keyframe, with which the next segment begins; of the last segment the number
-    of its last frame. correction : of poses and depth of its frames, to the world of the submap; None: they are as
-    tracked. is_joined : False where it shares no keyframe with the segment before, so that only the motion as tracked
-    joins them. frames : numbers of its frames.
+    last : number of the frame of its last keyframe, which the next segment is adjusted from, too; the frame is of this
+    one. Of the last segment the number of its last frame. correction : of poses and depth of its frames, to the world
+    of the submap; None: they are as tracked. is_joined : False where it shares no keyframe with the segment before, so
+    that only the motion as tracked joins them. frames : numbers of its frames.
     """
 
     last: int

@@ -11,6 +11,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.corner_pose import nonrigidity
 from scopemap.engine.tracking.track import FrameTracker, KeyframeDecision, Track
+from scopemap.engine.tracking.usable import too_few_pixels
 
 
 class CameraAtRest(FrameTracker):
@@ -30,11 +31,11 @@ class CameraAtRest(FrameTracker):
 
     def track(self, frame: Frame) -> Track:
         """Return the identity, with the motion of the tissue since the keyframe; "lost" where little is usable."""
-        here, share = np.eye(4), float(frame.valid.mean())
+        here, loss = np.eye(4), too_few_pixels(frame, self._settings)
         self._frames_since_keyframe += 1
-        if share < self._settings.min_valid_share:
+        if loss is not None:
             reference = frame.index if self._keyframe is None else self._keyframe
-            return Track(frame.index, "lost", f"only {share:.0%} of the image is usable", here, reference)
+            return Track(frame.index, "lost", loss.reason, here, reference, cause=loss.cause)
         if self._keyframe is None:
             first = "first frame of the map"
             return Track(frame.index, "initial", first, here, frame.index, decision=KeyframeDecision("new", first))

@@ -35,11 +35,11 @@ def too_few_pixels(frame: Frame, settings: TrackingSettings) -> TrackingLoss | N
 
 def covered_by(instruments: np.ndarray, frame: Frame, settings: TrackingSettings) -> TrackingLoss | None:
     """Return that instruments (H, W) bool, left out of a frame, leave too few usable pixels; None: enough are left."""
-    share = float(frame.valid.mean())
-    if share >= settings.min_valid_share:
-        return None
-    reason = f"only {share:.0%} of the image is usable: instruments cover {instruments.mean():.0%}"
-    return TrackingLoss(LossCause.VIEW_COVERED, reason)
+    loss = too_few_pixels(frame, settings)
+    return loss and TrackingLoss(
+        LossCause.VIEW_COVERED,
+        f"only {frame.valid.mean():.0%} of the image is usable: instruments cover {instruments.mean():.0%}",
+    )
 
 
 class TextureMonitor:

@@ -161,7 +161,7 @@ def with_focal_from_motion(sequence: Sequence, config: Config) -> tuple[Sequence
     is_unknown, bends = bool(kept), abs(estimate.distortion) >= _MIN_DISTORTION
     if not wanted and (is_unknown or bends):
         # A run that adjusts nothing afterwards does not wait for windows to be adjusted.
-        adjusts = config.mapping.at_end
+        adjusts = config.mapping.global_adjustment
         found = try_lenses(windows, scope) if adjusts else None
         tried = _agreeing(found, estimate, sequence, windows)
         if tried is not None and not tried.reason:
