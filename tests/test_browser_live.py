@@ -20,7 +20,7 @@ import pytest
 from front_door import call
 from test_live import write_video
 from tiny_phantom import write_tiny
-from window_without_browser import element, press, until, words
+from window_without_browser import element, press, seen_by_someone, until, words
 
 from scopemap.apps.browser.live_page import open_live
 from scopemap.apps.browser.result_page import ResultPage
@@ -30,7 +30,7 @@ from scopemap.apps.browser.workspace import Workspace
 from scopemap.apps.live.shown import words_and_facts
 from scopemap.engine.errors import InputError
 from scopemap.result.result import Result
-from scopemap.result.run_view import read_map, read_pictures, read_state, view_folder
+from scopemap.result.run_view import look, read_map, read_pictures, read_state, view_folder
 
 PATIENCE_S = 240.0
 STATE = {
@@ -87,6 +87,7 @@ def test_a_session_that_is_watched_does_what_lines_say(clip: Path, tmp_path: Pat
 
         def state() -> Any:
             assert process.poll() is None
+            look(view)
             return read_state(view)
 
         try:
@@ -102,7 +103,7 @@ def test_a_session_that_is_watched_does_what_lines_say(clip: Path, tmp_path: Pat
             snapshot = Path(wait_for(lambda: state().facts.get("snapshot")))
             # Coverage comes in a process of its own, in words and as a picture, and is what the window shows.
             wait_for(lambda: state().facts["coverage"].startswith("Of map 1 until"))
-            assert (view / "coverage.png").is_file()
+            wait_for(lambda: state() and (view / "coverage.png").is_file())
             last = state().frame
             press_line("reset")
             wait_for(lambda: state().doing == "tracking" and state().frame > last and read_map(view).index[0] > last)
@@ -134,6 +135,7 @@ def test_a_stream_in_the_window(clip: Path, tmp_path: Path) -> None:
     with Workspace(tmp_path) as workspace:
         window = BrowserWindow()
         try:
+            seen_by_someone(window)
             open_live(window, workspace, str(clip))
             until(window, lambda: "tracked at" in words(window), PATIENCE_S)
             page: Any = window._page
@@ -143,7 +145,8 @@ def test_a_stream_in_the_window(clip: Path, tmp_path: Path) -> None:
             until(window, lambda: "paused" in words(window), PATIENCE_S)
             press(window, "Pause or go on")
             until(window, lambda: "tracking" in words(window), PATIENCE_S)
-            assert {"/page/points", "/page/path", "/page/now"} <= window.scene._handle_from_node_name.keys()
+            drawn = {"/page/points", "/page/path", "/page/now"}
+            until(window, lambda: drawn <= window.scene._handle_from_node_name.keys(), PATIENCE_S)
             press(window, "Stop")
             assert element(window, "Pause or go on").disabled
             until(window, lambda: isinstance(window._page, ResultPage), PATIENCE_S)

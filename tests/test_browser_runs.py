@@ -19,20 +19,22 @@ from scopemap.engine.errors import InputError
 
 # In place of Python with scopemap: what the input is called says what its run does.
 STAND_IN = """#!{python}
-import pathlib, signal, sys, time
+import pathlib, shutil, signal, sys, time
 source, out = pathlib.Path(sys.argv[4]), pathlib.Path(sys.argv[6])
-(out / ".unfinished").mkdir(parents=True, exist_ok=True)
+kept = out / ".unfinished" / "checkpoint"
+has_begun = kept.is_dir()
+kept.mkdir(parents=True, exist_ok=True)
 def stopped(*_):
-    (out / "provenance.json").write_text("{{}}")
+    (kept / "state.json").write_text("{{}}")
     sys.exit(130)
-signal.signal(signal.SIGINT, stopped)
+signal.signal(signal.SIGINT, signal.SIG_IGN if source.stem == "long_deaf" else stopped)
 print("started", flush=True)
-if source.stem.startswith("long"):
+if source.stem.startswith("long") and not has_begun:
     time.sleep(300)
 if source.stem.startswith("bad"):
     print("scopemap: reading the video: it is none")
     sys.exit(1)
-(out / ".unfinished").rmdir()
+shutil.rmtree(out / ".unfinished")
 (out / "provenance.json").write_text("{{}}")
 """
 
@@ -67,10 +69,41 @@ def test_runs_wait_for_each_other_and_end_as_they_end(workspace: Workspace) -> N
     assert [workspace.runs.place(run) for run in asked] == [0, 1, 2]
     wait(workspace, has_begun(asked[0]))
     asked[0].stop()
-    asked[0].stop()  # a second signal to the process would leave nothing
+    asked[0].stop()  # a second signal to the process would leave less
     wait(workspace, lambda: asked[2].status == "done")
-    assert [run.status for run in asked] == ["done", "failed", "done"]
+    assert [run.status for run in asked] == ["stopped", "failed", "done"]
     assert asked[1].sentence == "reading the video: it is none"
+
+
+def test_what_was_stopped_goes_on_and_is_made_a_result_of(workspace: Workspace) -> None:
+    source = workspace.folder / "long.mp4"
+    run = workspace.reconstruct(source, ["--fps=5"])
+    wait(workspace, has_begun(run))
+    run.stop()
+    wait(workspace, lambda: run.status == "stopped")
+    assert run.is_kept
+    assert workspace.interrupted == []
+    assert workspace.reconstruct(source, ["--fps=4"]).out != run.out, "other settings would begin anew there"
+    workspace.runs.runs[-1].kill()
+    part = run.finish(run.copy())
+    assert part.arguments == ("--fps=5", "--finish")
+    assert part.out.name == "long_so_far"
+    wait(workspace, lambda: part.status == "done")
+    assert run.is_kept, "it was copied"
+    # To choose the video again, or to press Continue, is the same.
+    assert workspace.reconstruct(source, ["--fps=5"]) is run
+    wait(workspace, lambda: run.status == "done")
+    assert not run.is_kept
+
+
+def test_a_run_that_does_not_stop_in_time_is_ended(workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert runs._PATIENCE_S < 10
+    monkeypatch.setattr(runs, "_PATIENCE_S", 0.2)
+    run = workspace.reconstruct(workspace.folder / "long_deaf.mp4", [])
+    wait(workspace, has_begun(run))
+    run.stop()
+    wait(workspace, lambda: run.status == "stopped")
+    assert not run.is_kept
 
 
 def test_a_run_that_waits_is_taken_out_of_the_queue(workspace: Workspace) -> None:
@@ -91,7 +124,6 @@ def test_what_a_killed_run_left_is_gone_on_with(workspace: Workspace) -> None:
     wait(workspace, has_begun(first))
     assert workspace.interrupted == []
     workspace.runs.close()  # the window ends
-    assert not (first.out / "provenance.json").exists(), "a gentle signal writes a result that nothing goes on from"
     wait(workspace, lambda: first.status == "failed")
     assert workspace.interrupted == [first.out]
     again = workspace.reconstruct(source, ["--fps=5"])

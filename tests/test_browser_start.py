@@ -284,8 +284,19 @@ def test_a_video_is_sent_looked_at_run_and_stopped(browser: Any, served: tuple[s
     assert "good: motion, sharpness and texture" in opened.text()
     opened.press("Reconstruct")
     opened.until(lambda: opened.points() > 0)
-    opened.press("Stop and keep what there is")
+    opened.press("Stop")
+    opened.until(lambda: "What was tracked is kept" in opened.text())
     out = folder / "scopemap" / "video_001"
+    assert not (out / "provenance.json").exists()
+    opened.press("Make a result of these frames")
+    part = folder / "scopemap" / "video_001_so_far"
+    opened.until(lambda: (part / "provenance.json").exists())
+    assert Result(part).provenance["interrupted_at_frame"] is not None
+    # What was stopped is still there, and goes on.
+    opened.until(lambda: "Continue" in opened.text())
+    opened.press("Continue")
     opened.until(lambda: (out / "provenance.json").exists())
+    assert Result(out).provenance["resumed_after_frame"] is not None
+    assert Result(out).provenance["interrupted_at_frame"] is None
     word = verdict(Result(out)).word.capitalize()
     opened.until(lambda: word in opened.text())

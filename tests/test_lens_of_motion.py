@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,10 @@ from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.input.opening import open_sequence
 from scopemap.input.scopes import KINDS
-from scopemap.input.sequence import Sequence
+from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
-from scopemap.runner.lens_of_motion import lenses_of, with_lens_of_motion
+from scopemap.runner.lens_of_motion import OtherLens, lens_of_motion, lenses_of
+from scopemap.runner.observers import RunStopped
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Run
 
@@ -33,8 +35,9 @@ def clip(tmp_path: Path) -> Path:
 def test_an_assumed_lens_is_replaced_and_no_doubt_of_it_stays(clip: Path) -> None:
     sequence = open_sequence(clip)
     sequence.source.warnings.append(Notice("camera-unknown", {"reason": "the camera hardly turns"}))
-    found = with_lens_of_motion(sequence, Config(), WIDER, again=False)
-    assert isinstance(found, Sequence)
+    found = lens_of_motion(sequence, Config(), WIDER, again=False)
+    assert isinstance(found, OtherLens)
+    found = found.seen_by(sequence)
     assert found.camera.fx == pytest.approx(sequence.camera.fx * math.exp(-0.4))
     assert found.camera_origin == "estimated"
     assert found.camera_source == "estimated: pinhole, field of view 92 deg, from the motion, 87 to 98"
@@ -56,15 +59,16 @@ def test_an_assumed_lens_is_replaced_and_no_doubt_of_it_stays(clip: Path) -> Non
     ],
 )
 def test_a_lens_that_is_given_or_not_contradicted_stays(clip: Path, given: dict, lens: LensTest) -> None:
-    assert with_lens_of_motion(open_sequence(clip, **given), Config(), lens, again=False) is None
+    assert lens_of_motion(open_sequence(clip, **given), Config(), lens, again=False) is None
 
 
 def test_a_fisheye_straightens_the_pictures_and_states_its_own_field_of_view(clip: Path) -> None:
     sequence = open_sequence(clip)
     kind = "equidistant fisheye"
     assert set(lenses_of(sequence, Config(), again=False).kinds) == set(KINDS)
-    found = with_lens_of_motion(sequence, Config(), WIDER._replace(kind=kind, log_focal=-0.2), again=False)
-    assert isinstance(found, Sequence)
+    found = lens_of_motion(sequence, Config(), WIDER._replace(kind=kind, log_focal=-0.2), again=False)
+    assert isinstance(found, OtherLens)
+    found = found.seen_by(sequence)
     assert isinstance(found.rectifier.source, FisheyeCamera)
     assert found.rectifier.source.distortion == KINDS[kind]
     fov_deg = math.degrees(sequence.camera.width / (sequence.camera.fx * math.exp(-0.2)))
@@ -75,8 +79,8 @@ def test_a_fisheye_straightens_the_pictures_and_states_its_own_field_of_view(cli
 
 def test_a_lens_of_the_motion_is_refined_while_it_changes_much(clip: Path) -> None:
     sequence, slightly = open_sequence(clip), WIDER._replace(free_px=0.295)
-    assert with_lens_of_motion(sequence, Config(), slightly, again=True) is not None
-    assert with_lens_of_motion(sequence, Config(), slightly._replace(log_focal=0.04), again=True) is None
+    assert lens_of_motion(sequence, Config(), slightly, again=True) is not None
+    assert lens_of_motion(sequence, Config(), slightly._replace(log_focal=0.04), again=True) is None
 
 
 def test_the_assumed_field_of_view_typed_in_is_still_assumed(clip: Path) -> None:
@@ -123,3 +127,38 @@ def test_a_run_begins_again_with_the_lens_of_the_motion(
     assert result.provenance["camera"]["origin"] == "estimated"
     assert result.camera.fx == pytest.approx(open_sequence(clip).camera.fx * math.exp(-0.4))
     assert not {"camera-assumed", "camera-unknown"} & {reason.code for reason in verdict(result).reasons}
+
+
+def test_a_pass_with_the_lens_of_the_motion_is_stopped_and_goes_on_to_the_same_bytes(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settled = LensTest(0.2, 0.2, 0.0, 0.01)
+
+    def run(out: Path, tests: list[LensTest], *observers: Callable[[Step], None]) -> list[int]:
+        told, indices = iter(tests), list[int]()
+        monkeypatch.setattr(Run, "lens", property(lambda run: next(told)))
+        note = lambda step: indices.append(step.frame.index)  # noqa: E731
+        sequence = open_sequence(clip)
+        reconstruct(sequence, Config.load(settings=LIGHT), out=out, observers=(note, *observers))
+        return indices
+
+    seen = _Seen()
+
+    def stop(step: Step) -> None:
+        seen(step)
+        if seen.begun and step.frame.index == 4:
+            raise RunStopped
+
+    stop.forget = seen.forget  # type: ignore[attr-defined]
+    whole = run(tmp_path / "whole", [WIDER, settled])
+    with pytest.raises(RunStopped):
+        run(tmp_path / "stopped", [WIDER], stop)
+    rest = run(tmp_path / "stopped", [settled])
+    assert rest == whole[len(whole) - len(rest) :]
+    assert rest[0] > 4, "no frame is tracked twice"
+    assert rest[0] < 12
+    for name in ("trajectory.tum", "frames.csv", "camera.yaml", "config.toml"):
+        assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    said = [Result(tmp_path / name).provenance for name in ("whole", "stopped")]
+    assert said[0]["notices"] == said[1]["notices"]
+    assert said[0]["camera"] == said[1]["camera"]

@@ -23,6 +23,7 @@ from scopemap.report.frame_pictures import FramePictures
 from scopemap.result.checkpoint import CHECKPOINT, SavedState
 from scopemap.result.result_folder import LOCK, UNFINISHED
 from scopemap.runner.checkpoints import can_resume, check_resumable, discard_unfinished, identity_of
+from scopemap.runner.observers import RunStopped
 
 # Seconds, and sums of files that hold some.
 _OF_ITS_TIME = {"provenance.json", "SHA256SUMS"}
@@ -83,6 +84,28 @@ def test_a_killed_run_goes_on_to_the_same_bytes(folder: Path, whole: tuple[str, 
     after = result.provenance["resumed_after_frame"]
     assert after >= 1
     assert seen == list(range(after + 1, FRAMES))
+    assert _bytes(out) == _bytes(wanted)
+
+
+def test_a_stopped_run_keeps_every_frame_and_goes_on_to_the_same_bytes(
+    folder: Path, whole: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    preset, wanted = whole
+    out, tracked = tmp_path / "run", list[int]()
+    # Not often: what is kept is the state at the stop.
+    monkeypatch.setattr("scopemap.runner.checkpoints._LEAST_S", 1000.0)
+
+    def stop_in_the_middle(step: Step) -> None:
+        tracked.append(step.frame.index)
+        if len(tracked) in (3, FRAMES):
+            raise RunStopped
+
+    for _ in range(2):
+        with pytest.raises(RunStopped):
+            _run(folder, out, preset, observers=(stop_in_the_middle,))
+        assert [path.name for path in out.iterdir()] == [UNFINISHED]
+    _run(folder, out, preset, observers=(stop_in_the_middle,))
+    assert tracked == list(range(FRAMES)), "no frame is tracked twice"
     assert _bytes(out) == _bytes(wanted)
 
 

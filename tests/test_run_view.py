@@ -21,8 +21,9 @@ from scopemap.engine.odometry import Step
 from scopemap.input.opening import open_sequence
 from scopemap.result.result import Result
 from scopemap.result.result_folder import UNFINISHED
-from scopemap.result.run_view import RunProgressState, SeenMap, read_map, read_pictures, read_state, view_folder
+from scopemap.result.run_view import RunProgressState, SeenMap, look, read_map, read_pictures, read_state, view_folder
 from scopemap.runner import watched
+from scopemap.runner.observers import RunStopped
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.watched import RunWatch
 
@@ -48,6 +49,8 @@ class Looking(RunWatch):
         self._look()
 
     def _look(self) -> None:
+        self.folder.mkdir(exist_ok=True)
+        look(self.folder)
         self._write()
         for found, seen in (
             (self.states, read_state(self.folder)),
@@ -72,6 +75,7 @@ def settings(phantom: Path) -> Config:
 def looked(phantom: Path, settings: Config, tmp_path_factory: pytest.TempPathFactory) -> tuple[Looking, Path]:
     out, patch = tmp_path_factory.mktemp("run") / "out", pytest.MonkeyPatch()
     patch.setattr(watched, "_POINTS_EVERY_S", 0.0)
+    patch.setattr(watched, "_DRAWN_EVERY_S", 0.0)
     watch = Looking(out, FRAMES)
     reconstruct(open_sequence(phantom), settings, out=out, observers=(watch,), progress=watch.progress)
     patch.undo()
@@ -131,6 +135,47 @@ def test_nothing_of_it_is_in_the_result(
     assert _contents(out) == _contents(tmp_path / "out")
 
 
+def test_what_was_seen_goes_on_with_a_run_that_was_stopped(phantom: Path, settings: Config, tmp_path: Path) -> None:
+    out, counts = tmp_path / "out", list[tuple[int, int]]()
+
+    def run(stop_at: int) -> None:
+        watch = RunWatch(out, FRAMES)
+
+        def note(step: Step) -> None:
+            state = watch.state()
+            counts.append((state.frames, state.points))
+            if step.frame.index == stop_at:
+                raise RunStopped
+
+        reconstruct(open_sequence(phantom), settings, out=out, observers=(watch, note))
+
+    with pytest.raises(RunStopped):
+        run(1)
+    run(FRAMES)
+    assert [frames for frames, _ in counts] == list(range(1, FRAMES + 1))
+    points = [points for _, points in counts]
+    assert points == sorted(points)
+    assert points[-1] > points[0] > 0
+
+
+def test_where_nobody_looks_nothing_is_drawn(phantom: Path, settings: Config, tmp_path: Path) -> None:
+    out, seen = tmp_path / "out", list[tuple[set[str], RunProgressState]]()
+
+    def note(step: Step) -> None:
+        watch._write()
+        state = read_state(view_folder(out))
+        assert state is not None
+        seen.append(({file.name for file in view_folder(out).iterdir()}, state))
+        if step.frame.index == FRAMES - 3:
+            look(view_folder(out))
+
+    watch = RunWatch(out, FRAMES)
+    reconstruct(open_sequence(phantom), settings, out=out, observers=(watch, note))
+    assert [names for names, _ in seen[:-2]] == [{"state.json"}] * (FRAMES - 2)
+    assert {"picture.jpg", "depth.jpg", "map.npz"} <= seen[-2][0]
+    assert [state.frames for _, state in seen] == list(range(1, FRAMES + 1))
+
+
 def test_a_folder_that_takes_nothing_does_not_end_the_run(
     phantom: Path, settings: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,7 +205,7 @@ def test_a_run_in_a_terminal_can_be_watched_and_killed(phantom: Path, tmp_path: 
     frames, out = only_images(phantom, tmp_path / "frames"), tmp_path / "out"
     command = [sys.executable, "-m", "scopemap", "run", str(frames), "--out", str(out), "--watched", "--quiet"]
     killed = subprocess.Popen(command, env=os.environ | {"PYTHONUNBUFFERED": "1"})
-    while killed.poll() is None and read_map(view_folder(out)) is None:
+    while killed.poll() is None and read_state(view_folder(out)) is None:
         pass
     killed.send_signal(signal.SIGKILL)
     killed.wait()

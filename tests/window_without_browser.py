@@ -70,6 +70,12 @@ def press(window: BrowserWindow, label: str, value: Any = None) -> None:
     settle(window)
 
 
+def seen_by_someone(window: BrowserWindow) -> None:
+    """Let a window believe that a browser looks at it."""
+    client = SimpleNamespace(camera=SimpleNamespace())
+    window.server.get_clients = lambda: {0: client}
+
+
 class Client:
     """A connection to a window as its page has one, that sends files."""
 

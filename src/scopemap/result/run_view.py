@@ -2,14 +2,18 @@
 
 DIR/.unfinished/view/  state.json  picture.jpg (usable pixels, corners)  depth.jpg  map.npz (path, points)
                        coverage.png (of a live stream: what was not seen so far)
+                       looked_at (touched by whoever looks)
 
-Whoever looks reads them when it likes, so that nobody who looks can slow the run down. They go with the folder.
+Whoever looks reads them when it likes, so that nobody who looks can slow the run down. Where nobody looks, state.json
+alone is written. They go with the folder.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -23,6 +27,9 @@ _PICTURE = "picture.jpg"
 _DEPTH = "depth.jpg"
 _MAP = "map.npz"
 _COVERAGE = "coverage.png"
+_LOOKED = "looked_at"
+_LOOKED_S = 5.0
+"""Someone who has looked so long ago still looks: a window that is busy looks late."""
 
 
 def view_folder(out: Path) -> Path:
@@ -37,7 +44,8 @@ class RunProgressState:
     doing : what is done now, in words. done, total : frames; 0: not known. time_left : in words, or "". status : of the
     last frame, as `Track` has it, or "" before the first. reason : why it is lost. lost : frames lost so far. frame :
     number of the last frame, time_s : its time. submap : its number. adjusted : whether poses and points are those
-    after the adjustment. written : counts what was written. facts : of a live stream, more in words by name.
+    after the adjustment. points : of the surface that were seen so far, fewer are drawn; frames : that have a pose.
+    written : counts what was drawn. facts : of a live stream, more in words by name.
     """
 
     doing: str = "preparing"
@@ -51,16 +59,19 @@ class RunProgressState:
     time_s: float = 0.0
     submap: int = 0
     adjusted: bool = False
+    points: int = 0
+    frames: int = 0
     written: int = 0
     facts: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class SeenMap:
-    """The current submap so far, in its world, mm.
+    """The current submap so far, in a world for the eye, mm.
 
     index : (N,) numbers of tracked frames. T_world_camera : (N, 4, 4) float32. keyframe : (N,) bool. points : (M, 3)
-    float32, colours : (M, 3) uint8. fov_rad, aspect : vertical field of view of the camera, width over height.
+    float32, colours : (M, 3) uint8. earlier : (K, 3) float32, points of what was seen before tracking began anew, whose
+    place beside the others is a guess. fov_rad, aspect : vertical field of view of the camera, width over height.
     """
 
     index: np.ndarray
@@ -68,8 +79,23 @@ class SeenMap:
     keyframe: np.ndarray
     points: np.ndarray
     colours: np.ndarray
+    earlier: np.ndarray
     fov_rad: float
     aspect: float
+
+
+def look(folder: Path) -> None:
+    """Have the run draw what can be seen: someone looks. Nothing happens where there is no run."""
+    with suppress(OSError):
+        (folder / _LOOKED).touch()
+
+
+def is_looked_at(folder: Path) -> bool:
+    """Return whether someone has looked just now."""
+    try:
+        return time.time() - (folder / _LOOKED).stat().st_mtime < _LOOKED_S
+    except OSError:
+        return False
 
 
 def write_state(folder: Path, state: RunProgressState) -> None:
@@ -89,7 +115,7 @@ def write_coverage(folder: Path, drawn: bytes) -> None:
 
 
 def write_map(folder: Path, seen: SeenMap) -> None:
-    """Write the current submap; raises `OSError`."""
+    """Write what is shown of the surface; raises `OSError`."""
     held = io.BytesIO()
     np.savez(held, allow_pickle=False, **{name: np.asarray(value) for name, value in vars(seen).items()})
     _replace(folder / _MAP, held.getvalue())
@@ -122,7 +148,7 @@ def read_coverage(folder: Path) -> bytes | None:
 
 
 def read_map(folder: Path) -> SeenMap | None:
-    """Return the current submap; None where there is none."""
+    """Return what is shown of the surface; None where there is nothing."""
     try:
         with np.load(folder / _MAP, allow_pickle=False) as held:
             arrays = {one.name: held[one.name] for one in fields(SeenMap)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,8 +16,8 @@ from scopemap.input.sequence import Sequence
 from scopemap.result.checkpoint import SavedState, discard_checkpoint, has_checkpoint
 from scopemap.result.checksums import input_checksum
 from scopemap.result.result_folder import STORED, UNFINISHED
+from scopemap.runner.observers import FrameWriter
 from scopemap.runner.provenance import package_versions
-from scopemap.runner.run import FrameWriter
 
 # Writing takes a 50th of the time, unless that is less often than once a minute: so much is done again at most.
 _SHARE = 0.02
@@ -40,18 +41,18 @@ class Checkpoints:
     so that together they are the state of the run after that frame.
 
     folder : of the unfinished run. identity : what a run must have in common with this one to resume it, as JSON holds
-    it. observers : that go with the run. Raises `InputError` as `SavedState` does.
+    it. others : what goes with the run, by name. Raises `InputError` as `SavedState` does.
     """
 
     def __init__(
-        self, folder: Path, identity: dict[str, Any], run: ResumableRun, observers: tuple[object, ...] = ()
+        self, folder: Path, identity: dict[str, Any], run: ResumableRun, others: Mapping[str, object] | None = None
     ) -> None:
         self._state = SavedState(folder)
         self._identity, self._run = identity, run
         sequence, fusion = run.sequence, run.pipeline.fusion
-        others = {"run": run, "fusion": fusion, "frame choice": sequence.choice, "source": sequence.source}
-        others |= {f"writer {number}": writer for number, writer in enumerate(run.writers)}
-        self._others = others | {f"observer {number}": observer for number, observer in enumerate(observers)}
+        own = {"run": run, "fusion": fusion, "frame choice": sequence.choice, "source": sequence.source}
+        own |= {f"writer {number}": writer for number, writer in enumerate(run.writers)}
+        self._others = own | dict(others or {})
         self._begun_s = time.perf_counter()
         self._first_s = self._next_s = self._begun_s + _LEAST_S
         self._open = False
@@ -87,13 +88,16 @@ class Checkpoints:
         self._next_s = self._begun_s + min(max(_LEAST_S, self._state.seconds / _SHARE), most_s)
         self._open = False
 
-    def commit_all(self, last: int) -> None:
-        """Write the state after all frames, when no stage is at work; that of a short run is not worth it."""
-        if time.perf_counter() < self._first_s:
+    def commit_all(self, last: int, *, stopped: bool, complete: bool) -> None:
+        """Write the state after the last frame that was read, when no stage is at work.
+
+        stopped : the run ends with it; else that of a short run is not worth it. complete : no further frame follows.
+        """
+        if time.perf_counter() < self._first_s and not stopped:
             return
         for stage in self._run.pipeline.stages:
             self.keep(stage)
-        self.commit(last, complete=True)
+        self.commit(last, complete=complete)
 
     def restore(self) -> tuple[int, bool]:
         """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
@@ -170,6 +174,15 @@ def check_resumable(out: Path, sequence: Sequence, config: Config) -> None:
         raise InputError(
             f"cannot resume the run in {out}: {'; '.join(found[:_SHOWN_DIFFERENCES])}; --no-resume begins a new one"
         )
+
+
+def check_finishable(out: Path, sequence: Sequence, config: Config) -> None:
+    """Raise `InputError` where `out` holds nothing to make a result of without another frame."""
+    if not has_checkpoint(out / UNFINISHED):
+        raise InputError(
+            f"cannot finish the run in {out}: no stopped run has kept anything there; run it without --finish"
+        )
+    check_resumable(out, sequence, config)
 
 
 def discard_unfinished(out: Path) -> None:

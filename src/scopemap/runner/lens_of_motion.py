@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from scopemap.engine.cameras.lenses import FisheyeCamera
 from scopemap.engine.config import Config
@@ -23,16 +24,32 @@ _INFLATION = 5.0
 scenes of 50, 110 and 130 degrees were off by up to 4.5 times the deviation that the tracks account for."""
 
 
+@dataclass(frozen=True)
+class OtherLens:
+    """A lens for `Sequence.with_focal`, by its arguments."""
+
+    focal_px: float
+    source: str
+    sigma_px: float
+    fisheye: tuple[float, ...]
+
+    def seen_by(self, sequence: Sequence) -> Sequence:
+        """Return the sequence with this lens; that its camera is not known no longer holds."""
+        warnings = sequence.source.warnings
+        warnings[:] = [one for one in warnings if not (isinstance(one, Notice) and one.code == "camera-unknown")]
+        return sequence.with_focal(self.focal_px, self.source, self.sigma_px, self.fisheye)
+
+
 def lenses_of(sequence: Sequence, config: Config, *, again: bool) -> LensKinds:
-    """Return what the lens of a sequence may be, as `with_lens_of_motion` takes it; no kinds where it is known."""
+    """Return what the lens of a sequence may be, as `lens_of_motion` takes it; no kinds where it is known."""
     if not (again or _is_assumed(sequence, config)):
         return LensKinds()
     scope = SCOPES.get(config.input.scope, ANY_LENS)
     return LensKinds({kind: KINDS[kind] for kind in scope.kinds}, _bend(sequence))
 
 
-def with_lens_of_motion(sequence: Sequence, config: Config, lens: LensTest, *, again: bool) -> Sequence | None:
-    """Return the sequence with the lens that left-out tracks fit; None where it stays as it is.
+def lens_of_motion(sequence: Sequence, config: Config, lens: LensTest, *, again: bool) -> OtherLens | None:
+    """Return the lens that left-out tracks fit; None where that of the sequence stays as it is.
 
     It stays where it is not assumed, where `input.focal` chooses how it is found, where the tracks do not contradict
     it, where they tell it badly, and where they fit a field of view that no endoscope has. again : whether it comes
@@ -50,10 +67,7 @@ def with_lens_of_motion(sequence: Sequence, config: Config, lens: LensTest, *, a
         return None
     kind = next(name for name, coefficients in KINDS.items() if coefficients == bend)
     source = f"estimated: {kind}, field of view {fov:.0f} deg, from the motion, {narrowest:.0f} to {widest:.0f}"
-    # What was said before the first frame no longer holds.
-    warnings = sequence.source.warnings
-    warnings[:] = [one for one in warnings if not (isinstance(one, Notice) and one.code == "camera-unknown")]
-    return sequence.with_focal(focal_px, source, share * focal_px, bend)
+    return OtherLens(focal_px, source, share * focal_px, bend)
 
 
 def _is_assumed(sequence: Sequence, config: Config) -> bool:

@@ -13,7 +13,7 @@ from scopemap.engine.notices import Notice
 from scopemap.input.sequence import Sequence
 from scopemap.runner.depth_backends import files_folder
 from scopemap.runner.estimators import CustomEstimators, create_estimators
-from scopemap.runner.run import Progress
+from scopemap.runner.observers import Progress
 
 Timed = Callable[..., Any]
 """Takes the name of a part, a function and its arguments; returns what the function returns."""

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scopemap.engine.config import Config
 from scopemap.engine.fusion.frame_store import FrameStore
-from scopemap.engine.kept import kept
+from scopemap.engine.kept import Kept, kept
 from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
 from scopemap.engine.tracking.track import FrameTracker
 from scopemap.input.frame_choice import selection_text, slice_of
 from scopemap.input.sequence import Sequence
-from scopemap.result.checkpoint import discard_checkpoint
+from scopemap.result.checkpoint import SavedState, discard_checkpoint
 from scopemap.result.checksums import write_checksums
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.result import Result
@@ -26,20 +26,19 @@ from scopemap.result.verdict import state_verdict
 from scopemap.result.wording import facts_of_notices
 from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
 from scopemap.runner.estimators import largest_depth_mm
-from scopemap.runner.lens_of_motion import MOST_PASSES, lenses_of, with_lens_of_motion
+from scopemap.runner.lens_of_motion import MOST_PASSES, OtherLens, lens_of_motion, lenses_of
 from scopemap.runner.memory import MemoryPlan, memory_plan
-from scopemap.runner.preparation import prepare
-from scopemap.runner.provenance import refuse_own_input
-from scopemap.runner.run import (
-    Clock,
+from scopemap.runner.observers import (
     FinalFrameObserver,
     FrameWriter,
     KeptObserver,
     Observer,
     Progress,
     RestartedObserver,
-    Run,
 )
+from scopemap.runner.preparation import prepare
+from scopemap.runner.provenance import refuse_own_input
+from scopemap.runner.run import Clock, Run
 
 if TYPE_CHECKING:
     from scopemap.report.depth_figures import DepthPreviews
@@ -78,7 +77,8 @@ def reconstruct(
     out : folder for the result; None keeps it in memory, without depth maps. Where the run fails it stays as it was.
     overwrite : replace an earlier run there, once the new one is whole.
     observers : called with each `Step`, whose pose and depth are as tracked, before the back end; one that returns
-        True ends the run early, with the frames that were read until then.
+        True ends the run early, with the frames that were read until then; one that raises `RunStopped` ends it
+        without a result, to be resumed after them.
     tracker : replaces the one of `config.tracking`; its keyframes are adjusted, too, unless `config.mapping.method` is
         "none".
     progress : called before the first frame and after the last one; None: a notebook shows how far the run is.
@@ -150,11 +150,26 @@ class _DepthPictures:
             self.previews.finish(range_mm, scale_known=scale_known)
 
 
+@dataclass
+class _PassStart:
+    """What a pass begins with that the call does not name; kept with its checkpoint, for a later pass to be resumed.
+
+    number : 1 for the first. lens : of the sequence in place of its own. config : settings as resolved by the pass
+    before, JSON. warnings : of the source until then. notices : of the run until then.
+    """
+
+    number: Kept[int] = 1
+    lens: Kept[OtherLens | None] = None
+    config: Kept[str] = ""
+    warnings: Kept[list[str | Notice]] = field(default_factory=list)
+    notices: Kept[list[Notice]] = field(default_factory=list)
+
+
 @dataclass(frozen=True)
 class _Again:
-    """What another pass begins with: the sequence with another lens, and the settings as resolved."""
+    """What another pass begins with: another lens, and the settings as resolved."""
 
-    sequence: Sequence
+    lens: OtherLens
     config: Config
 
 
@@ -182,14 +197,20 @@ class _Passes:
 
     def result(self, sequence: Sequence) -> tuple[Result, _DepthPictures | None]:
         """Return the result of the last pass, and what has written its depth."""
-        passes = self
-        for number in range(1, MOST_PASSES + 1):
-            found = passes._pass(sequence, number)
-            if not isinstance(found, _Again):
-                break
+        passes, start = self, _PassStart()
+        if self.folder is not None and (saved := SavedState(self.folder)).facts:
+            saved.restore("pass", start)
+            if start.lens is not None:
+                sequence.source.warnings[:] = start.warnings
+                sequence = start.lens.seen_by(sequence)
+                passes = replace(self, config=Config.model_validate_json(start.config))
+                self.notices[:] = start.notices
+        while isinstance(found := passes._pass(sequence, start), _Again):
             # What was decided before the first frame stays decided.
-            sequence, passes = found.sequence, replace(self, config=found.config)
-            # Nothing resumes from a pass with another lens: where the next one is killed the run begins anew.
+            sequence, passes = found.lens.seen_by(sequence), replace(self, config=found.config)
+            warnings, settings = list(sequence.source.warnings), found.config.model_dump_json()
+            start = _PassStart(start.number + 1, found.lens, settings, warnings, list(self.notices))
+            # It is of the pass before.
             if self.folder is not None:
                 discard_checkpoint(self.folder)
             for observer in self.observers:
@@ -198,10 +219,9 @@ class _Passes:
             from scopemap.report.run_state import TRACKING_AGAIN
 
             self.progress(f"{TRACKING_AGAIN}, lens {sequence.camera_source}", 0, 0)
-        assert not isinstance(found, _Again)
         return found
 
-    def _pass(self, sequence: Sequence, number: int) -> tuple[Result, _DepthPictures | None] | _Again:
+    def _pass(self, sequence: Sequence, start: _PassStart) -> tuple[Result, _DepthPictures | None] | _Again:
         """Return the result of a sequence, and what has written its depth; or what to begin again with."""
         folder = self.folder
         store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
@@ -221,15 +241,16 @@ class _Passes:
         writers += tuple(observer.final for observer in self.observers if isinstance(observer, FinalFrameObserver))
         with closing(store):
             pipeline = Pipeline(config, estimators, store, self.tracker)
-            pipeline.mapper.try_lenses(lenses_of(sequence, config, again=number > 1))
+            pipeline.mapper.try_lenses(lenses_of(sequence, config, again=start.number > 1))
             run = Run(sequence, pipeline, self.clock, writers, self.progress, self.plan)
             states = None
-            if folder is not None and number == 1 and (self.tracker is None or kept(self.tracker.__class__)):
-                states = Checkpoints(folder, self.identity, run, self.lasting)
+            if folder is not None and (self.tracker is None or kept(self.tracker.__class__)):
+                others = {f"observer {number}": observer for number, observer in enumerate(self.lasting)}
+                states = Checkpoints(folder, self.identity, run, {"pass": start, **others})
             run.track(self.observers, states)
             # A tracker of the caller cannot begin again, and who stops a run waits for its end.
-            if number < MOST_PASSES and self.tracker is None and not run.stopped:
-                other = with_lens_of_motion(sequence, config, run.lens, again=number > 1)
+            if start.number < MOST_PASSES and self.tracker is None and not run.stopped:
+                other = lens_of_motion(sequence, config, run.lens, again=start.number > 1)
                 if other is not None:
                     return _Again(other, config)
             return run.result(self.notices), written

@@ -31,9 +31,10 @@ from scopemap.result.run_input import stated_input
 from scopemap.result.verdict import state_verdict
 from scopemap.runner.estimators import CustomEstimators, largest_depth_mm
 from scopemap.runner.memory import memory_plan
+from scopemap.runner.observers import FrameWriter, Progress
 from scopemap.runner.preparation import prepare
 from scopemap.runner.provenance import Limits, provenance_of, scale_facts
-from scopemap.runner.run import Clock, FrameWriter, KeptMaps, Progress, Run, overlapped
+from scopemap.runner.run import Clock, KeptMaps, Run, overlapped
 
 
 class Reconstructor:

@@ -9,8 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
-from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar
 
 from numba.core.event import TimingListener, register
 
@@ -30,50 +29,10 @@ from scopemap.result.surface_segments import main_segment
 from scopemap.result.verdict import graded
 from scopemap.result.wording import facts_of_notices
 from scopemap.runner.memory import MemoryPlan, trim_memory
+from scopemap.runner.observers import FrameWriter, Observer, Progress, RunStopped
 from scopemap.runner.provenance import Limits, facts_of_segment, motion_notices, notices_of_end, provenance_of
 from scopemap.runner.submap_frames import check_tracked, frames_of_submap, put_backwards, tracked_frames
 
-Observer = Callable[[Step], bool | None]
-"""Called with each step; True: no further frame is read, and the result is of the frames until then."""
-
-
-@runtime_checkable
-class KeptObserver(Protocol):
-    """An `Observer` that is resumed with a run, by what it marks as `Kept`, and saved with the result."""
-
-    def __call__(self, step: Step) -> bool | None:
-        """Take a step."""
-
-    def save(self, run: Path) -> None:
-        """Write what was observed to the folder of the result."""
-
-
-@runtime_checkable
-class FinalFrameObserver(Protocol):
-    """An `Observer` that also sees each frame with its final depth and pose, as it is written."""
-
-    def __call__(self, step: Step) -> bool | None:
-        """Take a step."""
-
-    def final(self, frame: Frame) -> None:
-        """Take a frame whose depth and pose are final."""
-
-
-@runtime_checkable
-class RestartedObserver(Protocol):
-    """An `Observer` that forgets what it has seen where a run begins again at its first frame."""
-
-    def __call__(self, step: Step) -> bool | None:
-        """Take a step."""
-
-    def forget(self) -> None:
-        """Begin anew."""
-
-
-Progress = Callable[[str, int, int], None]
-"""Called with what is done outside of tracking (such as "fusing"), frames done, and all frames; 0: not in frames."""
-FrameWriter = Callable[[Frame], None]
-"""Writes something of a frame whose depth is final."""
 _Item = TypeVar("_Item")
 _END = object()
 
@@ -97,8 +56,11 @@ class RunStates(Protocol):
     def commit(self, last: int) -> None:
         """Write the rest; the state is now that after the frame `last`."""
 
-    def commit_all(self, last: int) -> None:
-        """Write the state after all frames, when no stage is at work."""
+    def commit_all(self, last: int, *, stopped: bool, complete: bool) -> None:
+        """Write the state after the last frame that was read, when no stage is at work.
+
+        stopped : the run ends with it. complete : no further frame follows.
+        """
 
 
 @dataclass
@@ -148,19 +110,25 @@ class Run:
         self.pipeline.mapper.limit(self.plan.observations)
 
     def track(self, observers: tuple[Observer, ...], states: RunStates | None = None) -> None:
-        """Pass all frames through the pipeline, those after the last checkpoint."""
+        """Pass all frames through the pipeline, those after the last checkpoint. Raises `RunStopped` of an observer."""
         last, complete = -1, False
         if states is not None and states.exist:
             last, complete = states.restore()
             self.resumed_after = last
             self.progress("resuming", len(self.frames), 0)
-        frames = iter(()) if complete else self._until_stopped(last)
+        frames, stop = iter(()) if complete else self._until_stopped(last), None
         for step in overlapped(frames, self.pipeline, self.clock, self.plan.ahead, states):
             self.take(step)
             for observer in observers:
-                self.stopped = bool(observer(step)) or self.stopped
-        if states is not None and len(self.frames) and not (complete or self.interrupted):
-            states.commit_all(self.frames.last_index)
+                try:
+                    self.stopped = bool(observer(step)) or self.stopped
+                except RunStopped as asked:
+                    # Frames that are on their way are tracked: the state is that after a frame.
+                    self.stopped, stop = True, asked
+        if states is not None and len(self.frames) and not complete and (stop or not self.interrupted):
+            states.commit_all(self.frames.last_index, stopped=stop is not None, complete=not self.interrupted)
+        if stop is not None:
+            raise stop
 
     def take(self, step: Step) -> None:
         """Collect the results of a step, and forget what is beyond the limits."""

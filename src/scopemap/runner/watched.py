@@ -1,6 +1,7 @@
 """Writes what can be seen of a run while it goes on, for whoever looks (`result/run_view.py`), without slowing it down.
 
-What is observed is put down in the run's threads; a thread of its own draws and writes it, twice a second at most.
+What is observed is put down in the run's threads; a thread of its own writes it. Pictures and points are drawn only
+while someone looks.
 """
 
 from __future__ import annotations
@@ -16,26 +17,26 @@ import numpy as np
 
 from scopemap.engine.flow.corners import detect_corners
 from scopemap.engine.frame import Frame
-from scopemap.engine.geometry.se3 import transform
+from scopemap.engine.kept import Kept
 from scopemap.engine.odometry import Step
 from scopemap.report.depth_figures import colour_depth
 from scopemap.report.frame_pictures import shrunk
 from scopemap.report.run_state import RunState
 from scopemap.result.run_view import (
     RunProgressState,
-    SeenMap,
+    is_looked_at,
     view_folder,
     write_coverage,
     write_map,
     write_pictures,
     write_state,
 )
+from scopemap.runner.seen_pieces import SeenPieces
 
 _EVERY_S = 0.5
-_POINTS_EVERY_S = 0.25
-_POINTS_OF_A_FRAME = 1500
-_MOST_POINTS = 150_000
-_MOST_POSES = 5_000
+_DRAWN_EVERY_S = 2.0
+"""Corners, depth in colours and points take .05 s: less often than what is only counted."""
+_POINTS_EVERY_S = 0.5
 _PICTURE_PX = 480
 _CORNER_CELL_PX = 12  # that of the tracker's corners
 _DEPTH_PERCENTILES = (2, 98)
@@ -50,6 +51,9 @@ class RunWatch:
     input, None: not known. adjusts : as of `RunState`. Of a live stream, asked when it is written: live : what it does,
     and what else is shown, by name; drawn : the map of what was not seen so far, PNG, b"": none.
     """
+
+    _pieces: Kept[SeenPieces]
+    _map_of: Kept[dict[int, int]]
 
     def __init__(
         self,
@@ -68,11 +72,10 @@ class RunWatch:
         self._progress = RunState(total, adjusts=adjusts)
         self._words, self._done, self._frames = "preparing", 0, 0
         self._step: Step | None = None
-        self._tracked, self._final = _Cloud(), _Cloud()
-        self._map_of: dict[int, int] = {}
-        self._keyframes = set[int]()
+        self._pieces = SeenPieces()
+        self._map_of = {}
         self._final_map: int | None = None
-        self._pointed_s, self._written = 0.0, 0
+        self._pointed_s, self._drawn_s, self._written = 0.0, 0.0, 0
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._write_until_ended, name="watch", daemon=True)
 
@@ -92,22 +95,29 @@ class RunWatch:
         with self._lock:
             self._progress.add(step)
             self._words, self._done, self._frames = "tracking", self._progress.done, self._total or 0
-            if self._step is not None and self._step.track.map != track.map:
-                self._tracked = _Cloud()  # another world
+            if next(reversed(self._map_of.values()), track.map) != track.map:
+                self._pieces.begin()
             self._step = step
             if frame.T_world_camera is None:
                 return
             self._map_of[frame.index] = track.map
-            self._keyframes.add(track.keyframe)
+            self._pieces.keyframes.add(track.keyframe)
             is_due = now - self._pointed_s > _POINTS_EVERY_S
             self._pointed_s = now if is_due else self._pointed_s
-            self._tracked.put(frame, with_points=is_due, keyframe=track.keyframe)
+            self._pieces.put(frame, with_points=is_due)
 
     def forget(self) -> None:
-        """Begin anew: what was seen so far is no longer shown."""
+        """Begin anew: what a run has shown stays until its frames come again, what a live stream has shown goes."""
         with self._lock:
             self._progress = RunState(self._total, adjusts=self._adjusts)
-            self._step, self._tracked, self._map_of, self._keyframes = None, _Cloud(), {}, set()
+            self._step, self._map_of, self._final_map = None, {}, None
+            if self._live is None:
+                self._pieces.begin()
+            else:
+                self._pieces = SeenPieces()
+
+    def save(self, run: Path) -> None:
+        """Write nothing: what is shown goes on with a run that is resumed, and is no part of its result."""
 
     def final(self, frame: Frame) -> None:
         """Take a frame whose depth and pose are final."""
@@ -116,9 +126,9 @@ class RunWatch:
         with self._lock:
             number = self._map_of.get(frame.index, 0)
             if number != self._final_map:  # of a submap with a world of its own
-                self._final, self._final_map = _Cloud(), number
-                self._final.keyframes = self._keyframes
-            self._final.put(frame, with_points=frame.index in self._tracked.points or self._final.is_sparse)
+                self._pieces.begin()
+                self._final_map = number
+            self._pieces.put(frame, with_points=self._pieces.has_points(frame.index) or self._pieces.is_sparse)
 
     def progress(self, doing: str, done: int, frames: int) -> None:
         """Take what is done outside of tracking, as `Progress` is called."""
@@ -142,7 +152,9 @@ class RunWatch:
                 frame=-1 if step is None else step.frame.index,
                 time_s=0.0 if step is None else step.frame.time_s,
                 submap=0 if step is None else step.track.map,
-                adjusted=bool(self._final.poses) and self._words != "tracking",
+                adjusted=self._final_map is not None,
+                points=self._pieces.count,
+                frames=len(self._map_of),
                 written=self._written,
                 facts=facts,
             )
@@ -160,85 +172,26 @@ class RunWatch:
             if not folder.parent.is_dir():  # not yet, or the result is in its place
                 return
         assert folder is not None
-        with self._lock:
-            step = self._step
-            seen = (self._tracked if self._words == "tracking" or not self._final.poses else self._final).copy()
         try:
             folder.mkdir(exist_ok=True)
-            if step is not None:
-                write_pictures(folder, *_pictures(step.frame))
-                if seen.poses:
-                    write_map(folder, seen.map(step.frame))
-            if drawn := self._drawn():
-                write_coverage(folder, drawn)
-            self._written += 1
+            if is_looked_at(folder) and time.monotonic() - self._drawn_s > _DRAWN_EVERY_S:
+                self._draw(folder)
+                self._drawn_s = time.monotonic()
+                self._written += 1
             write_state(folder, self.state())
         except OSError:
             return
 
-
-class _Cloud:
-    """Poses of a submap's frames, and points of some of them: of fewer, the more there are."""
-
-    def __init__(self) -> None:
-        self.poses: dict[int, np.ndarray] = {}
-        self.points: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self.keyframes: set[int] = set()
-
-    @property
-    def is_sparse(self) -> bool:
-        """Whether there is room for the points of more frames without leaving any out."""
-        return len(self.points) < _MOST_POINTS // (2 * _POINTS_OF_A_FRAME)
-
-    def copy(self) -> _Cloud:
-        """Return the same, to be read while this one grows."""
-        other = _Cloud()
-        other.poses, other.points, other.keyframes = dict(self.poses), dict(self.points), set(self.keyframes)
-        return other
-
-    def put(self, frame: Frame, *, with_points: bool, keyframe: int | None = None) -> None:
-        """Add a frame that has a pose."""
-        assert frame.T_world_camera is not None
-        self.poses[frame.index] = frame.T_world_camera.astype(np.float32)
-        if keyframe is not None:
-            self.keyframes.add(keyframe)
-        if len(self.poses) > _MOST_POSES:
-            kept = list(self.poses)[::2]
-            self.poses = {index: self.poses[index] for index in kept}
-        if with_points and frame.depth_mm is not None:
-            self.points[frame.index] = _points(frame)
-        if len(self.points) * _POINTS_OF_A_FRAME > _MOST_POINTS:
-            self.points = dict(list(self.points.items())[::2])
-
-    def map(self, frame: Frame) -> SeenMap:
-        """Return what is shown of it; frame : any of its camera."""
-        clouds, colours = zip(*self.points.values(), strict=True) if self.points else ((), ())
-        index, camera = np.fromiter(self.poses, int, len(self.poses)), frame.camera
-        return SeenMap(
-            index=index,
-            T_world_camera=np.stack(list(self.poses.values())),
-            keyframe=np.isin(index, list(self.keyframes)),
-            points=np.concatenate([np.zeros((0, 3), np.float32), *clouds]),
-            colours=np.concatenate([np.zeros((0, 3), np.uint8), *colours]),
-            fov_rad=float(2 * np.arctan(camera.height / (2 * camera.fy))),
-            aspect=camera.width / camera.height,
-        )
-
-
-def _points(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 3) float32, world mm, and colours (n, 3) uint8 of usable pixels on a coarse grid."""
-    assert frame.depth_mm is not None
-    assert frame.T_world_camera is not None
-    step_px = max(1, int(np.ceil(np.sqrt(frame.valid.size / _POINTS_OF_A_FRAME))))
-    row, column = (
-        side.ravel() for side in np.mgrid[: frame.valid.shape[0] : step_px, : frame.valid.shape[1] : step_px]
-    )
-    depth_mm = frame.depth_mm[row, column]
-    known = frame.valid[row, column] & np.isfinite(depth_mm)
-    row, column, depth_mm = row[known], column[known], depth_mm[known]
-    rays = frame.camera.unproject(np.column_stack([column, row]).astype(float))
-    points = transform(frame.T_world_camera, rays * depth_mm[:, None])
-    return points.astype(np.float32), frame.rgb[row, column]
+    def _draw(self, folder: Path) -> None:
+        with self._lock:
+            step = self._step
+            seen = None if step is None else self._pieces.map(step.frame)
+        if step is not None:
+            write_pictures(folder, *_pictures(step.frame))
+        if seen is not None:
+            write_map(folder, seen)
+        if drawn := self._drawn():
+            write_coverage(folder, drawn)
 
 
 def _pictures(frame: Frame) -> tuple[bytes, bytes]:

@@ -10,8 +10,8 @@ from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.page import write_report
 from scopemap.result.result import Result
 from scopemap.runner.memory import share_arenas, trim_memory
+from scopemap.runner.observers import Observer, Progress
 from scopemap.runner.reconstruct import reconstruct
-from scopemap.runner.run import Observer, Progress
 
 
 def reconstruct_with_report(

@@ -19,11 +19,11 @@ class Interruption:
     """Context in which the first signal ends a run early, once a frame was tracked; any other ends the program.
 
     exit_code : 130 after Ctrl-C, 143 after SIGTERM, 0 without a signal. stop : called at the first one, for a run that
-    waits for frames.
+    waits for frames. keeps : the run ends without a result, to be resumed (`RunStopped`).
     """
 
-    def __init__(self, stop: Callable[[], None] = lambda: None) -> None:
-        self._stop = stop
+    def __init__(self, stop: Callable[[], None] = lambda: None, *, keeps: bool = False) -> None:
+        self._stop, self._keeps = stop, keeps
         self.exit_code = 0
         self._tracking = False
         self._before: dict[int, Any] = {}
@@ -39,6 +39,10 @@ class Interruption:
     def observe(self, step: Step) -> bool:
         """Note that there is something to write, and return whether the run shall end; observes `reconstruct`."""
         self._tracking = True
+        if self.exit_code and self._keeps:
+            from scopemap.runner.observers import RunStopped
+
+            raise RunStopped
         return self.exit_code != 0
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
@@ -46,5 +50,6 @@ class Interruption:
         if again or not self._tracking:
             typer.echo("scopemap: stopped, nothing was written", err=True)
             raise SystemExit(self.exit_code)
-        typer.echo("stopping after this frame; what was tracked is written; once more ends it at once", err=True)
+        done = "kept" if self._keeps else "written"
+        typer.echo(f"stopping after this frame; what was tracked is {done}; once more ends it at once", err=True)
         self._stop()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +13,8 @@ from scopemap.apps.batch.batch import LOGS, Video, log_to
 from scopemap.apps.batch.engines import Engine
 from scopemap.engine.errors import reporting
 from scopemap.input.inputs import RemoteFile
+from scopemap.runner.forecast import bytes_in, run_cost
 from scopemap.runner.processes import ProcessLimits, run_in_processes
-from scopemap.runner.with_report import reconstruct_with_report
-
-_FEWEST = 12  # frames of the second that is run
-_MOST = 60
-_ENDLESS = 1 << 40
-_REPORTING = "writing the report"
-_PER_FRAME = "depth*/*"
 
 
 @dataclass(frozen=True)
@@ -83,45 +75,13 @@ def forecast(
 def _measure(part: _Part) -> dict[str, Any]:
     """Run the first second of a video, and return what its forecast says."""
     log_to(part.out / LOGS / f"{part.video.name}.txt")
-    video, folder = part.video.fetched(part.out), part.out / part.video.name
-    whole = video.open()
-    rate_hz, chosen = whole.source.rate_hz, video.frames or slice(None)
-    step = chosen.step or 1
-    used = min(max(math.ceil(rate_hz / step), _FEWEST), _MOST)
-    if whole.source.count is not None:
-        start, stop, _ = chosen.indices(whole.source.count)
-    else:
-        start, stop = max(chosen.start or 0, 0), chosen.stop if (chosen.stop or -1) >= 0 else _ENDLESS
-    times, begun = list[float](), time.perf_counter()
-    written = [begun]
-
-    def progress(doing: str, done: int, frames: int) -> None:
-        if doing == _REPORTING:
-            written[0] = time.perf_counter()
-
-    first = video.open(slice(start, min(stop, start + used * step), step))
-    seen = (lambda step: times.append(time.perf_counter()),)
-    reconstruct_with_report(first, video.config, folder, observers=seen, progress=progress)
-    ended, count = time.perf_counter(), whole.used_count
-    if count is None or whole.count is None:
+    video = part.video.fetched(part.out)
+    cost = run_cost(video.open(), video.open, video.config, part.out / video.name)
+    if cost is None:
         return {}
-    steady_s = (times[-1] - times[0]) / max(len(times) - 1, 1) + (written[0] - times[-1]) / len(times)
-    fixed_s = times[0] - begun + ended - written[0]
-    growing = sum(file.stat().st_size for file in folder.glob(_PER_FRAME))
-    return {
-        "frames": count,
-        "video_s": whole.count * step / rate_hz,
-        "seconds": fixed_s + steady_s * count,
-        "result_bytes": _bytes(folder) + int(growing * (count / len(times) - 1)),
-    }
+    names = ("frames", "video_s", "seconds", "result_bytes")
+    return {name: getattr(cost, name) for name in names}
 
 
 def _bytes(path: Path | RemoteFile) -> int:
-    """Return the size of a file, or of all files below a folder; 0 for what is not there."""
-    if isinstance(path, RemoteFile):
-        return path.size or 0
-    try:
-        files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
-        return sum(file.stat().st_size for file in files)
-    except OSError:
-        return 0
+    return path.size or 0 if isinstance(path, RemoteFile) else bytes_in(path)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scopemap.apps.browser.forecast import VideoForecast
 from scopemap.apps.browser.looking import LeftEarlier, Look, look, measured_rates, time_in_words
 from scopemap.apps.browser.run_choice import LAYOUTS, LEAST_FOV_DEG, MOST_FOV_DEG, PRESETS, RunChoice, boxes_of
 from scopemap.apps.browser.runs import BrowserRun
@@ -47,6 +48,7 @@ class InputPage:
         self._workspace, self._source, self._started, self._back = workspace, source, started, back
         self._looked: Look | None = None
         self._done, self._all, self._left = 0, 1, False
+        self._forecast = VideoForecast(source, workspace.logs / "forecast.log")
         self.choice = RunChoice()
         """The options as they are set."""
 
@@ -61,13 +63,16 @@ class InputPage:
         window.job("looking at the video", self._look, self._show)
 
     def tick(self) -> None:
-        """Show how far the look is."""
+        """Show how far the look is, and what is found out about the time."""
         if self._looked is None:
             self._bar.value = min(100.0, 100 * self._done / self._all)
+        elif self._forecast.poll():
+            self._show_choice()
 
     def close(self) -> None:
-        """End the look."""
+        """End the look, and what is measured."""
         self._left = True
+        self._forecast.close()
 
     def _heard(self, done: int, all_: int) -> None:
         if self._left:
@@ -199,11 +204,21 @@ class InputPage:
             return
         self._window.clear_error()
         self._start.disabled = False
-        self._time.content = f"**Time:** {escaped(time_in_words(frames, choice.preset, self._rates[choice.preset]))}"
+        self._time.content = f"**Time:** {escaped(self._time_words(choice, frames))}"
         out = self._workspace.new_result(self._source)
         words = [f"scopemap run {shlex.quote(str(self._source))}", f"--out {shlex.quote(str(out))}"]
         command = _NEXT_LINE.join([*words, *map(shlex.quote, choice.arguments())])
         self._command.content = f"The same in a terminal:\n\n{fenced(self._window.names.hidden(command))}"
+
+    def _time_words(self, choice: RunChoice, frames: int | None) -> str:
+        """Return how long a run takes; where nothing else runs, a second of the video is run to find out."""
+        if self._workspace.runs.running is None and frames is not None:
+            # Masks are written with the run.
+            self._forecast.ask(choice.preset, replace(choice, masks=None).arguments())
+        usual = time_in_words(frames, choice.preset, self._rates[choice.preset])
+        if self._forecast.is_measured(choice.preset):
+            return f"being measured: one second of this video is run. Without that: {usual}"
+        return self._forecast.words(choice.preset, frames) or usual
 
     def _reconstruct(self) -> None:
         from scopemap.apps.inspect.inspection_sheet import write_mask
@@ -213,6 +228,7 @@ class InputPage:
         if choice.masks is not None:
             write_mask(self._looked.spread, choice.masks)
         self._start.disabled = True
+        self._forecast.close()  # before the run: it would share the cores
         self._started(self._workspace.reconstruct(self._source, choice.arguments()))
 
 

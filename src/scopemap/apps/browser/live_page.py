@@ -75,9 +75,5 @@ def open_live(window: BrowserWindow, workspace: Workspace, source: str) -> None:
     def finished() -> None:
         window.show(ResultPage(out, workspace))
 
-    def back() -> None:
-        run.stop()
-        window.start()
-
     buttons = {words: partial(run.press, name) for words, name in LIVE_BUTTONS.items()}
-    window.show(RunPage(run, view_folder(out), "Live", finished, back, buttons=buttons))
+    window.show(RunPage(run, view_folder(out), "Live", finished, buttons=buttons))

@@ -5,23 +5,29 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from PIL import Image
 
+from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, look_at, quaternion
 from scopemap.apps.browser.window import escaped, fenced
-from scopemap.result.run_view import RunProgressState, SeenMap, read_coverage, read_map, read_pictures, read_state
+from scopemap.result.run_view import RunProgressState, SeenMap, look, read_coverage, read_map, read_pictures, read_state
 
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
 
-_MOST_FRUSTA = 60
-_FRUSTUM_SHARE = 0.05
-_POINT_SHARE = 0.006
+_MOST_KEYFRAMES = 200
+_FRUSTUM_SHARE = 0.08
+_POINT_SHARE = 0.008
 _LOST = (200, 40, 40)
+_TRACKED = (30, 160, 70)
+_EARLIER = (150, 150, 150)
+_GREY = " Grey: what was seen before tracking began anew. Where it lies beside the rest is a guess until the run ends."
 _MOST_LOG = 4000
+_STOP = "Stop"
+_STOPPING = "stopping, ten seconds at most"
 
 
 class WatchedRun(Protocol):
@@ -43,14 +49,14 @@ class WatchedRun(Protocol):
         """Look whether it has ended."""
 
     def stop(self) -> None:
-        """Ask it to end and write what it has."""
+        """Ask it to end and keep what it has."""
 
 
 class RunPage:
     """A run that writes what is seen of it to `folder`.
 
-    finished : called once with the run where it has a result. back : called where the page is left. buttons : of a live
-    stream, what they call by what is written on them.
+    finished : called once with the run where it has a result. back : leads to the result that it was started from.
+    buttons : of a live stream, what they call by what is written on them.
     """
 
     def __init__(
@@ -65,21 +71,24 @@ class RunPage:
     ) -> None:
         self._run, self._folder, self._title = run, folder, title
         self._finished, self._back, self._waiting, self._buttons = finished, back, waiting, buttons or {}
-        self._frusta = set[str]()
-        self._ended = False
+        self._ended = self._is_lost = False
         self._written = self._first = -1
+        self._size = self._grey = ""
+        self._ways: list[Any] = []
 
     def open(self, window: BrowserWindow) -> None:
         """Make the elements."""
         gui = window.gui
         self._window = window
         gui.add_markdown(f"### {escaped(window.names.hidden(self._title))}")
-        self._words, self._size = gui.add_markdown("starting"), ""
-        self._bar = gui.add_progress_bar(0, animated=True)
+        self._words = gui.add_markdown("starting")
+        self._bar = gui.add_progress_bar(0)
         self._facts = gui.add_markdown("", visible=False)
         self._live = [window.on(gui.add_button(name), call) for name, call in self._buttons.items()]
-        stop = gui.add_button("Stop" if self._live else "Stop and keep what there is", icon=_icon("PLAYER_STOP"))
+        makes = "Makes a result of the frames so far." if self._makes_result else "Keeps what was tracked, to continue."
+        stop = gui.add_button(_STOP, icon=_icon("PLAYER_STOP"), hint=makes)
         self._stop = window.on(stop, self._stop_run)
+        self._add_ways_on()
         self._picture = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Frame: unused parts dark, corners green")
         self._depth = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Depth: red near, blue far")
         self._coverage = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="What was not seen so far")
@@ -87,11 +96,24 @@ class RunPage:
         with gui.add_folder("Log", expand_by_default=False):
             self._log = gui.add_markdown("")
         if self._back is not None:
-            window.on(gui.add_button("Back to the start", hint="The run goes on.", color="gray"), self._back)
+            window.on(gui.add_button("Back to the earlier result", hint="The run goes on.", color="gray"), self._back)
+        if window.first_page is not None:
+            hint = "The stream ends with its result." if self._live else "The run goes on."
+            window.on(gui.add_button("Back to the start", hint=hint, color="gray"), self._to_start)
         self.tick()
+
+    @property
+    def _makes_result(self) -> bool:
+        """Whether stopping makes a result: of a live stream, and of a run in a terminal."""
+        return not isinstance(self._run, BrowserRun)
 
     def close(self) -> None:
         """Nothing was begun."""
+
+    def _to_start(self) -> None:
+        if self._live:  # nothing else would end it
+            self._run.stop()
+        self._window.start()
 
     def tick(self) -> None:
         """Show what has changed."""
@@ -107,9 +129,42 @@ class RunPage:
         else:
             self._end(status)
 
+    def _add_ways_on(self) -> None:
+        """Make what a run that was stopped offers."""
+        gui, window, run = self._window.gui, self._window, self._run
+        if not isinstance(run, BrowserRun):
+            return
+        go_on = gui.add_button("Continue", color="green", hint="The run goes on after the frames that it has tracked.")
+        finish = gui.add_button(
+            "Make a result of these frames", hint="In a folder beside it. The run can still be continued afterwards."
+        )
+        self._ways = [window.on(go_on, self._go_on), window.on(finish, self._finish)]
+        for way in self._ways:
+            way.visible = False
+
+    def _go_on(self) -> None:
+        assert isinstance(self._run, BrowserRun)
+        self._run.go_on()
+        self._ended, self._stop.visible, self._stop.disabled, self._stop.label = False, True, False, _STOP
+        for way in self._ways:
+            way.visible = False
+        self.tick()
+
+    def _finish(self) -> None:
+        run = self._run
+        assert isinstance(run, BrowserRun)
+        # What is copied is as large as the frames so far.
+        self._window.job("copying what was tracked", run.copy, self._finish_in)
+
+    def _finish_in(self, folder: Path) -> None:
+        assert isinstance(self._run, BrowserRun)
+        self._run.finish(folder)
+        self._window.start()  # which shows it beside the one that can still go on
+
     def _stop_run(self) -> None:
         self._run.stop()
-        self._stop.label, self._stop.disabled = "stopping after this frame", True
+        self._stop.label = "stopping: the result of the frames so far is made" if self._makes_result else _STOPPING
+        self._stop.disabled = True
         for button in self._live:
             button.disabled = True
 
@@ -124,8 +179,15 @@ class RunPage:
         if status == "failed":
             self._window.fail(self._run.sentence, self._run.printed[-_MOST_LOG:])
             self._words.content = "**The run has failed.**"
-        else:
-            self._words.content = "**Stopped.** Nothing was written."
+            return
+        is_kept = isinstance(self._run, BrowserRun) and self._run.is_kept
+        state = read_state(self._folder) if is_kept else None
+        self._draw_all()
+        if state is not None:
+            self._note_size(state)
+        self._words.content = stopped_words(state) + self._size
+        for way, is_offered in zip(self._ways, (True, is_kept), strict=False):
+            way.visible = is_offered
 
     def _show_state(self) -> None:
         state = read_state(self._folder)
@@ -134,68 +196,75 @@ class RunPage:
             last = self._window.names.hidden(lines[-1]) if lines and self._first < 0 else "preparing"
             self._words.content = escaped(last)
             return
+        self._note_size(state)
         self._words.content = words_of(state) + self._size
         self._bar.value, self._bar.visible = share_of(state), not self._live
-        if state.written == self._written:
-            return
-        self._written = state.written
         self._facts.visible = bool(state.facts)
         self._facts.content = "\n".join(f"- {name}: {escaped(value)}" for name, value in state.facts.items())
+        if not self._window.server.get_clients():  # no one looks
+            return
+        look(self._folder)
+        if state.written != self._written:
+            self._written, self._is_lost = state.written, state.status == "lost"
+            self._draw_all()
+
+    def _note_size(self, state: RunProgressState) -> None:
+        if state.points:
+            self._size = f"\n\nThe surface so far: {state.points:,} points from {state.frames:,} frames.{self._grey}"
+
+    def _draw_all(self) -> None:
         if (pictures := read_pictures(self._folder)) is not None:
             for handle, content in zip((self._picture, self._depth), pictures, strict=True):
                 handle.image, handle.visible = _pixels(content), True
         if (drawn := read_coverage(self._folder)) is not None:
             self._coverage.image, self._coverage.visible = _pixels(drawn), True
-        if (seen := read_map(self._folder)) is not None:
-            self._draw(seen, is_lost=state.status == "lost")
+        if (seen := read_map(self._folder)) is not None and len(seen.index):
+            self._draw(seen)
 
-    def _draw(self, seen: SeenMap, *, is_lost: bool) -> None:
+    def _draw(self, seen: SeenMap) -> None:
+        """Draw path, points and the camera: few nodes, as a browser may have to draw with the processor."""
         scene = self._window.scene
-        if not len(seen.index):
-            return
-        self._size = f"\n\nThe surface so far: {len(seen.points):,} points from {len(seen.index):,} frames."
+        self._grey = _GREY if len(seen.earlier) else ""
         positions = seen.T_world_camera[:, :3, 3]
-        everything = np.concatenate([positions, seen.points]) if len(seen.points) else positions
+        everything = np.concatenate([positions, seen.points, seen.earlier])
         size = float(np.linalg.norm(np.ptp(np.percentile(everything, [5, 95], axis=0), axis=0))) or 1.0
-        is_new = self._first != seen.index[0]  # another submap, or all was forgotten
-        self._first = int(seen.index[0])
+        is_first, self._first = self._first < 0, int(seen.index[0])
+        grey = np.full(seen.earlier.shape, _EARLIER, np.uint8)
+        keyframes = positions[seen.keyframe][-_MOST_KEYFRAMES:]
+        blue = np.full(keyframes.shape, PATH_COLOUR, np.uint8)
         with self._window.server.atomic():
-            if is_new:
-                scene.remove_by_name("/page/points")
-                scene.remove_by_name("/page/path")
-            if len(seen.points):
-                scene.add_point_cloud(
-                    "/page/points",
-                    seen.points,
-                    seen.colours,
-                    point_size=_POINT_SHARE * size,
-                    point_shape="circle",
-                    point_shading="flat",
-                    precision="float32",
-                )
+            for name, points, colours, share in (
+                ("points", seen.points, seen.colours, _POINT_SHARE),
+                ("earlier", seen.earlier, grey, _POINT_SHARE),
+                ("keyframes", keyframes.astype(np.float32), blue, 2 * _POINT_SHARE),
+            ):
+                scene.remove_by_name(f"/page/{name}")
+                if len(points):
+                    scene.add_point_cloud(
+                        f"/page/{name}",
+                        points,
+                        colours,
+                        point_size=share * size,
+                        point_shape="circle",
+                        point_shading="flat",
+                        precision="float32",
+                    )
             draw_path(scene, "/page/path", positions)
-            chosen = np.flatnonzero(seen.keyframe)[-_MOST_FRUSTA:]
-            poses = {f"/page/keyframes/{place}": seen.T_world_camera[row] for place, row in enumerate(chosen)}
-            poses["/page/now"] = seen.T_world_camera[-1]
-            for name in self._frusta - poses.keys():
-                scene.remove_by_name(name)
-            self._frusta = set(poses)
-            for name, pose in poses.items():
-                now = name == "/page/now"
-                scene.add_camera_frustum(
-                    name,
-                    seen.fov_rad,
-                    seen.aspect,
-                    scale=_FRUSTUM_SHARE * size * (1.6 if now else 1.0),
-                    color=(_LOST if is_lost else (30, 160, 70)) if now else PATH_COLOUR,
-                    thickness=1.5,
-                    thickness_units="screen",
-                    cast_shadow=False,
-                    receive_shadow=False,
-                    wxyz=quaternion(pose),
-                    position=pose[:3, 3],
-                )
-        if is_new:
+            pose = seen.T_world_camera[-1]
+            scene.add_camera_frustum(
+                "/page/now",
+                seen.fov_rad,
+                seen.aspect,
+                scale=_FRUSTUM_SHARE * size,
+                color=_LOST if self._is_lost else _TRACKED,
+                thickness=1.5,
+                thickness_units="screen",
+                cast_shadow=False,
+                receive_shadow=False,
+                wxyz=quaternion(pose),
+                position=pose[:3, 3],
+            )
+        if is_first:
             look_at(self._window, seen.T_world_camera[0], everything)
 
 
@@ -213,6 +282,16 @@ def words_of(state: RunProgressState) -> str:
     elif state.adjusted:
         lines.append("Poses and points are those after the adjustment.")
     return "\n\n".join(lines)
+
+
+def stopped_words(state: RunProgressState | None) -> str:
+    """Return where a run was stopped that has kept its state; None: it has kept nothing."""
+    if state is None:
+        return "**Stopped** before anything was kept. *Continue* begins at the first frame."
+    if state.doing == "tracking":
+        of = f" of {state.total}" if state.total else ""
+        return f"**Stopped after {state.done}{of} frames.** What was tracked is kept."
+    return f"**Stopped while {escaped(state.doing)}.** All frames that were tracked are kept."
 
 
 def share_of(state: RunProgressState) -> float:

@@ -4,37 +4,46 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from scopemap.engine.errors import reporting
+from scopemap.result.checkpoint import has_checkpoint
+from scopemap.result.result_folder import LOCK, UNFINISHED, VIEW
+
 Status = Literal["waiting", "running", "done", "failed", "stopped"]
 _LOG = "run.log"
 _MOST_LOG = 20_000
-_PATIENCE_S = 10.0
-_STOPPED = (130, 143)
-"""Exit codes of a run that was stopped, and wrote what it had."""
+_SO_FAR = "_so_far.part"
+"""What the name of a copy ends in; the ending of a file's name is left out of that of its result."""
+_PATIENCE_S = 7.0
+"""Seconds after which a run that is stopping is ended: what it does after the last frame is done again."""
 
 
 @dataclass(eq=False)
 class BrowserRun:
     """A run of `scopemap run INPUT --out OUT` with further arguments.
 
-    log : file that takes what it prints. status : where it is.
+    log : file that takes what it prints. status : where it is. queue : that it is of.
     """
 
     source: Path
     out: Path
     arguments: tuple[str, ...]
     log: Path
+    queue: RunQueue = field(repr=False)
     status: Status = "waiting"
     stopping: bool = False
+    _stopped_s: float = 0.0
     _process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
 
     @property
@@ -57,6 +66,16 @@ class BrowserRun:
         code = None if self._process is None else self._process.returncode
         return f"the run ended unexpectedly (exit code {code}); start it again: it goes on where it was"
 
+    @property
+    def holds_its_folder(self) -> bool:
+        """Whether no other run may write to its folder: what was stopped may go on there."""
+        return self.status != "failed" and (self.status != "stopped" or self.is_kept)
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether it can go on after the frames that it has tracked."""
+        return has_checkpoint(self.out / UNFINISHED)
+
     def start(self) -> None:
         """Start the process."""
         words = ["run", str(self.source), "--out", str(self.out), *self.arguments, "--watched"]
@@ -65,39 +84,61 @@ class BrowserRun:
 
     def poll(self) -> None:
         """Look whether it has ended."""
-        if self.status == "running" and self._process is not None and (code := self._process.poll()) is not None:
-            finished = (self.out / "provenance.json").is_file()
-            if code == 0 or (code in _STOPPED and finished):
-                self.status = "done"
-            else:
-                self.status = "stopped" if self.stopping else "failed"
+        if self.status != "running" or self._process is None:
+            return
+        if self.stopping and time.monotonic() - self._stopped_s > _PATIENCE_S:
+            self.kill()
+        if (code := self._process.poll()) is not None:
+            self.status = "done" if code == 0 else "stopped" if self.stopping else "failed"
 
     def stop(self) -> None:
-        """Ask it to end after its frame and write what it has; asked again it only goes on with that."""
-        if self._process is not None and self._process.poll() is None:
-            if not self.stopping:  # a second signal would end it with nothing written
-                self._process.send_signal(signal.SIGINT)
-            self.stopping = True
-        elif self.status == "waiting":
+        """Ask it to end after its frame and keep what it has tracked; asked again it only goes on with that."""
+        if self.status == "waiting":
             self.status = "stopped"
+        elif self._process is not None and self._process.poll() is None and not self.stopping:
+            # A second signal would end it with less kept.
+            self._process.send_signal(signal.SIGINT)
+            self.stopping, self._stopped_s = True, time.monotonic()
+
+    def copy(self) -> Path:
+        """Copy what it has kept into the folder of another result, and return that; any thread may call it.
+
+        This one can still go on. Raises `InputError` where the disk is full.
+        """
+        out = self.queue.new_result(Path(f"{self.out.name}{_SO_FAR}"))
+        with reporting(f"cannot copy what {self.out} has kept"):
+            shutil.rmtree(out / UNFINISHED, ignore_errors=True)
+            shutil.copytree(self.out / UNFINISHED, out / UNFINISHED, ignore=shutil.ignore_patterns(LOCK, VIEW))
+        return out
+
+    def finish(self, out: Path) -> BrowserRun:
+        """Put a run at the end of the queue that makes a result of what `copy` has put into a folder; return it."""
+        return self.queue.ask(self.source, out, (*self.arguments, "--finish"))
+
+    def go_on(self) -> None:
+        """Put it into the queue again: it goes on after what it has kept."""
+        self.status, self.stopping = "waiting", False
+        self.queue.put(self)
 
     def kill(self) -> None:
-        """End it at once; the same run goes on from its last checkpoint. One that is stopping may write what it has."""
+        """End it at once; the same run goes on from its last checkpoint. One that is stopping may keep what it has."""
         if self._process is None or self._process.poll() is not None:
             return
         if self.stopping:
             with suppress(subprocess.TimeoutExpired):
-                self._process.wait(_PATIENCE_S)
-        # No gentler signal: it would write a result of the frames so far, which nothing can go on from.
+                self._process.wait(max(0.0, self._stopped_s + _PATIENCE_S - time.monotonic()))
         self._process.kill()
         self._process.wait()
 
 
 class RunQueue:
-    """Runs in the order in which they were asked for, one at a time; folder : of their logs."""
+    """Runs in the order in which they were asked for, one at a time.
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    folder : of their logs. new_result : returns a folder for a result of an input.
+    """
+
+    def __init__(self, folder: Path, new_result: Callable[[Path], Path]) -> None:
+        self._folder, self.new_result = folder, new_result
         self._waiting: deque[BrowserRun] = deque()
         self.runs: list[BrowserRun] = []
         """All, the last one last."""
@@ -109,11 +150,15 @@ class RunQueue:
 
     def ask(self, source: Path, out: Path, arguments: Sequence[str]) -> BrowserRun:
         """Put a run at the end of the queue, and return it."""
-        run = BrowserRun(source, out, tuple(arguments), self._folder / f"{len(self.runs):03d}" / _LOG)
+        run = BrowserRun(source, out, tuple(arguments), self._folder / f"{len(self.runs):03d}" / _LOG, self)
         self.runs.append(run)
+        self.put(run)
+        return run
+
+    def put(self, run: BrowserRun) -> None:
+        """Put a run at the end of the queue."""
         self._waiting.append(run)
         self.tick()
-        return run
 
     def place(self, run: BrowserRun) -> int:
         """Return how many runs come before one that waits."""

@@ -29,6 +29,7 @@ scopemap finds how the camera moved and reconstructs the tissue surface. Everyth
 _CHOOSE = "choose ..."
 _LOOK = "Look at it"
 _STOP = "Stop"
+_GO_ON = "Continue"
 _CLIP = ("colon.mp4", "camera.yaml")
 _MOST_RUNS = 6
 
@@ -127,12 +128,15 @@ class StartPage:
         gui = self._window.gui
         self._states.append((run, gui.add_markdown(self._words(run))))
         can_stop = run.status in ("waiting", "running") and not run.stopping
-        buttons = gui.add_button_group("", (_LOOK, _STOP) if can_stop else (_LOOK,))
+        second = (_STOP,) if can_stop else (_GO_ON,) if run.status == "stopped" else ()
+        buttons = gui.add_button_group("", (_LOOK, *second))
 
         def pressed() -> None:
             if buttons.value == _STOP:
                 run.stop()
             else:
+                if buttons.value == _GO_ON:
+                    run.go_on()
                 self.show_run(run)
 
         self._window.on(buttons, pressed)
@@ -142,7 +146,8 @@ class StartPage:
         if run.status == "waiting":
             return f"**{name}** waits: {self._workspace.runs.place(run)} before it"
         if run.status != "running":
-            ends = {"done": "done", "failed": "has failed", "stopped": "was stopped"}
+            kept = ", and what was tracked is kept" if run.is_kept else ""
+            ends = {"done": "done", "failed": "has failed", "stopped": f"was stopped{kept}"}
             return f"**{name}** {ends[run.status]}"
         state = read_state(view_folder(run.out))
         is_at = "starting" if state is None else words_of(state).partition("\n")[0]
@@ -230,4 +235,4 @@ class StartPage:
             return
         title = window.names.of(run.source, "video")
         waiting = lambda: workspace.runs.place(run)  # noqa: E731
-        window.show(RunPage(run, view_folder(run.out), title, finished, self._window.start, waiting))
+        window.show(RunPage(run, view_folder(run.out), title, finished, waiting=waiting))

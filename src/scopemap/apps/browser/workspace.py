@@ -56,7 +56,7 @@ class Workspace:
         self._session = Path(tempfile.mkdtemp(prefix="scopemap-app-"))
         self.uploads = self.results / _UPLOADS if keep_uploads else self._session / _UPLOADS
         self.keeps_uploads = keep_uploads
-        self.runs = RunQueue(self.logs)
+        self.runs = RunQueue(self.logs, self.new_result)
 
     def __enter__(self) -> Workspace:
         return self
@@ -88,8 +88,8 @@ class Workspace:
 
     @property
     def interrupted(self) -> list[Path]:
-        """Folders in FOLDER/scopemap of runs that were killed, and that no run of this session writes to."""
-        writing = {run.out for run in self.runs.runs if run.status in ("waiting", "running")}
+        """Folders in FOLDER/scopemap of killed runs, which no run of this session writes to or has kept."""
+        writing = {run.out for run in self.runs.runs if run.status in ("waiting", "running", "stopped")}
         return [path for path in _inside(self.results) if path not in writing and _is_left(path)][:_MOST_LISTED]
 
     @property
@@ -136,7 +136,7 @@ class Workspace:
         stem, number = self._stem(source), 1
         while True:
             out = self.results / (stem if number == 1 else f"{stem}_{number}")
-            is_taken = any(run.out == out and run.status not in ("failed", "stopped") for run in self.runs.runs)
+            is_taken = any(run.out == out and run.holds_its_folder for run in self.runs.runs)
             if not is_taken and (not out.exists() or _is_left(out)):
                 return out
             number += 1
@@ -146,10 +146,14 @@ class Workspace:
         stem = re.sub(r"[^\w.-]+", "_", source.name if source.is_dir() else source.stem).strip(".") or "video"
         return f"{stem}_" if stem in (_UPLOADS, _MASKS, DEMONSTRATION) else stem
 
-    def reconstruct(self, source: Path, arguments: Sequence[str], out: Path | None = None) -> BrowserRun:
-        """Put a run of an input at the end of the queue, and return it."""
+    def reconstruct(self, source: Path, arguments: Sequence[str]) -> BrowserRun:
+        """Put a run of an input at the end of the queue, and return it; the same one that was stopped goes on."""
+        for run in self.runs.runs:
+            if (run.status, run.source, run.arguments) == ("stopped", source, tuple(arguments)):
+                run.go_on()
+                return run
         self.results.mkdir(parents=True, exist_ok=True)
-        return self.runs.ask(source, self.new_result(source) if out is None else out, arguments)
+        return self.runs.ask(source, self.new_result(source), arguments)
 
 
 def _inside(folder: Path) -> list[Path]:

@@ -30,8 +30,8 @@ from scopemap.report.sheet import picture_grid
 from scopemap.result.result import Result
 from scopemap.result.result_folder import check_result_folder
 from scopemap.result.trajectories import read_trajectory
+from scopemap.runner.observers import Observer, Progress
 from scopemap.runner.reconstruct import reconstruct
-from scopemap.runner.run import Observer, Progress
 
 CLIP = "colon.mp4"
 CAMERA = "camera.yaml"

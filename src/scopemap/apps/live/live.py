@@ -22,9 +22,9 @@ from scopemap.input.live_source import LiveSource
 from scopemap.input.sequence import Sequence
 from scopemap.result.result import Result
 from scopemap.result.wording import facts_of_notices
+from scopemap.runner.observers import FrameWriter, Progress
 from scopemap.runner.provenance import Limits
 from scopemap.runner.reconstructor import Reconstructor
-from scopemap.runner.run import FrameWriter, Progress
 
 LIMITS = Limits(frames=50_000, maps=8, blocks=80_000, stored=9_000)
 """Of a session: about 60 MB of rows, 1 GB of surfaces, and on disk 4 GB of frames: ten minutes at 15 frames/s."""

@@ -7,9 +7,11 @@ import signal
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import asdict
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from scopemap.engine.config import Config
     from scopemap.input.sequence import Sequence
     from scopemap.result.result import Result
+    from scopemap.runner.forecast import RunCost
 
 
 def run(
@@ -120,6 +123,14 @@ def run(
             help="Resume a killed run; default: if input, settings and versions are the same.",
         ),
     ] = None,
+    dry_run: Annotated[
+        bool,
+        options.advanced("--dry-run", help="Run one second of the video and print the expected time and space of all."),
+    ] = False,
+    finish: Annotated[
+        bool,
+        options.advanced("--finish", help="Read no more frames: write the result of what a stopped run has tracked."),
+    ] = False,
     in_app: Annotated[
         bool, typer.Option("--app", help="Show the run in a browser while it goes on, and its result (extra app).")
     ] = False,
@@ -160,23 +171,42 @@ def run(
 
     known = {"dataset": dataset, "camera": camera, "fov_deg": fov, "size": options.parse_size(size) if size else None}
     sequence = _opened(source, resolved, known)
-    from scopemap.runner.checkpoints import check_resumable, discard_unfinished
+    from scopemap.runner.checkpoints import check_finishable, check_resumable, discard_unfinished
+    from scopemap.runner.forecast import run_cost
+
+    if dry_run:
+        place = next(folder for folder in out.absolute().parents if folder.exists())
+        with TemporaryDirectory(prefix=".dry-run-", dir=place) as folder:
+            part = partial(_opened, source, resolved, known)
+            _forecast(run_cost(sequence, part, resolved, Path(folder) / "result"), as_json=as_json, quiet=quiet)
+        return
     from scopemap.runner.estimators import missing_weights
     from scopemap.runner.network_cost import network_cost
+    from scopemap.runner.observers import RunStopped
     from scopemap.runner.with_report import reconstruct_with_report
 
-    if resume:
+    if finish:
+        check_finishable(out, sequence, resolved)
+    elif resume:
         check_resumable(out, sequence, resolved)
     elif resume is not None:
         discard_unfinished(out)
     if not (quiet or as_json or missing_weights(resolved)) and (cost := network_cost(resolved, sequence)):
         typer.echo(cost, err=True)
+    looked: Literal["", "app", "window"] = "window" if watched else "app" if in_app else ""
+    count, adjusts = sequence.used_count, resolved.mapping.global_adjustment
     with _window(out) if in_app else nullcontext():
-        adjusts = resolved.mapping.global_adjustment
-        with _shown(out, sequence.used_count, adjusts, quiet or as_json, watched or in_app) as (shown, interruption):
-            result = reconstruct_with_report(
-                sequence, resolved, out, overwrite=overwrite, observers=shown.observers, progress=shown.progress
-            )
+        with _shown(out, count, adjusts, quiet or as_json, looked) as (
+            shown,
+            interruption,
+        ):
+            observers = (*shown.observers, lambda step: finish)
+            try:
+                result = reconstruct_with_report(
+                    sequence, resolved, out, overwrite=overwrite, observers=observers, progress=shown.progress
+                )
+            except RunStopped:
+                raise typer.Exit(interruption.exit_code) from None
         _report(result, resolved, out, as_json=as_json, quiet=quiet)
     # After the last frame there is nothing to cut short: the result is whole.
     if interruption.exit_code and result.provenance["interrupted_at_frame"] is not None:
@@ -194,14 +224,17 @@ def _window(out: Path) -> AbstractContextManager[None]:
 
 @contextmanager
 def _shown(
-    out: Path, frames: int | None, adjusts: bool, silent: bool, watched: bool
+    out: Path, frames: int | None, adjusts: bool, silent: bool, looked: Literal["", "app", "window"]
 ) -> Iterator[tuple[RunProgress, Interruption]]:
-    """Yield what a run tells how far it is, in the terminal and, `watched`, for a window; and what ends it early."""
+    """Yield what a run tells how far it is, in the terminal and for what `looked` names; and what ends it early.
+
+    looked : "app": a window beside this command. "window": one that has started it, and goes on with what it keeps.
+    """
     with ExitStack() as stack:
         shown = stack.enter_context(run_progress(frames, silent=silent, adjusts=adjusts))
-        interruption = stack.enter_context(Interruption())
+        interruption = stack.enter_context(Interruption(keeps=looked == "window"))
         observers, progress = (*shown.observers, interruption.observe), shown.progress
-        if watched:
+        if looked:
             from scopemap.runner.watched import RunWatch
 
             watch = stack.enter_context(RunWatch(out, frames, adjusts=adjusts))
@@ -209,14 +242,27 @@ def _shown(
         yield RunProgress(observers, progress), interruption
 
 
-def _opened(source: Path, resolved: Config, known: dict[str, Any]) -> Sequence:
-    """Return the frames of an input by what is `known` of it; what a run needs is loaded meanwhile."""
+def _forecast(cost: RunCost | None, *, as_json: bool, quiet: bool) -> None:
+    """Print what a run costs; None: its number of frames is not known."""
+    if as_json:
+        print_json({} if cost is None else asdict(cost) | {"seconds": cost.seconds})
+    elif cost is None:
+        typer.echo("not known: the number of frames is not")
+    elif not quiet:
+        typer.echo(f"{cost.frames} frames, about {cost.seconds:.0f} s, {cost.result_bytes / 1e9:.2f} GB")
+
+
+def _opened(source: Path, resolved: Config, known: dict[str, Any], frames: slice | None = None) -> Sequence:
+    """Return the frames of an input by what is `known` of it; what a run needs is loaded meanwhile.
+
+    frames : instead of those that the settings choose.
+    """
     with loading(), ThreadPoolExecutor(1) as pool:
         from scopemap.input.opening import open_sequence
 
         # To open an input loads nothing of it: imports in two threads can lock up.
         pool.submit(import_module, "scopemap.runner.with_report")
-        return open_sequence(source, settings=resolved.input, **known)
+        return open_sequence(source, settings=resolved.input, frames=frames, **known)
 
 
 def _report(result: Result, resolved: Config, out: Path, *, as_json: bool, quiet: bool) -> None:
