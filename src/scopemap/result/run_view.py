@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import io
 import json
-import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -28,8 +27,6 @@ _DEPTH = "depth.jpg"
 _MAP = "map.npz"
 _COVERAGE = "coverage.png"
 _LOOKED = "looked_at"
-_LOOKED_S = 5.0
-"""Someone who has looked so long ago still looks: a window that is busy looks late."""
 
 
 def view_folder(out: Path) -> Path:
@@ -90,12 +87,12 @@ def look(folder: Path) -> None:
         (folder / _LOOKED).touch()
 
 
-def is_looked_at(folder: Path) -> bool:
-    """Return whether someone has looked just now."""
+def last_look(folder: Path) -> int:
+    """Return a number that is another one after each `look`; 0: no one has looked."""
     try:
-        return time.time() - (folder / _LOOKED).stat().st_mtime < _LOOKED_S
+        return (folder / _LOOKED).stat().st_mtime_ns
     except OSError:
-        return False
+        return 0
 
 
 def write_state(folder: Path, state: RunProgressState) -> None:

@@ -24,7 +24,7 @@ from scopemap.report.frame_pictures import shrunk
 from scopemap.report.run_state import RunState
 from scopemap.result.run_view import (
     RunProgressState,
-    is_looked_at,
+    last_look,
     view_folder,
     write_coverage,
     write_map,
@@ -36,6 +36,8 @@ from scopemap.runner.seen_pieces import SeenPieces
 _EVERY_S = 0.5
 _DRAWN_EVERY_S = 2.0
 """Corners, depth in colours and points take .05 s: less often than what is only counted."""
+_LOOKED_S = 5.0
+"""Who looked so long ago still looks: a window that is busy looks late."""
 _POINTS_EVERY_S = 0.5
 _PICTURE_PX = 480
 _CORNER_CELL_PX = 12  # that of the tracker's corners
@@ -76,6 +78,7 @@ class RunWatch:
         self._map_of = {}
         self._final_map: int | None = None
         self._pointed_s, self._drawn_s, self._written = 0.0, 0.0, 0
+        self._look, self._looked_s = 0, -_LOOKED_S
         self._lock, self._ended = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._write_until_ended, name="watch", daemon=True)
 
@@ -174,9 +177,12 @@ class RunWatch:
         assert folder is not None
         try:
             folder.mkdir(exist_ok=True)
-            if is_looked_at(folder) and time.monotonic() - self._drawn_s > _DRAWN_EVERY_S:
+            now = time.monotonic()
+            if (found := last_look(folder)) != self._look:
+                self._look, self._looked_s = found, now
+            if now - self._looked_s < _LOOKED_S and now - self._drawn_s > _DRAWN_EVERY_S:
                 self._draw(folder)
-                self._drawn_s = time.monotonic()
+                self._drawn_s = now
                 self._written += 1
             write_state(folder, self.state())
         except OSError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import asdict
@@ -171,28 +171,18 @@ def run(
 
     known = {"dataset": dataset, "camera": camera, "fov_deg": fov, "size": options.parse_size(size) if size else None}
     sequence = _opened(source, resolved, known)
-    from scopemap.runner.checkpoints import check_finishable, check_resumable, discard_unfinished
-    from scopemap.runner.forecast import run_cost
-
     if dry_run:
-        place = next(folder for folder in out.absolute().parents if folder.exists())
-        with TemporaryDirectory(prefix=".dry-run-", dir=place) as folder:
-            part = partial(_opened, source, resolved, known)
-            _forecast(run_cost(sequence, part, resolved, Path(folder) / "result"), as_json=as_json, quiet=quiet)
+        cost = _cost(sequence, partial(_opened, source, resolved, known), resolved, out)
+        _print_cost(cost, as_json=as_json, quiet=quiet)
         return
     from scopemap.runner.estimators import missing_weights
     from scopemap.runner.network_cost import network_cost
     from scopemap.runner.observers import RunStopped
     from scopemap.runner.with_report import reconstruct_with_report
 
-    if finish:
-        check_finishable(out, sequence, resolved)
-    elif resume:
-        check_resumable(out, sequence, resolved)
-    elif resume is not None:
-        discard_unfinished(out)
-    if not (quiet or as_json or missing_weights(resolved)) and (cost := network_cost(resolved, sequence)):
-        typer.echo(cost, err=True)
+    _check_unfinished(out, sequence, resolved, finish=finish, resume=resume)
+    if not (quiet or as_json or missing_weights(resolved)) and (words := network_cost(resolved, sequence)):
+        typer.echo(words, err=True)
     looked: Literal["", "app", "window"] = "window" if watched else "app" if in_app else ""
     count, adjusts = sequence.used_count, resolved.mapping.global_adjustment
     with _window(out) if in_app else nullcontext():
@@ -242,7 +232,28 @@ def _shown(
         yield RunProgress(observers, progress), interruption
 
 
-def _forecast(cost: RunCost | None, *, as_json: bool, quiet: bool) -> None:
+def _check_unfinished(out: Path, sequence: Sequence, resolved: Config, *, finish: bool, resume: bool | None) -> None:
+    """Refuse what a run left in `out`, or take it away, as --finish and --resume ask for it."""
+    from scopemap.runner.checkpoints import check_finishable, check_resumable, discard_unfinished
+
+    if finish:
+        check_finishable(out, sequence, resolved)
+    elif resume:
+        check_resumable(out, sequence, resolved)
+    elif resume is not None:
+        discard_unfinished(out)
+
+
+def _cost(whole: Sequence, part: Callable[[slice], Sequence], resolved: Config, out: Path) -> RunCost | None:
+    """Return what a run costs, by its first second; what that writes beside `out` is removed."""
+    from scopemap.runner.forecast import run_cost
+
+    place = next(folder for folder in out.absolute().parents if folder.exists())
+    with TemporaryDirectory(prefix=".dry-run-", dir=place) as folder:
+        return run_cost(whole, part, resolved, Path(folder) / "result")
+
+
+def _print_cost(cost: RunCost | None, *, as_json: bool, quiet: bool) -> None:
     """Print what a run costs; None: its number of frames is not known."""
     if as_json:
         print_json({} if cost is None else asdict(cost) | {"seconds": cost.seconds})
