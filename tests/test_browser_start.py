@@ -24,6 +24,7 @@ from scopemap.apps.browser.input_page import InputPage
 from scopemap.apps.browser.looking import measured_rates
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
+from scopemap.apps.browser.serving import RUN_GOES_ON
 from scopemap.apps.browser.start_page import StartPage
 from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.browser.workspace import Workspace, thumbnail
@@ -266,6 +267,30 @@ def test_the_demonstration_from_the_button_to_the_verdict(browser: Any, served: 
     assert local == {own, own.replace("http", "ws")}
 
 
+def test_a_page_of_a_run_draws_rarely_until_someone_moves_it(browser: Any) -> None:
+    window = BrowserWindow()
+    page = browser.new_page(viewport={"width": 900, "height": 600})
+    count = """seconds => new Promise(ended => {
+        let drawn = 0;
+        const next = () => { drawn += 1; requestAnimationFrame(next); };
+        requestAnimationFrame(next);
+        setTimeout(() => ended(drawn), 1000 * seconds);
+    })"""
+    drawn = {}
+    page.goto(window.url)
+    page.get_by_text("Dark", exact=True).wait_for()
+    page.wait_for_timeout(4000)  # no one touches it
+    drawn["start"] = page.evaluate(count, 4)
+    page.evaluate(f"document.body.appendChild(document.createElement('i')).id = '{RUN_GOES_ON}'")
+    drawn["run"] = page.evaluate(count, 4)
+    page.mouse.move(100, 100)
+    drawn["moved"] = page.evaluate(count, 2)
+    window.close()
+    assert drawn["run"] <= 3
+    assert drawn["start"] > 2 * drawn["run"]
+    assert drawn["moved"] > 2 * drawn["run"]
+
+
 def test_a_video_is_sent_looked_at_run_and_stopped(browser: Any, served: tuple[str, Path], tmp_path: Path) -> None:
     url, folder = served
     opened = Opened(browser, url)
@@ -296,7 +321,7 @@ def test_a_video_is_sent_looked_at_run_and_stopped(browser: Any, served: tuple[s
     opened.until(lambda: "Continue" in opened.text())
     opened.press("Continue")
     opened.until(lambda: (out / "provenance.json").exists())
-    assert Result(out).provenance["resumed_after_frame"] is not None
     assert Result(out).provenance["interrupted_at_frame"] is None
+    assert len(Result(out).frames) > len(Result(part).frames)
     word = verdict(Result(out)).word.capitalize()
     opened.until(lambda: word in opened.text())

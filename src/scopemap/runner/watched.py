@@ -34,7 +34,7 @@ from scopemap.result.run_view import (
 from scopemap.runner.seen_pieces import SeenPieces
 
 _EVERY_S = 0.5
-_DRAWN_EVERY_S = 2.0
+_DRAWN_EVERY_S = 3.0
 """Corners, depth in colours and points take .05 s: less often than what is only counted."""
 _LOOKED_S = 5.0
 """Who looked so long ago still looks: a window that is busy looks late."""

@@ -12,6 +12,7 @@ from PIL import Image
 
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, look_at, quaternion
+from scopemap.apps.browser.serving import RUN_GOES_ON
 from scopemap.apps.browser.window import escaped, fenced
 from scopemap.result.run_view import RunProgressState, SeenMap, look, read_coverage, read_map, read_pictures, read_state
 
@@ -25,6 +26,7 @@ _LOST = (200, 40, 40)
 _TRACKED = (30, 160, 70)
 _EARLIER = (150, 150, 150)
 _GREY = " Grey: what was seen before tracking began anew. Where it lies beside the rest is a guess until the run ends."
+_NOT_FINAL = " Grey: as tracked, before the adjustment."
 _MOST_LOG = 4000
 _STOP = "Stop"
 _STOPPING = "stopping, ten seconds at most"
@@ -71,9 +73,9 @@ class RunPage:
     ) -> None:
         self._run, self._folder, self._title = run, folder, title
         self._finished, self._back, self._waiting, self._buttons = finished, back, waiting, buttons or {}
-        self._ended = self._is_lost = False
+        self._ended = self._is_lost = self._has_grey = False
         self._written = self._first = -1
-        self._size = self._grey = ""
+        self._size = ""
         self._ways: list[Any] = []
 
     def open(self, window: BrowserWindow) -> None:
@@ -81,6 +83,7 @@ class RunPage:
         gui = window.gui
         self._window = window
         gui.add_markdown(f"### {escaped(window.names.hidden(self._title))}")
+        self._rarely = gui.add_html(f'<span id="{RUN_GOES_ON}"></span>')
         self._words = gui.add_markdown("starting")
         self._bar = gui.add_progress_bar(0)
         self._facts = gui.add_markdown("", visible=False)
@@ -145,7 +148,8 @@ class RunPage:
     def _go_on(self) -> None:
         assert isinstance(self._run, BrowserRun)
         self._run.go_on()
-        self._ended, self._stop.visible, self._stop.disabled, self._stop.label = False, True, False, _STOP
+        self._ended, self._stop.visible, self._rarely.visible = False, True, True
+        self._stop.disabled, self._stop.label = False, _STOP
         for way in self._ways:
             way.visible = False
         self.tick()
@@ -169,7 +173,7 @@ class RunPage:
             button.disabled = True
 
     def _end(self, status: str) -> None:
-        self._ended, self._bar.visible, self._stop.visible = True, False, False
+        self._ended, self._bar.visible, self._stop.visible, self._rarely.visible = True, False, False, False
         for button in self._live:
             button.visible = False
         if status == "done":
@@ -210,7 +214,8 @@ class RunPage:
 
     def _note_size(self, state: RunProgressState) -> None:
         if state.points:
-            self._size = f"\n\nThe surface so far: {state.points:,} points from {state.frames:,} frames.{self._grey}"
+            grey = "" if not self._has_grey else _NOT_FINAL if state.adjusted else _GREY
+            self._size = f"\n\nThe surface so far: {state.points:,} points from {state.frames:,} frames.{grey}"
 
     def _draw_all(self) -> None:
         if (pictures := read_pictures(self._folder)) is not None:
@@ -224,7 +229,7 @@ class RunPage:
     def _draw(self, seen: SeenMap) -> None:
         """Draw path, points and the camera: few nodes, as a browser may have to draw with the processor."""
         scene = self._window.scene
-        self._grey = _GREY if len(seen.earlier) else ""
+        self._has_grey = len(seen.earlier) > 0
         positions = seen.T_world_camera[:, :3, 3]
         everything = np.concatenate([positions, seen.points, seen.earlier])
         size = float(np.linalg.norm(np.ptp(np.percentile(everything, [5, 95], axis=0), axis=0))) or 1.0
@@ -236,7 +241,7 @@ class RunPage:
             for name, points, colours, share in (
                 ("points", seen.points, seen.colours, _POINT_SHARE),
                 ("earlier", seen.earlier, grey, _POINT_SHARE),
-                ("keyframes", keyframes.astype(np.float32), blue, 2 * _POINT_SHARE),
+                ("keyframes", keyframes.astype(np.float32), blue, _POINT_SHARE),
             ):
                 scene.remove_by_name(f"/page/{name}")
                 if len(points):

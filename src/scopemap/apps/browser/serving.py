@@ -21,6 +21,9 @@ LOOPBACK = "127.0.0.1"
 _OWN_NAMES = {LOOPBACK, "localhost", "[::1]", "::1"}
 _ALL = ("0.0.0.0", "::")  # noqa: S104
 _TITLE = "scopemap"
+RUN_GOES_ON = "scopemap-run-goes-on"
+"""Name of an element of the page; while it is there the page draws rarely, unless someone moves it."""
+_RARELY = (Path(__file__).parent / "draw_rarely.js").read_text(encoding="utf-8").replace("ELEMENT", RUN_GOES_ON)
 # What the page may load: itself, what it makes in memory, and its own connection.
 _POLICY = (
     "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval'; "
@@ -127,7 +130,8 @@ def _checked(answer: Callable[..., Any], *, only_own: bool, files: Mapping[str, 
             for name, value in _HEADERS.items():
                 response.headers[name] = value
             if response.headers.get("Content-Type", "").startswith("text/html"):
-                response.body = re.sub(rb"<title>.*?</title>", f"<title>{_TITLE}</title>".encode(), response.body)
+                head = f"<title>{_TITLE}</title><script>{_RARELY}</script>".encode()
+                response.body = re.sub(rb"<title>.*?</title>", lambda found: head, response.body)
                 del response.headers["Content-Length"]
                 response.headers["Content-Length"] = str(len(response.body))
         return response
