@@ -26,8 +26,8 @@ from scopemap.apps.browser.unseen_part import unseen_words
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.apps.coverage.coverage import BLIND, CAUTION, coverage
 from scopemap.engine.notices import Notice
+from scopemap.report.measured_by_hand import read_measurements
 from scopemap.report.page import write_report
-from scopemap.report.page_data import read_measurements
 from scopemap.result.result import Result
 from scopemap.result.summary import summary_lines
 from scopemap.result.wording import facts_of_notices
@@ -195,7 +195,8 @@ def test_a_distance_is_measured_and_kept(tmp_path: Path) -> None:
 
 
 def test_without_a_scale_two_points_become_the_reference(tmp_path: Path) -> None:
-    page = ResultPage(draw_run(tmp_path))
+    folder = draw_run(tmp_path)
+    page = ResultPage(folder)
     with shown_window() as shown:
         shown.show(page)
         shown.choose("ButtonGroup", "Measure", "Distance")
@@ -207,6 +208,11 @@ def test_without_a_scale_two_points_become_the_reference(tmp_path: Path) -> None
         shown.press("Use as reference")
         assert "Sizes are in mm by your reference (5 mm)." in shown.words
         assert "Sizes are unknown" not in shown.words
+        assert shown.nodes["/page/reference/words"].text == "5 mm"
+        # It is there when the result is opened again.
+        page = ResultPage(folder)
+        shown.show(page)
+        assert "Sizes are in mm by your reference (5 mm)." in shown.words
         assert shown.nodes["/page/reference/words"].text == "5 mm"
         shown.choose("ButtonGroup", "Measure", "Area")
         for pixel in ((20.0, 20.0), (60.0, 20.0), (60.0, 44.0)):
@@ -239,14 +245,20 @@ def test_a_lesion_is_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureF
         corners = ((52.0, 26.0), (64.0, 26.0), (64.0, 38.0), (52.0, 38.0))
         for pixel in corners:
             click(shown, page, pixel)
+        shown.choose("Text", "Name of the lesion", "polyp 1")
         shown.press("Measure the lesion")
         shown.until(lambda: "largest diameter" in shown.words)
         outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
         assert f'--lesion "{outline}"' in shown.words
         capsys.readouterr()
-        assert call("measure", folder, "--frame", 4, "--lesion", outline) == 0
-        for line in capsys.readouterr().out.splitlines()[:-1]:
-            assert line in shown.words
+        assert call("measure", folder, "--frame", 4, "--lesion", outline, "--json") == 0
+        facts = json.loads(capsys.readouterr().out)["measures"]
+        # It is kept by its name, and there when the result is opened again.
+        (kept,) = read_measurements(folder)
+        assert (kept["kind"], kept["name"], kept["found"]) == ("lesion", "polyp 1", facts)
+        shown.show(ResultPage(folder))
+        assert f"1. polyp 1: {facts[0]['what']}: " in shown.words
+        assert shown.nodes["/page/measured/0/words"].text.startswith("polyp 1: ")
 
 
 def test_a_share_that_may_be_far_too_large_is_said_with_its_caution(tmp_path: Path) -> None:

@@ -15,8 +15,9 @@ import numpy as np
 
 from scopemap.engine.errors import reporting
 from scopemap.report.frame_pictures import FOLDER as PICTURES
+from scopemap.report.measured_by_hand import MEASUREMENTS, checked_measurements
 from scopemap.report.measured_surface import MOST_FACES
-from scopemap.report.page_data import MEASUREMENTS, checked_measurements, page_data, shown_meshes
+from scopemap.report.page_data import by_hand_data, page_data, shown_meshes
 from scopemap.report.pale_parts import LEAST_COLOUR, PALE, SURE_CONFIDENCE, WORDS
 from scopemap.report.shown_mesh import base64_of
 from scopemap.report.summary_picture import summary_picture
@@ -30,6 +31,7 @@ _SCRIPTS = (
     "matrices", "surface_view", "frame_panels", "curves", "words", "atlas", "measuring", "measure_by_hand", "page",
     "gestures",
 )  # fmt: skip
+_DATA = re.compile(r'(<script type="application/json" id="data">)(.*?)(</script>)', re.DOTALL)
 _LICENCES = (
     "Licences: scopemap and its depth network scopenet are under Apache-2.0. Weights of other networks have licences "
     "of their own, named by `scopemap models list`; some forbid commercial use. The video and its data set keep theirs."
@@ -72,15 +74,46 @@ def write_comparison(folders: Sequence[Path], names: Sequence[str], file: Path) 
 
 
 def keep_measurements(folder: Path | str, sent: bytes) -> None:
-    """Write what was measured by hand, a list as JSON, as `measurements.json` into a run's folder.
+    """Write what was measured by hand, a list as JSON, as `measurements.json` into a run's folder, and into its report.
 
     Raises `InputError` where it is no such list, or cannot be written.
     """
     file = Path(folder) / MEASUREMENTS
     with reporting(f"cannot write {file}"):
-        text = json.dumps(checked_measurements(sent), indent=1)
-        file.with_suffix(".part").write_text(f"{text}\n", encoding="utf-8")
-        file.with_suffix(".part").replace(file)
+        _replace(file, json.dumps(checked_measurements(sent), indent=1) + "\n")
+    _put_into_page(Path(folder))
+
+
+def _put_into_page(folder: Path) -> None:
+    """Write what is measured by hand into a run's report, where there is one; all else on it stays.
+
+    To write all of the page takes seconds, and the one who measures waits.
+    """
+    page = folder / PAGE
+    if not page.is_file():
+        return
+    with reporting(f"cannot write {page}"):
+        text = page.read_text(encoding="utf-8")
+        if (found := _DATA.search(text)) is None:
+            raise ValueError("it is no report")
+        content = json.loads(found[2])
+        content["runs"][0] |= without_nan(by_hand_data(Result(folder)))
+        _replace(page, text[: found.start(2)] + _as_data(content) + text[found.end(2) :])
+    if (folder / SUMS).is_file():
+        write_checksums(folder, only=(PAGE,))
+
+
+def _replace(file: Path, text: str) -> None:
+    """Write a file as a whole or not at all."""
+    draft = file.with_suffix(".part")
+    draft.write_text(text, encoding="utf-8")
+    draft.replace(file)
+
+
+def _as_data(content: dict[str, Any]) -> str:
+    """Return the data of a page as its script holds it."""
+    # "<" would end the script that holds the data, wherever a name in it contains "</script>".
+    return json.dumps(content, allow_nan=False).replace("<", "\\u003c")
 
 
 def page_html(runs: list[dict[str, Any]]) -> str:
@@ -96,8 +129,7 @@ def page_html(runs: list[dict[str, Any]]) -> str:
         "title": html.escape(names.encode("utf-8", "replace").decode("utf-8"), quote=False),
         "style": _asset("page.css"),
         "script": "\n".join(_asset(f"{name}.js") for name in _SCRIPTS),
-        # "<" would end the script that holds the data, wherever a name in it contains "</script>".
-        "data": json.dumps(content, allow_nan=False).replace("<", "\\u003c"),
+        "data": _as_data(content),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda place: parts[place[1]], _asset("page.html"))
 

@@ -11,11 +11,12 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from scopemap.engine.errors import ScopemapError
 from scopemap.engine.geometry.align import align_trajectories
 from scopemap.input.trajectory.trajectory import Trajectory
+from scopemap.report.measured_by_hand import advice_by_reference, read_measurements
 from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
 from scopemap.report.shown_maps import MapOnPage, shown_map_numbers, shown_maps
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified, textured_surface
@@ -32,7 +33,6 @@ from scopemap.result.summary import frames_per_s
 from scopemap.result.verdict import gives_reason, verdict
 from scopemap.result.wording import in_words
 
-MEASUREMENTS = "measurements.json"
 COVERAGE = "coverage"
 _MOST_BYTES = 7_500_000
 """Of pictures, before base64, which makes them a third longer."""
@@ -69,11 +69,11 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
     camera, pictures = run.camera, _within_budget(_pictures(run), share * _MOST_BYTES)
     near_mm, far_mm = _depth_range([p.depth_mm for p in pictures if p.depth_mm is not None])
     source = str(run.provenance.get("input", ""))
-    found, maps = verdict(run), shown_maps(run)
+    maps = shown_maps(run)
     return {
         "name": name or Path(source).name or source,
         "input": source,
-        "verdict": asdict(found) | {"word": found.word},
+        **by_hand_data(run),
         "titles": [one.facts for one in maps],
         "scale_known": run.scale_known,
         "scale_source": scale_source(run.provenance),
@@ -87,7 +87,6 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
         "sigma_shares": run.depth.sigma_shares.astype(np.float64).tolist(),
         # Runs that share a page have fewer triangles than `measure` measures on.
         "measuring": share >= 1,
-        "measurements": read_measurements(run.folder),
         "coverage": _coverage(run),
         "maps": _maps(run, maps, meshes, pictures),
         "losses": [
@@ -102,6 +101,13 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
         "config": run.config_text,
         "provenance": {name: value for name, value in run.provenance.items() if name not in PLACES},
     }
+
+
+def by_hand_data(run: Result) -> dict[str, Any]:
+    """Return what of `page_data` changes with what is measured by hand: that, and the verdict with what sizes are."""
+    found, kept = verdict(run), read_measurements(run.folder)
+    advice = advice_by_reference(found.advice, kept)
+    return {"verdict": asdict(found) | {"word": found.word, "advice": advice}, "measurements": kept}
 
 
 def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:
@@ -134,14 +140,6 @@ def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:
         "reasons": different,
         "reason": base64_of(np.array([number_of[reason] for reason in reasons]), "i2"),
     }
-
-
-def read_measurements(folder: Path) -> list[Any]:
-    """Return what was measured by hand on a page and kept beside the result; [] where nothing was, or it is damaged."""
-    try:
-        return checked_measurements((folder / MEASUREMENTS).read_bytes())
-    except (OSError, ValueError):
-        return []
 
 
 def _coverage(run: Result) -> dict[str, Any] | None:
@@ -177,33 +175,6 @@ class _Covered(BaseModel):
     caution: str = ""
     total: _NotSeen
     blind_spots: list[_Spot]
-
-
-class _Value(BaseModel):
-    what: str
-    value: float | None
-    low: float | None
-    high: float | None
-    unit: str
-
-
-class _ByHand(BaseModel):
-    folder: str
-    frame: int
-    points: list[tuple[float, float]]
-    reference: list[tuple[float, float]] | None
-    reference_mm: float | None
-    found: list[_Value]
-    command: str
-    world: list[tuple[float, float, float]]
-
-
-def checked_measurements(text: bytes) -> list[dict[str, Any]]:
-    """Return what a page keeps of measuring by hand, from its JSON; raises `ValueError` where it is anything else."""
-    try:
-        return [one.model_dump() for one in TypeAdapter(list[_ByHand]).validate_json(text)]
-    except ValidationError:
-        raise ValueError("it is no list of measurements") from None
 
 
 def _pose_of(submap: Result) -> dict[int, np.ndarray]:

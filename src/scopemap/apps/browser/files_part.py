@@ -15,7 +15,7 @@ from scopemap.apps.export.formats import FORMATS, export_run
 from scopemap.report.page import PAGE, PICTURE
 
 EXPORTS = "exports"
-"""Folder of a result with what the window wrote; `verify` names it as added."""
+"""Folder of a result with what the window wrote; `verify` knows it."""
 _FILM = "film of the video beside the surface"
 _FILM_FILE = "film.mp4"
 _SURFACES = {

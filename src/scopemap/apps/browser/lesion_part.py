@@ -1,29 +1,18 @@
-"""A lesion: its outline, clicked in the view of one frame, and its sizes from all frames, with the command for them."""
+"""A lesion: its outline, clicked in the view of one frame, its name, and its sizes from all frames."""
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-from scopemap.apps.browser.hand_measures import (
-    Reference,
-    broken,
-    folder_in_whole,
-    pixels_in_words,
-    reference_words,
-    rounded,
-)
+from scopemap.apps.browser.hand_measures import Reference, frame_of_reference, line_on_surface
 from scopemap.apps.browser.marks import draw_marks
 from scopemap.apps.browser.result_view import ResultView
-from scopemap.apps.browser.seen_by import frames_that_saw
+from scopemap.apps.browser.seen_by import corners_in
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
-from scopemap.apps.browser.window import escaped, fenced
-from scopemap.apps.measure.lesion import MeasuredLesion, measure_lesion
-from scopemap.engine.errors import InputError
-from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.apps.measure.hand_measure import HandMeasure, folder_in_whole, rounded
+from scopemap.apps.measure.lesion import measure_lesion
 
 _OUTLINE = "/page/lesion"
 _FEWEST = 3
@@ -32,22 +21,24 @@ _FEWEST = 3
 class LesionPart:
     """Controls of a lesion's outline in the frame that is shown when it begins.
 
-    changed : called where there are more corners, or fewer.
+    changed : called where there are more corners, or fewer. keep : takes the lesion, and its line on the surface.
     """
 
     def __init__(
-        self, view: ResultView, reference: Callable[[], Reference | None], changed: Callable[[], None]
+        self,
+        view: ResultView,
+        reference: Callable[[], Reference | None],
+        changed: Callable[[], None],
+        keep: Callable[[HandMeasure, np.ndarray], None],
     ) -> None:
         self._view, self._reference = view, reference
-        self._changed = changed
+        self._changed, self._keep = changed, keep
         self._picks: list[SurfacePick] = []
         self._frame = -1
         gui = view.window.gui
+        self._name = gui.add_text("Name of the lesion", "", visible=False)
+        self._name.hint = "As it is to be found in the list and the report"
         self._button = view.window.on(gui.add_button("Measure the lesion", visible=False), self._measure)
-        self._found = gui.add_markdown("", visible=False)
-        self._folder = gui.add_folder("Command", expand_by_default=False, visible=False)
-        with self._folder:
-            self._command = gui.add_markdown("")
 
     @property
     def count(self) -> int:
@@ -83,61 +74,43 @@ class LesionPart:
 
     def _show(self) -> None:
         view = self._view
-        self._button.visible = len(self._picks) >= _FEWEST
+        self._button.visible = self._name.visible = len(self._picks) >= _FEWEST
         points = np.array([view.surface.position(pick) for pick in self._picks])
         draw_marks(view.window.scene, _OUTLINE, points, view.surface.size_mm)
         self._changed()
 
     def _measure(self) -> None:
-        surface, frame = self._view.surface, self._frame
-        corners = rounded(corners_in(surface, frame, self._picks))
-        reference = self._reference()
+        surface, frame, picks = self._view.surface, self._frame, [*self._picks]
+        reference, name = self._reference(), self._name.value.strip()
 
-        def measure() -> tuple[MeasuredLesion, str]:
-            known, of_frame, length_mm = _reference_pixels(surface, reference, frame)
-            found = measure_lesion(
-                surface.run.folder,
-                corners,
-                frame,
-                reference=known,
-                reference_frame=of_frame,
-                reference_mm=length_mm,
-            )
-            folder = Path(self._view.folder_words) / folder_in_whole(surface.run)
-            words = ["scopemap", "measure", shlex.quote(str(folder)), "--frame", str(frame)]
-            words += ["--lesion", f'"{pixels_in_words(corners)}"', *reference_words(known, length_mm)]
-            words += [] if of_frame is None else ["--reference-frame", str(of_frame)]
-            return found, " ".join(words)
+        def measure() -> tuple[HandMeasure, np.ndarray]:
+            found = lesion_by_hand(surface, frame, picks, reference, name)
+            return found, line_on_surface(surface, frame, found.world)
 
-        self._view.window.job("measuring the lesion", measure, self._say)
+        def then(found: tuple[HandMeasure, np.ndarray]) -> None:
+            self._picks, self._name.value = [], ""
+            self._view.note(str(found[0].found[0]))
+            self._show()
+            self._keep(*found)
 
-    def _say(self, measured: tuple[MeasuredLesion, str]) -> None:
-        found, command = measured
-        lines = [f"- {escaped(str(one))}" for one in found.measures]
-        lines.append(f"\nFrom {len(found.masks)} frames; the scale rests on {escaped(found.scale)}.")
-        self._found.content, self._command.content = "\n".join(lines), fenced(broken(command))
-        self._found.visible = self._folder.visible = True
-        self._view.note(str(found.measures[0]))
+        self._view.window.job("measuring the lesion", measure, then)
 
 
-def corners_in(surface: ShownSurface, frame: int, picks: list[SurfacePick]) -> np.ndarray:
-    """Return the pixels (N, 2) of places in a frame, NaN behind it. Raises `InputError` where it has no pose."""
-    tracked = surface.run.tracked
-    row = np.flatnonzero(tracked["index"] == frame)
-    if not len(row):
-        raise InputError(f"frame {frame} has no pose in this submap: choose a tracked frame")
-    places = np.array([surface.position(pick) for pick in picks])
-    return surface.run.camera.project(transform(inverse(tracked["T_world_camera"][row[0]]), places))
+def lesion_by_hand(
+    surface: ShownSurface, frame: int, picks: list[SurfacePick], reference: Reference | None, name: str
+) -> HandMeasure:
+    """Return the sizes of a lesion with these corners in a frame, as `scopemap measure --lesion` finds them.
 
-
-def _reference_pixels(
-    surface: ShownSurface, reference: Reference | None, frame: int
-) -> tuple[np.ndarray | None, int | None, float | None]:
-    """Return the pixels (2, 2) of a reference, their frame where it is not `frame`, and its length, mm."""
-    if reference is None:
-        return None, None, None
-    seen = frames_that_saw(surface, reference.picks)
-    if not seen:
-        raise InputError("no frame saw both ends of the reference: choose another one")
-    best = next((sight for sight in seen if sight.frame == frame), seen[0])
-    return rounded(best.pixels), None if best.frame == frame else best.frame, reference.length_mm
+    Raises `InputError` where no frame saw both ends of the reference, and as `measure_lesion`.
+    """
+    corners, known, of_frame, length_mm = rounded(corners_in(surface, frame, picks)), None, None, None
+    if reference is not None:
+        sight, length_mm = frame_of_reference(surface, reference, frame), reference.length_mm
+        known, of_frame = rounded(sight.pixels), None if sight.frame == frame else sight.frame
+    found = measure_lesion(
+        surface.run.folder, corners, frame, reference=known, reference_frame=of_frame, reference_mm=length_mm
+    )
+    world, folder = np.array([surface.position(pick) for pick in picks]), folder_in_whole(surface.run)
+    return HandMeasure(
+        folder, frame, corners, known, length_mm, found.measures, world, "lesion", name, reference_frame=of_frame
+    )

@@ -6,12 +6,14 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from scopemap.apps.browser.hand_measures import HandMeasure, Reference, line_on_surface, measure_by_hand
+from scopemap.apps.browser.hand_measures import Reference, line_on_surface, measure_by_hand
 from scopemap.apps.browser.lesion_part import LesionPart
 from scopemap.apps.browser.marks import REFERENCE, draw_marks
 from scopemap.apps.browser.measured_list import MeasuredList, short
 from scopemap.apps.browser.result_view import LOOKING, ResultView
 from scopemap.apps.browser.shown_surface import SurfacePick
+from scopemap.apps.measure.hand_measure import HandMeasure
+from scopemap.report.measured_by_hand import sizes_by
 
 Mode = Literal["Look", "Distance", "Area", "Lesion"]
 _CHOOSE = "Choose what to measure."
@@ -40,10 +42,12 @@ class MeasurePart:
         self._refer = window.on(gui.add_button("Use as reference", visible=False), self._use_as_reference)
         forget = gui.add_button("Forget the reference", visible=False, color="gray")
         self._forget = window.on(forget, self._forget_reference)
-        self._lesion = LesionPart(view, lambda: self._reference, self._say_mode)
+        self._lesion = LesionPart(
+            view, lambda: self._reference, self._say_mode, lambda one, line: self._measured.add(one, line)
+        )
         self._measured = MeasuredList(view)
         view.follow(submap=self._follow_submap)
-        self._refer_to(None)
+        self._refer_to(self._measured.kept_reference())
 
     @property
     def _is_known(self) -> bool:
@@ -91,34 +95,32 @@ class MeasurePart:
             self._picks = []
             self._view.note(", ".join(f"{found.what}: {short(found)}" for found in one.found))
             self._show()
-            self._measured.add(one, reference, line)
+            self._measured.add(one, line)
 
         self._view.window.job("measuring", work, then)
 
     def _use_as_reference(self) -> None:
         first, second = self._picks
+        reference = Reference((first, second), float(self._length.value) or None)
+        self._measured.keep_reference(reference)
         self._picks = []
-        self._refer_to(Reference((first, second), float(self._length.value) or None))
+        self._refer_to(reference)
         self._view.note("The reference is set. Now measure with two clicks.")
 
     def _forget_reference(self) -> None:
+        self._measured.keep_reference(None)
         self._refer_to(None)
 
     def _refer_to(self, reference: Reference | None) -> None:
         """Use a reference, or none, and say what sizes are by it."""
         self._reference = reference
-        if reference is None:
-            self._view.say_sizes()
-        elif reference.length_mm is None:
-            self._view.say_sizes("Sizes are in multiples of your reference.")
-        else:
-            self._view.say_sizes(f"Sizes are in mm by your reference ({reference.length_mm:g} mm).")
+        self._view.say_sizes("" if reference is None else sizes_by(reference.length_mm))
         self._measured.show(reference)
         self._show()
 
     def _follow_submap(self) -> None:
         self._picks = []
-        self._refer_to(None)
+        self._refer_to(self._measured.kept_reference())
         self._lesion.begin(shown=self.mode == "Lesion")
 
     def _show(self) -> None:

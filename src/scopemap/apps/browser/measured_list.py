@@ -7,20 +7,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scopemap.apps.browser.hand_measures import (
-    HandMeasure,
     Reference,
-    add_measurements,
     broken,
-    folder_in_whole,
-    kept_measures,
+    is_by,
+    kept_reference,
     line_on_surface,
-    remove_measurement,
+    reference_as_kept,
 )
 from scopemap.apps.browser.marks import INK, PALE, draw_marks
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import escaped, fenced
+from scopemap.apps.measure.hand_measure import (
+    HandMeasure,
+    add_measurement,
+    folder_in_whole,
+    kept_measures,
+    remove_measurement,
+    remove_reference,
+)
 from scopemap.apps.measure.measure import Measure
-from scopemap.report.page_data import MEASUREMENTS
+from scopemap.report.measured_by_hand import MEASUREMENTS
 
 _KEPT = "/page/measured"
 _SHORT = {"mm": "mm", "mm2": "mm²", "times the reference": "x", "times the reference's square": "x²"}
@@ -28,10 +34,9 @@ _SHORT = {"mm": "mm", "mm2": "mm²", "times the reference": "x", "times the refe
 
 @dataclass(frozen=True)
 class _Listed:
-    """One measurement, by which reference of this window it was made (None: none, or an earlier window's), its line."""
+    """One measurement, and its line on the surface; None: not found yet."""
 
     one: HandMeasure
-    reference: Reference | None
     line: np.ndarray | None = None
 
 
@@ -41,7 +46,7 @@ class MeasuredList:
     def __init__(self, view: ResultView) -> None:
         self._view, gui = view, view.window.gui
         self._reference: Reference | None = None
-        self._all = [_Listed(one, None) for one in kept_measures(view.whole.folder)]
+        self._all = [_Listed(one) for one in kept_measures(view.whole.folder) if one.kind != "reference"]
         # Rebuilt within a place that stays.
         self._outer = gui.add_folder(None)
         with self._outer:
@@ -49,11 +54,23 @@ class MeasuredList:
         self._remove = view.window.on(gui.add_button("Remove the last", color="gray"), self._remove_last)
         view.follow(submap=self._draw)
 
-    def add(self, one: HandMeasure, reference: Reference | None, line: np.ndarray) -> None:
-        """Show and keep a measurement by a reference, with its line (M, 3) on the surface."""
-        self._all.append(_Listed(one, reference, line))
+    def add(self, one: HandMeasure, line: np.ndarray) -> None:
+        """Show and keep a measurement, with its line (M, 3) on the surface."""
+        self._all.append(_Listed(one, line))
         self.show(self._reference)
-        add_measurements(self._view.whole.folder, [one])
+        add_measurement(self._view.whole.folder, one)
+
+    def kept_reference(self) -> Reference | None:
+        """Return the reference that is kept for the surface that is shown."""
+        return kept_reference(self._view.surface, kept_measures(self._view.whole.folder))
+
+    def keep_reference(self, reference: Reference | None) -> None:
+        """Keep the reference of the surface that is shown; None: none. Raises as `reference_as_kept`."""
+        view = self._view
+        if reference is None:
+            remove_reference(view.whole.folder, folder_in_whole(view.run))
+        else:
+            add_measurement(view.whole.folder, reference_as_kept(view.surface, reference))
 
     def show(self, reference: Reference | None) -> None:
         """List and draw all; those by another reference than this one are pale."""
@@ -67,17 +84,17 @@ class MeasuredList:
             if self._all:
                 gui.add_markdown(f"Measured, and kept in {escaped(MEASUREMENTS)} for the report:")
             for number, listed in enumerate(self._all, 1):
-                gui.add_markdown(f"**{number}.** {escaped(in_words(listed.one))}{self._note(listed)}")
+                gui.add_markdown(f"**{number}.** {escaped(str(listed.one))}{self._note(listed)}")
                 with gui.add_folder(f"Command of {number}", expand_by_default=False):
                     gui.add_markdown(fenced(broken(listed.one.command(self._view.folder_words))))
         self._draw()
 
     def _is_earlier(self, listed: _Listed) -> bool:
-        return listed.one.reference is not None and (
-            listed.reference is None or listed.reference is not self._reference
-        )
+        return not is_by(self._view.surface, listed.one, self._reference)
 
     def _note(self, listed: _Listed) -> str:
+        if listed.one.folder != folder_in_whole(self._view.run):
+            return " *on another submap*"
         return " *by an earlier reference*" if self._is_earlier(listed) else ""
 
     def _draw(self) -> None:
@@ -93,19 +110,14 @@ class MeasuredList:
                 listed = self._all[place] = replace(listed, line=line_on_surface(view.surface, one.frame, one.world))
             colour = PALE if self._is_earlier(listed) else INK
             name, size_mm = f"{_KEPT}/{place}", view.surface.size_mm
-            draw_marks(view.window.scene, name, one.world, size_mm, short(one.found[0]), colour, listed.line)
+            words = ": ".join(filter(None, (one.name, short(one.found[0]))))
+            draw_marks(view.window.scene, name, one.world, size_mm, words, colour, listed.line)
 
     def _remove_last(self) -> None:
         gone = self._all.pop()
         self.show(self._reference)
         remove_measurement(self._view.whole.folder, gone.one)
         self._view.note(f"Removed: {short(gone.one.found[0])}.")
-
-
-def in_words(one: HandMeasure) -> str:
-    """Return what was measured in one line."""
-    found = "; ".join(str(measure).replace(" (", ", 95 % interval ").rstrip(")") for measure in one.found)
-    return f"{found} (frame {one.frame})"
 
 
 def short(measure: Measure) -> str:

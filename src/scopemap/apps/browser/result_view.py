@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
@@ -15,6 +14,7 @@ from scopemap.apps.browser.scene import look_at, look_from
 from scopemap.apps.browser.shown_surface import ShownSurface
 from scopemap.apps.browser.window import escaped
 from scopemap.engine.errors import InputError
+from scopemap.report.measured_by_hand import advice_with_sizes
 from scopemap.report.page import PAGE, write_report
 from scopemap.report.summary_picture import NOT_A_DEVICE, TONES
 from scopemap.result.frame_table import NOT_USED
@@ -178,7 +178,7 @@ class ResultView:
     def say_sizes(self, words: str = "") -> None:
         """Show the verdict, with a sentence in place of what it says of sizes; "": as it is."""
         found = verdict(self.whole)
-        advice = re.sub(r"Sizes .*$", words, found.advice) if words else found.advice
+        advice = advice_with_sizes(found.advice, words) if words else found.advice
         self._head.content = f"### {found.word.capitalize()}\n{escaped(advice)}"
 
     def add_headline(self) -> None:

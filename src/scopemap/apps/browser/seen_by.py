@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
+from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.result.result import Result
 
@@ -27,10 +28,10 @@ class Sight:
     px_per_mm: float
 
 
-def frames_that_saw(surface: ShownSurface, picks: Sequence[SurfacePick]) -> list[Sight]:
+def frames_that_saw(surface: ShownSurface, picks: Sequence[SurfacePick], always: int | None = None) -> list[Sight]:
     """Return the frames of a surface's submap that saw all of some places, the one that saw them best first.
 
-    Of many frames 150 are tried, evenly spread over those whose picture holds the places.
+    Of many frames 150 are tried, evenly spread over those whose picture holds the places, and the frame `always`.
     """
     run, found = surface.run, []
     tracked, camera = run.tracked, run.camera
@@ -48,9 +49,18 @@ def frames_that_saw(surface: ShownSurface, picks: Sequence[SurfacePick]) -> list
             facing = np.abs((normals * rays).sum(1)) / far_mm
             clear = float((np.maximum(facing, _LEAST_COSINE) * camera.fx / far_mm).min())
             found.append((Sight(index, pixels, clear), points[:, 2]))
-    tried = found[:: -(-len(found) // _MOST_TRIED) or 1]
+    every = -(-len(found) // _MOST_TRIED) or 1
+    tried = [one for number, one in enumerate(found) if number % every == 0 or one[0].frame == always]
     seen = [sight for sight, depth_mm in tried if _is_seen(surface, sight, depth_mm, places)]
     return sorted(seen, key=lambda sight: -sight.px_per_mm)
+
+
+def corners_in(surface: ShownSurface, frame: int, picks: Sequence[SurfacePick]) -> np.ndarray:
+    """Return the pixels (N, 2) of places in a frame, NaN behind it. Raises `InputError` where it has no pose."""
+    if frame not in surface.run.tracked["index"]:
+        raise InputError(f"frame {frame} has no pose in this submap: choose a tracked frame")
+    places = np.array([surface.position(pick) for pick in picks])
+    return surface.run.camera.project(transform(inverse(pose_of(surface.run, frame)), places))
 
 
 def _is_seen(surface: ShownSurface, sight: Sight, far_mm: np.ndarray, places: np.ndarray) -> bool:

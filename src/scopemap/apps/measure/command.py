@@ -49,16 +49,25 @@ def measure(
     ] = None,
     export: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write the lesion for 3D Slicer (.mrk.json) or as a DICOM report (.dcm)."),
+        typer.Option(
+            metavar="FILE",
+            help="Write the lesion, or all that is kept, for 3D Slicer (.mrk.json) or as a DICOM report (.dcm).",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure distances, areas or a lesion, with 95 % intervals.
 
-    If the scale of the run is unknown, give a reference: two pixels or a mask, and its length.
+    If the scale of the run is unknown, give a reference: two pixels or a mask, and its length. Without --points and
+    --lesion the command shows what was measured by hand, in the window or the report.
     """
-    if bool(points) == bool(lesion):
+    if points and lesion:
         raise typer.BadParameter("give either --points or --lesion")
+    if not (points or lesion):
+        if reference or any(one is not None for one in (frame, second, reference_mask, reference_frame, reference_mm)):
+            raise typer.BadParameter("--frame, --second and references need --points or --lesion")
+        _show_kept(run, pictures, export, as_json)
+        return
     if reference and reference_mask is not None:
         raise typer.BadParameter("give either --reference or --reference-mask")
     if frame is not None and second is not None:
@@ -108,6 +117,31 @@ def measure(
     _show(measured.measures, {"measures": facts, "scale": measured.scale, "frames": list(measured.masks)}, as_json)
     if not as_json:
         typer.echo(f"from {len(measured.masks)} frames; the scale rests on {measured.scale}")
+
+
+def _show_kept(run: Path, pictures: Path | None, export: Path | None, as_json: bool) -> None:
+    """Show what was measured by hand on a run or a submap, and export it."""
+    from scopemap.apps.measure.findings import FINDING_ENDINGS, write_findings
+    from scopemap.apps.measure.hand_measure import findings_of, folder_in_whole, kept_measures
+    from scopemap.report.measured_by_hand import MEASUREMENTS
+    from scopemap.result.result import Result
+
+    if pictures is not None:
+        raise typer.BadParameter("--pictures needs --lesion")
+    result = Result(run).checked()
+    here, whole = folder_in_whole(result), run.parent.parent if result.is_submap else run
+    kept = [one for one in kept_measures(whole) if one.folder == here]
+    if not kept:
+        raise typer.BadParameter(f"give --points or --lesion: nothing was measured by hand in {whole / MEASUREMENTS}")
+    if export is not None:
+        check_output(export, FINDING_ENDINGS, overwrite=True)
+        by_reference = "references set by hand" if any(one.reference is not None for one in kept) else result.scale
+        write_findings(run, findings_of(kept), by_reference, export)
+    if as_json:
+        typer.echo(json.dumps([one.as_json for one in kept], indent=2))
+        return
+    for one in kept:
+        typer.echo("\n  ".join(filter(None, (str(one), one.command(str(whole))))))
 
 
 def _facts(one: Measure) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from scopemap.result.result import Result
 _UNITS = {"mm": ("mm", "UCUM", "mm"), "mm2": ("mm2", "UCUM", "mm2")}
 _NO_UNITS = ("1", "UCUM", "no units")
 _NAMES = {
+    "straight": ("121206", "DCM", "Distance"),
     "largest diameter": ("103339001", "SCT", "Long Axis"),
     "diameter across it": ("103340004", "SCT", "Short Axis"),
     "along the surface": ("410668003", "SCT", "Length"),
@@ -64,8 +65,10 @@ def write_dicom_report(run: Result, findings: list[SurfaceFinding], about_scale:
 
 
 def _shape(points_mm: np.ndarray) -> tuple[str, np.ndarray]:
-    """Return a point, or a closed line: a polygon of DICOM is flat."""
-    return ("POINT", points_mm) if len(points_mm) == 1 else ("POLYLINE", np.concatenate([points_mm, points_mm[:1]]))
+    """Return a point, a line between two, or a closed line around more: a polygon of DICOM is flat."""
+    if len(points_mm) < 3:
+        return ("POINT", "POLYLINE")[len(points_mm) - 1], points_mm
+    return "POLYLINE", np.concatenate([points_mm, points_mm[:1]])
 
 
 def _measurement(sr: Any, size: Measure) -> Any:

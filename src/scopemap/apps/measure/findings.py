@@ -31,11 +31,15 @@ def write_findings(run: Path, findings: list[SurfaceFinding], scale: str, file: 
 
 
 def _markups_of(findings: list[SurfaceFinding], about: str) -> list[dict[str, Any]]:
-    """Return a list of the places, and a closed curve of each outline; about : what sizes and points rest on."""
+    """Return a list of the places, and a curve of each outline, open between two points.
+
+    about : what sizes and points rest on.
+    """
     places = {str(one): one.points_mm[0] for one in findings if len(one.points_mm) == 1}
     found = [markup("Fiducial", "findings", places, about)] if places else []
     for one in findings:
         if len(one.points_mm) > 1:
             points = {f"{one.name} {number}": at for number, at in enumerate(one.points_mm, start=1)}
-            found.append(markup("ClosedCurve", one.name, points, f"{one}; {about}"))
+            kind = "ClosedCurve" if len(one.points_mm) > 2 else "Curve"
+            found.append(markup(kind, one.name, points, f"{one}; {about}"))
     return found

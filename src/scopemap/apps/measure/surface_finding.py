@@ -11,9 +11,9 @@ from scopemap.apps.measure.measure import Measure
 
 @dataclass(frozen=True)
 class SurfaceFinding:
-    """Something on the surface of a run: its outline, or its place.
+    """Something on the surface of a run: its outline, its two ends, or its place.
 
-    points_mm : (N, 3) around it, or (1, 3), world. sizes : NaN for the ends of an interval that is not known.
+    points_mm : (N, 3) around it, (2, 3), or (1, 3), world. sizes : NaN for the ends of an interval that is not known.
     """
 
     name: str

@@ -16,7 +16,9 @@ _WRITTEN_LATER = {
     *(f"coverage/{name}" for name in ("coverage.json", "map.csv", "map.png", "coverage.ply")),
     *("against_video/frames.csv", "against_video/worst.png", "measurements.json"),
 }
-"""Files that `coverage`, `evaluate --against-video` and the report's measures add to a result or a submap."""
+"""Files that `coverage`, `evaluate --against-video` and what is measured by hand add to a result or a submap."""
+_EXPORTS = "exports/"
+"""Folder of a result or a submap with what the window wrote."""
 _SUBMAP = re.compile(r"^maps/\d+/")
 
 
@@ -59,11 +61,15 @@ def verify_result(folder: Path) -> Verified:
             if digest_of(folder / name) != digest:
                 damaged.append(name)
     others = [name for name in files_in(folder) if name not in sums and name != SUMS]
-    later = [name for name in others if _SUBMAP.sub("", name) in _WRITTEN_LATER]
+    later = [name for name in others if _is_written_later(_SUBMAP.sub("", name))]
     added = [name for name in others if name not in later]
     whole = len(sums) - len(damaged) - len(missing)
     notes = [] if "provenance.json" in damaged else _notes(folder)
     return Verified(whole, damaged, missing, added, size, notes, later)
+
+
+def _is_written_later(name: str) -> bool:
+    return name in _WRITTEN_LATER or name.startswith(_EXPORTS)
 
 
 def _notes(folder: Path) -> list[str]:

@@ -5,7 +5,9 @@ const rounded3 = (value) => (value === null ? "none: the surface has a gap" : St
 const rounded = (pixel) => pixel.map((value) => Math.round(100 * value) / 100);
 const inWords = (pixels) => pixels.map((pixel) => pixel.join(",")).join(" ");
 const tell = (text) => put("hand-note", text);
-const wordsOf = (one) => `Frame ${one.frame}: ${one.found.map((f) => `${f.what}: ${rounded3(f.value)}${f.value === null ? "" : ` ${f.unit} (${rounded3(f.low)} to ${rounded3(f.high)})`}`).join("; ")}`;
+const lengthOf = (one) => (one.reference_mm === null ? "of unknown length" : `${one.reference_mm} mm long`);
+const foundIn = (one) => one.found.map((f) => `${f.what}: ${rounded3(f.value)}${f.value === null ? "" : ` ${f.unit} (${rounded3(f.low)} to ${rounded3(f.high)})`}`).join("; ");
+const wordsOf = (one) => (one.kind === "reference" ? `Reference, ${lengthOf(one)}, in frame ${one.frame}` : `${one.name ? `${one.name}, frame` : "Frame"} ${one.frame}: ${foundIn(one)}`);
 
 // A picture's frame for `measured`, with its depth and its standard deviation at a pixel, NaN where unknown.
 async function measuredFrame(picture) {
@@ -164,8 +166,17 @@ function saveMeasures() {
   tell("Put measurements.json beside report.html: then `scopemap report` and `view` show it again.");
 }
 
+// The reference that is kept for the result, where its frame has a picture.
+function keptReference() {
+  const kept = (run.measurements || []).find((one) => one.kind === "reference" && one.folder === ".");
+  const picture = kept && run.pictures.find((one) => run.indices[one.row] === kept.frame);
+  if (!picture) return null;
+  element("reference-mm").value = kept.reference_mm ?? "";
+  return { picture, pixels: kept.points, at: kept.world };
+}
+
 function openMeasures() {
-  Object.assign(hand, { mode: "", picks: [], reference: null, list: run.measurements || [] });
+  Object.assign(hand, { mode: "", picks: [], reference: keptReference(), list: run.measurements || [] });
   element("by-hand").hidden = !run.measuring || !run.pictures.length;
   writeMeasures();
 }
