@@ -100,6 +100,25 @@ def test_a_hole_in_a_tube_is_found_where_it_is(whole: Path, holed: Path) -> None
     assert around[0].share == max(part.share for part in found.segments[1:])
 
 
+def test_a_lid_over_an_open_end_is_no_wall(whole: Path, tmp_path: Path) -> None:
+    bottom = 84.9  # the tube has one at its far end, which was seen
+    opened = coverage(
+        write_run(tmp_path / "run", without(tube(), lambda points: points[:, 2] > bottom), ALONG_THE_TUBE)
+    )
+    full = coverage(whole)
+
+    def inside(found: Coverage) -> np.ndarray:
+        middles = found.surface.triangles_center
+        return middles[np.hypot(middles[:, 0], middles[:, 1]) < 8.5]
+
+    # What is left within the wall, whose radius is 10, is the bottom: over open ends there is nothing.
+    assert not len(inside(opened))
+    assert inside(full)[:, 2].min() > bottom - 2
+    # The other end is below the picture's edge; nothing else of the open tube was missed.
+    assert all(spot.position_mm[2] < 10 for spot in opened.spots)
+    assert opened.total.share == pytest.approx(full.total.share, abs=0.01)
+
+
 def test_the_map_has_the_hole_and_its_table(holed: Path, tmp_path: Path) -> None:
     found = coverage(holed)
     chart = found.map

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from scopemap.apps.browser.legends import ramp_html, words_html
-from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.result_view import MODEL, ResultView
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
 from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, light_of, stops_of
 from scopemap.apps.browser.unlit_mesh import unlit_glb, unlit_textured_glb
@@ -23,17 +23,17 @@ from scopemap.result.wording import LEVEL_WORDS
 if TYPE_CHECKING:
     from scopemap.apps.coverage.coverage import Coverage
 
-_SURFACE = "/page/surface"
-_PATH = "/page/path"
-_KEYFRAMES = "/page/keyframes"
+_SURFACE = f"{MODEL}/surface"
+_PATH = f"{MODEL}/path"
+_KEYFRAMES = f"{MODEL}/keyframes"
 _MOST_FRUSTA = 60
 _FRUSTUM_SHARE = 0.03
 _COVERAGE = "coverage"
 _MOST_FACES = 200_000
 _MOST_SUBMAPS = 100
-_LIDS = (
-    "The surface is closed where it has gaps: flat lids close its open ends. Where you see the grey background, "
-    "nothing was examined."
+_CLOSED = (
+    "Gaps of the surface are closed, but not the open ends of a lumen. Where you see the grey background, nothing was "
+    "examined."
 )
 
 
@@ -95,7 +95,7 @@ class SurfacePart:
         seen, _, hidden = COLOURS
         colours = {name: COLOURS[name] for name in (seen, hidden)}
         self._legend.content, self._legend.visible = words_html(colours), True
-        self._words.content = _LIDS
+        self._words.content = _CLOSED
         self._shown = np.asarray(painted.vertices), np.asarray(painted.faces), vertex_colours(painted)[:, :3]
         self._draw()
 

@@ -21,6 +21,7 @@ _RING_DEG = 4.0
 _RINGS = 45
 _HALF = 0.5
 _END_RADII = 0.25
+_ACROSS = 0.5  # by hand: cosine of the normal to the centreline from which a face at its end is no wall
 _FARTHEST_SEEN = 0.95  # share of what was seen in a clock direction of a cavity, up to whose angle it was examined
 
 
@@ -120,6 +121,10 @@ def examined_space(run: Result) -> ExaminedSpace:
     surface = trimesh.Trimesh(*space.surface(), process=False)
     layout = layout_of(space, np.asarray(run.mesh.vertices), run.frames.only(run.frames.tracked)["T_world_camera"])
     present = cKDTree(run.mesh.vertices).query(surface.triangles_center)[0] <= SEEN_CELLS * space.cell_mm
+    if isinstance(layout, Lumen):
+        wall = ~lids(surface, present, layout.line)
+        surface.update_faces(wall)
+        present = present[wall]
     row, hours, wall = layout.place(surface.triangles_center, surface.face_normals)
     area = surface.area_faces * (wall | present)
     inside = layout.examined(*(binned(row, hours, weights, layout.rows) for weights in (area, area * present)))
@@ -128,6 +133,24 @@ def examined_space(run: Result) -> ExaminedSpace:
     rows = np.flatnonzero(inside.any(1))
     first = int(rows[0]) if layout.kind == "lumen" else 0
     return ExaminedSpace(surface, present, area, layout, row - first, hours, inside[first : rows[-1] + 1], first)
+
+
+def lids(surface: trimesh.Trimesh, present: np.ndarray, line: Centreline) -> np.ndarray:
+    """Return which faces (F,) of a closed lumen are lids over its open ends: they are no wall.
+
+    They are connected with the place where the centreline ends, by faces that were not seen, and lie across it.
+    present : (F,) bool, whether the run's own surface is there.
+    """
+    row, _ = line.place(surface.triangles_center)
+    tangents = np.gradient(line.points_mm, axis=0)
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    across = np.abs((surface.face_normals * tangents[row]).sum(1)) > _ACROSS
+    closing = ~present & across
+    pairs = surface.face_adjacency[closing[surface.face_adjacency].all(axis=1)]
+    found = np.zeros(len(present), bool)
+    for part in trimesh.graph.connected_components(pairs, nodes=np.flatnonzero(closing), min_len=1):
+        found[part] = bool(np.isin(row[part], (0, len(line.points_mm) - 1)).any())
+    return found
 
 
 def layout_of(space: ClosedSpace, points_mm: np.ndarray, poses: np.ndarray) -> Layout:
