@@ -44,8 +44,9 @@ class ShownWindow:
                 yield child
                 yield from inside(child)
 
-        root = self.window.gui._container_handle_from_uuid["root"]
-        return [one for one in inside(root) if type(one).__name__ == f"Gui{kind}Handle"]
+        gui = self.window.gui
+        roots = gui._container_handle_from_uuid["root"], *gui._panel_handle_from_uuid.values()
+        return [one for root in roots for one in inside(root) if type(one).__name__ == f"Gui{kind}Handle"]
 
     def labels(self, kind: str = "Button") -> list[str]:
         """The labels of what is seen of a kind."""

@@ -65,6 +65,12 @@ class Looked:
     def tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()
 
+    def click(self, right: float, down: float) -> None:
+        """Click on the scene, so far from its middle, in its heights."""
+        box = self.page.locator("canvas").first.bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        self.page.mouse.click(x + right * box["height"], y + down * box["height"])
+
     @property
     def words(self) -> str:
         return str(self.page.inner_text("body"))
@@ -93,12 +99,18 @@ def test_a_distance_between_two_clicks_is_the_commands(
     shown: tuple[Looked, ResultPage, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     looked, _, folder = shown
+    # The time line is below the scene, beside the panel.
+    line, panel = (looked.page.locator(f'[data-dock-region="{edge}"]').bounding_box() for edge in ("left", "right"))
+    assert line["x"] == 0
+    assert line["x"] + line["width"] == panel["x"]
+    assert line["y"] > 400
+    assert panel["height"] == 800
     looked.tab("Measure")
     looked.page.get_by_role("button", name="Distance").click()
     looked.until(lambda: "Distance: click on the 1st of 2 points" in looked.words, "what to do")
-    looked.page.mouse.click(420, 440)
+    looked.click(-0.025, 0.05)
     looked.until(lambda: "click on the 2nd of 2 points" in looked.words, "the first point")
-    looked.page.mouse.click(470, 500)
+    looked.click(0.0375, 0.125)
     looked.until(lambda: "Command of 1" in looked.words, "the distance")
     looked.page.get_by_text("Command of 1").click()
     looked.until(lambda: "--points" in looked.words, "the command")
@@ -115,7 +127,7 @@ def test_a_distance_between_two_clicks_is_the_commands(
     assert {urlsplit(url).hostname for url in looked.requests if url.startswith("http")} <= {"localhost", "127.0.0.1"}
 
 
-@pytest.mark.parametrize("shown", [(800, 700)], indirect=True)
+@pytest.mark.parametrize("shown", [(800, 1100)], indirect=True)
 def test_colours_are_those_of_the_surface_and_keys_move_the_time_line(shown: tuple[Looked, ResultPage, Path]) -> None:
     looked, _, _ = shown
     looked.tab("Surface")
@@ -123,7 +135,7 @@ def test_colours_are_those_of_the_surface_and_keys_move_the_time_line(shown: tup
     looked.page.get_by_role("combobox", name="Colour by").click()
     looked.page.get_by_role("option", name="picture", exact=True).click()
     near = lambda: (np.abs(looked.picture() - BRIGHT).max(-1) <= 2).sum()  # noqa: E731
-    looked.until(lambda: near() > 2000, "the tissue's own colour")
+    looked.until(lambda: near() > 500, "the tissue's own colour")
     looked.tab("Frames")
     slider = looked.page.get_by_role("slider").first
     slider.focus()
@@ -132,6 +144,12 @@ def test_colours_are_those_of_the_surface_and_keys_move_the_time_line(shown: tup
     slider.blur()
     looked.page.keyboard.press("n")
     looked.until(lambda: "Frame 2, 0.08 s: tracked" in looked.words, "the next frame by N")
+    # The panel and the time line are below the scene, which has all of the width.
+    box = lambda place: looked.page.locator(place).first.bounding_box()  # noqa: E731
+    scene, line, panel = (box(place) for place in ("canvas", '[data-dock-region="left"]', '[data-dock-region="right"]'))
+    assert (scene["width"], line["width"], panel["width"]) == (800, 800, 800)
+    assert scene["height"] > 200
+    assert scene["y"] + scene["height"] <= line["y"] + 1 <= line["y"] + line["height"] <= panel["y"] + 1
     # Nothing is wider than the page.
     assert looked.page.evaluate("document.documentElement.scrollWidth") <= 800
     assert looked.errors == []

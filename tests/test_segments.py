@@ -169,7 +169,8 @@ def _facts() -> list[dict[str, object]]:
     ]
 
 
-def _result() -> Result:
+def segmented_result() -> Result:
+    """A result with three segments, the first not usable."""
     segment = np.repeat([0, 1, 2], [20, 40, 20])
     rows = [
         {
@@ -210,7 +211,7 @@ def test_a_few_frames_confirm_no_shape() -> None:
 
 
 def test_the_verdict_says_what_is_usable_and_when() -> None:
-    found = verdict(_result())
+    found = verdict(segmented_result())
     assert found.advice.startswith("Usable: 2.0 to 7.9 s, 75 % of the video.")
     assert found.sentence.startswith("Usable: 2.0 to 7.9 s, 75 % of the video. 80 of 80 frames are in the result. ")
     (counted,) = (reason for reason in found.reasons if reason.code == "frames-in-result")
@@ -219,7 +220,7 @@ def test_the_verdict_says_what_is_usable_and_when() -> None:
 
 
 def test_a_result_keeps_the_surface_of_every_segment(tmp_path: Path) -> None:
-    _result().save(tmp_path)
+    segmented_result().save(tmp_path)
     again = Result(tmp_path)
     assert again.segments == graded(_facts())
     assert again.frames["segment"].tolist() == np.repeat([0, 1, 2], [20, 40, 20]).tolist()
@@ -229,7 +230,7 @@ def test_a_result_keeps_the_surface_of_every_segment(tmp_path: Path) -> None:
 
 
 def test_the_surfaces_are_shown_one_after_the_other(tmp_path: Path) -> None:
-    _result().save(tmp_path)
+    segmented_result().save(tmp_path)
     glb = (tmp_path / "mesh_over_time.glb").read_bytes()
     (length,) = struct.unpack_from("<I", glb, 12)
     tree, binary = json.loads(glb[20 : 20 + length]), glb[28 + length :]
@@ -248,7 +249,7 @@ def test_the_surfaces_are_shown_one_after_the_other(tmp_path: Path) -> None:
 
 
 def test_the_surface_that_fits_each_frame_is_exported(tmp_path: Path) -> None:
-    (result := _result()).save(run := tmp_path / "run")
+    (result := segmented_result()).save(run := tmp_path / "run")
     export_run(run, "surfaces", tmp_path / "out", unit="m", axes="ras")
     assert len(list((tmp_path / "out").iterdir())) == 80
     for index, z_mm in ((5, 10.0), (40, 20.0), (70, 30.0)):

@@ -22,6 +22,7 @@ from scopemap.input.trajectory.trajectory import SKIPPED
 from scopemap.report.frame_pictures import WHOLLY_USABLE, FramePictures
 from scopemap.result.result import Result
 from scopemap.result.run_input import find_input
+from scopemap.runner.texturing import read_again
 
 _SAME_CAMERA_PX = 0.01
 _MOST_ENLARGED = 1.25
@@ -96,6 +97,21 @@ def reread_frames(run: Path, indices: set[int], given: Path | None = None) -> It
             yield mask(frame)
         if not left:
             return
+
+
+def sharp_picture(run: Path, index: int) -> np.ndarray | None:
+    """Return the picture (H, W, 3) uint8 of a frame, rectified as the run's, at the resolution of the run's input.
+
+    None where the input has no such frame any more. Raises as `open_input`.
+    """
+    sequence, _ = open_input(run)
+    source, working = sequence.rectifier.source, sequence.camera
+    enlarged = max(1.0, max(source.width, source.height) / max(working.width, working.height))
+    size = round(enlarged * working.width), round(enlarged * working.height)
+    for frame in read_again(sequence.source, sequence.selection, [index]):
+        if frame.index == index:
+            return np.asarray(sequence.rectifier.enlarged(*size).image(frame.rgb))
+    return None
 
 
 def tracked_frames(run: Result) -> Iterator[Frame]:

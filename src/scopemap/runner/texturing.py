@@ -111,11 +111,12 @@ class _Pictures:
 
 
 def read_again(source: Source, selection: slice, numbers: Sequence[int]) -> Iterator[SourceFrame]:
-    """Yield pictures of a source as it is: those with some ascending numbers, and perhaps others between them."""
+    """Yield pictures of a source as it is: those with some ascending numbers, if there, and others between."""
     if source.numbers is None:
         first = numbers[0] if source.name == "video" and (selection.start or 0) >= 0 else selection.start
         yield from source.frames(slice(first, selection.stop))
         return
     place = {number: place for place, number in enumerate(source.numbers)}
     for number in numbers:
-        yield from source.frames(slice(place[number], place[number] + 1))
+        if number in place:
+            yield from source.frames(slice(place[number], place[number] + 1))

@@ -10,17 +10,21 @@ import numpy as np
 from scopemap.apps.browser.marks import CLICKED
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.surface_colours import is_albedo, looking_frames
+from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.agreement import lit_like
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.input.decoding import read_decoded
 from scopemap.report.depth_figures import colour_depth
+from scopemap.runner.reread_frames import sharp_picture
 
-_WIDTH = 960
-_LETTERS = 0.85
-_CAPTION_PX = 32
-_MARK_PX = 14
+_WIDTH, _HEIGHT = 1440, 240
+_LETTERS = 0.6
+_CAPTION_PX = 24
+_MARK_PX = 12
 _EMPTY = (58, 66, 76)
 _PERCENTILES = (2, 98)
+_MOST_SHARP = 12
+"""Pictures at the video's resolution that are kept: 6 MB each of a large video."""
 
 
 class FrameImages:
@@ -50,12 +54,24 @@ class FrameImages:
         found = read_decoded(whole.picture_file(nearest))
         return None if found is None else (nearest, np.ascontiguousarray(found[..., :3][..., ::-1]))
 
-    def keep(self, index: int, rgb: np.ndarray) -> None:
-        """Keep the picture of a frame that was read again from the input."""
-        self._reread[index] = rgb
+    def sharp(self, index: int) -> np.ndarray | None:
+        """Return the picture (h, w, 3) uint8 of a frame at the video's resolution, which takes time and is kept.
+
+        Where the input is gone, that which the run kept of this frame; None for none.
+        """
+        if index not in self._reread:
+            try:
+                found = sharp_picture(self._view.whole.folder, index)
+            except InputError:
+                found = None
+            if found is None:
+                kept = self.picture(index)
+                return kept[1] if kept is not None and kept[0] == index else None
+            self._reread = dict([*self._reread.items(), (index, found)][-_MOST_SHARP:])
+        return self._reread[index]
 
     def all_of(self, index: int, mark: np.ndarray | None = None) -> np.ndarray:
-        """Return one image of a frame, (h, 960, 3) uint8: its picture, beside it its depth and the surface from there.
+        """Return one image of a frame, (h, 1440, 3) uint8: its picture, its depth and the surface from there.
 
         Each says what it is. mark : pixel (2,) that is marked in all of them.
         """
@@ -68,22 +84,19 @@ class FrameImages:
         if depth_mm is not None:
             near, far = self.depth_range_mm
             unit = " mm" if view.whole.scale_known else ""
-            parts.append((f"depth {near:.2g}-{far:.2g}{unit}", colour_depth(depth_mm, near, far), True))
+            parts.append((f"depth {near:.2g}-{far:.2g}{unit}, near red", colour_depth(depth_mm, near, far), True))
         if view.pose is not None and not view.surface.is_empty:
             parts.append(("surface", self._rendered(view.pose, picture, depth_mm), True))
         if not parts:
             return np.full((8, _WIDTH, 3), _EMPTY, np.uint8)
-        # One large at the left, two of half its size at the right.
-        size = (_WIDTH * 2 // 3, round(_WIDTH * 2 / 3 * camera.height / camera.width))
-        half = (_WIDTH - size[0], size[1] // 2)
-        tiles = [
-            _tile(image, size if number == 0 else half, words, mark if is_own else None, camera.width)
-            for number, (words, image, is_own) in enumerate(parts)
-        ]
-        tiles += [np.full((half[1], half[0], 3), _EMPTY, np.uint8)] * (3 - len(tiles))
-        out = np.full((size[1], _WIDTH, 3), _EMPTY, np.uint8)
-        out[:, : size[0]] = tiles[0]
-        out[: half[1], size[0] :], out[half[1] : 2 * half[1], size[0] :] = tiles[1], tiles[2]
+        # Beside each other, so high that there is room for three.
+        height = min(_HEIGHT, round(_WIDTH / 3 * camera.height / camera.width))
+        size = round(height * camera.width / camera.height), height
+        tiles = [_tile(image, size, words, mark if is_own else None, camera.width) for words, image, is_own in parts]
+        out = np.full((_HEIGHT, _WIDTH, 3), _EMPTY, np.uint8)
+        left = (_WIDTH - len(tiles) * size[0]) // 2
+        for number, tile in enumerate(tiles):
+            out[: size[1], left + number * size[0] : left + (number + 1) * size[0]] = tile
         return out
 
     def _rendered(self, pose: np.ndarray, picture: np.ndarray | None, depth_mm: np.ndarray | None) -> np.ndarray:
@@ -101,7 +114,7 @@ def _tile(image: np.ndarray, size: tuple[int, int], words: str, mark: np.ndarray
     out = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
     low = size[1] - _CAPTION_PX
     out[low:] = out[low:] // 3
-    at = (8, size[1] - 9)
+    at = (8, size[1] - 7)
     cv2.putText(out, words, at, cv2.FONT_HERSHEY_SIMPLEX, _LETTERS, (255, 255, 255), 2, cv2.LINE_AA)
     if mark is not None:
         place = np.round((np.asarray(mark) + 0.5) * size[0] / width).astype(int).tolist()

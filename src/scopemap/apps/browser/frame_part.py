@@ -13,12 +13,12 @@ from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.scene import quaternion
 from scopemap.apps.browser.seen_by import frames_that_saw
 from scopemap.apps.browser.shown_surface import SurfacePick
+from scopemap.apps.browser.time_strip import TimeStrip
 from scopemap.apps.browser.window import escaped
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.result.frame_table import ELSEWHERE, LOST, ROTATED
 from scopemap.result.losses import ADVICE
 from scopemap.result.run_input import places_of_input
-from scopemap.runner.reread_frames import reread_frames
 
 _FRUSTUM = "/page/frame"
 _CLICK = "Click on the surface to see which frames saw that place."
@@ -34,17 +34,16 @@ _MOST_LISTED = 30
 class FramePart:
     """Controls of the time line; `list_that_saw` lists frames for a place on the surface."""
 
-    def __init__(self, view: ResultView) -> None:
+    def __init__(self, view: ResultView, images: FrameImages) -> None:
         self._view, window, gui = view, view.window, view.window.gui
-        self._images, self._player = FrameImages(view), threading.Event()
-        last = max(len(view.rows) - 1, 0)
-        self._slider = window.on(gui.add_slider("Frame", 0, last, 1, 0), self._slide)
-        self._slider.hint = "Arrow keys when it is chosen; N and P: next and previous frame"
+        self._images, self._player = images, threading.Event()
+        self._panel = gui.add_panel()
+        self._panel.dock_left()
+        with self._panel.add_tab("Time line"):
+            self._add_time_line()
         moves = gui.add_button_group("Go", ["Previous", "Next", "Play"])
         moves.on_click(lambda event: window.do(self._move, moves.value))
         window.on(gui.add_button("Look from here", color="gray"), view.look_from_frame)
-        self._words = gui.add_markdown("")
-        self._image = gui.add_image(np.zeros((8, 640, 3), np.uint8))
         self._add_list()
         self._with_camera = window.on(gui.add_checkbox("Fly along", initial_value=False), self._go_with)
         self._with_camera.hint = "Look from each frame that is chosen or played"
@@ -56,6 +55,18 @@ class FramePart:
             self._command("Previous frame", "P", "Previous"),
         ]
         view.follow(frame=self._follow, note=self._hide_list)
+
+    def _add_time_line(self) -> None:
+        """Make what is below the scene: the slider, what became of the frames, and the pictures of one."""
+        view, gui = self._view, self._view.window.gui
+        last = max(len(view.rows) - 1, 0)
+        self._slider = view.window.on(gui.add_slider("Frame", 0, last, 1, 0), self._slide)
+        self._slider.hint = "Arrow keys when it is chosen; N and P: next and previous frame"
+        self._strip = TimeStrip(view)
+        self._strip_image = gui.add_image(self._strip.picture(), format="png")
+        gui.add_html(self._strip.legend)
+        self._words = gui.add_markdown("")
+        self._image = gui.add_image(np.zeros((8, 640, 3), np.uint8))
 
     def _add_list(self) -> None:
         """Make the list of the frames that saw a place."""
@@ -100,8 +111,9 @@ class FramePart:
         draw_marks(view.window.scene, _CLICKED, place, view.surface.size_mm, colour=CLICKED)
 
     def close(self) -> None:
-        """End what plays, and the keys."""
+        """End what plays, the keys, and the time line, which is beside the page's panel."""
         self._player.set()
+        self._panel.remove()
         for command in self._commands:
             command.remove()
 
@@ -169,7 +181,7 @@ class FramePart:
         view = self._view
         if view.row in view.rows:
             self._slider.value = view.rows.index(view.row)
-        self._words.content = frame_words(view)
+        self._words.content, self._strip_image.image = frame_words(view), self._strip.picture()
         if self._with_camera.value and view.pose is not None:
             view.look_from_frame()
         self._draw()
@@ -205,19 +217,14 @@ class FramePart:
         )
 
     def _read_again(self) -> None:
-        index, folder = self._view.index, self._view.whole.folder
+        index = self._view.index
 
-        def read() -> np.ndarray | None:
-            return next((frame.rgb for frame in reread_frames(folder, {index})), None)
-
-        def keep(rgb: np.ndarray | None) -> None:
+        def show(rgb: np.ndarray | None) -> None:
             if rgb is None:
                 self._view.note(f"The video has no frame {index} any more.")
-                return
-            self._images.keep(index, rgb)
             self._show_images(index)
 
-        self._view.window.job("reading the video", read, keep)
+        self._view.window.job("reading the video", lambda: self._images.sharp(index), show)
 
 
 def frame_words(view: ResultView) -> str:

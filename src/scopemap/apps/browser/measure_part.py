@@ -6,12 +6,15 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from scopemap.apps.browser.frame_images import FrameImages
 from scopemap.apps.browser.hand_measures import Reference, line_on_surface, measure_by_hand
 from scopemap.apps.browser.lesion_part import LesionPart
 from scopemap.apps.browser.marks import REFERENCE, draw_marks
 from scopemap.apps.browser.measured_list import MeasuredList, short
+from scopemap.apps.browser.picture_part import PicturePart
 from scopemap.apps.browser.result_view import LOOKING, ResultView
 from scopemap.apps.browser.shown_surface import SurfacePick
+from scopemap.apps.browser.window import typed_number
 from scopemap.apps.measure.hand_measure import HandMeasure
 from scopemap.report.measured_by_hand import sizes_by
 
@@ -26,7 +29,7 @@ _REFERRED = "/page/reference"
 class MeasurePart:
     """Controls of measuring; `add` takes a place that was clicked. mode : what a click is for."""
 
-    def __init__(self, view: ResultView) -> None:
+    def __init__(self, view: ResultView, images: FrameImages) -> None:
         self._view, window, gui = view, view.window, view.window.gui
         self.mode: Mode = "Look"
         self._picks: list[SurfacePick] = []
@@ -34,11 +37,12 @@ class MeasurePart:
         self._hint = gui.add_markdown("")
         modes = gui.add_button_group("Measure", get_args(Mode)[1:])
         modes.on_click(lambda event: window.do(self._choose, modes.value))
+        self.picture = PicturePart(view, images)
         self._points = points = gui.add_button_group("Points", ["Undo", "Clear"], visible=False)
         points.on_click(lambda event: window.do(self._take_back, points.value))
         self._area = window.on(gui.add_button("Measure the area", visible=False), self._measure)
-        self._length = gui.add_number("Length of this line, mm (0: not known)", 0.0, min=0.0, step=0.1, visible=False)
-        self._length.hint = "0: other lengths are then multiples of it"
+        self._length = gui.add_text("Length of this line, mm", "", visible=False)
+        self._length.hint = "Empty where it is not known: other lengths are then multiples of it"
         self._refer = window.on(gui.add_button("Use as reference", visible=False), self._use_as_reference)
         forget = gui.add_button("Forget the reference", visible=False, color="gray")
         self._forget = window.on(forget, self._forget_reference)
@@ -85,9 +89,10 @@ class MeasurePart:
 
     def _measure(self) -> None:
         surface, picks, reference = self._view.surface, [*self._picks], self._reference
+        frame = self.picture.frame
 
         def work() -> tuple[HandMeasure, np.ndarray]:
-            found = measure_by_hand(surface, picks, reference)
+            found = measure_by_hand(surface, picks, reference, frame)
             return found, line_on_surface(surface, found.frame, found.world)
 
         def then(found: tuple[HandMeasure, np.ndarray]) -> None:
@@ -100,10 +105,14 @@ class MeasurePart:
         self._view.window.job("measuring", work, then)
 
     def _use_as_reference(self) -> None:
+        length_mm = typed_number(self._length.value)
+        if self._length.value.strip() and not length_mm > 0:
+            self._view.note("Type the length in mm, such as 2.5, or leave it empty.")
+            return
         first, second = self._picks
-        reference = Reference((first, second), float(self._length.value) or None)
+        reference = Reference((first, second), length_mm if length_mm > 0 else None)
         self._measured.keep_reference(reference)
-        self._picks = []
+        self._picks, self._length.value = [], ""
         self._refer_to(reference)
         self._view.note("The reference is set. Now measure with two clicks.")
 

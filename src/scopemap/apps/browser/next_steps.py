@@ -29,12 +29,12 @@ class NextRun:
     """Another run that a next step names.
 
     option : of `scopemap run`. choices : values of which one is chosen, (): a number is asked for.
-    number : what it is at first, its lowest and its highest value; None: no number.
+    number : its lowest and its highest value; None: no number.
     """
 
     option: str
     choices: tuple[str, ...] = ()
-    number: tuple[float, float, float] | None = None
+    number: tuple[float, float] | None = None
 
     @property
     def question(self) -> str:
@@ -68,7 +68,7 @@ def next_runs(step: str, run: Result) -> list[NextRun]:
             known = [kind for kind in value.split("|") if kind in _SCOPES]
             found.append(NextRun(option, tuple(known) or _SCOPES))
         elif option == "fov":
-            found.append(NextRun(option, number=(70.0, 5.0, 170.0)))
+            found.append(NextRun(option, number=(5.0, 170.0)))
     return found
 
 

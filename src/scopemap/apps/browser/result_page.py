@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scopemap.apps.browser.files_part import FilesPart
+from scopemap.apps.browser.frame_images import FrameImages
 from scopemap.apps.browser.frame_part import FramePart
 from scopemap.apps.browser.measure_part import MeasurePart
 from scopemap.apps.browser.next_steps import NextRun, arguments_again
@@ -47,7 +48,7 @@ class ResultPage:
         self._ways = gui.add_button_group("", self._ways_now())
         self._ways.on_click(lambda event: window.do(self._go, self._ways.value))
         view.follow(measuring=self._show_ways)
-        tabs = gui.add_tab_group()
+        images, tabs = FrameImages(view), gui.add_tab_group()
         with tabs.add_tab("Verdict"):
             VerdictPart(view, self._run_again)
             self._add_ways_on()
@@ -56,9 +57,9 @@ class ResultPage:
             gui.add_divider()
             UnseenPart(view)
         with tabs.add_tab("Frames"):
-            self._frames = FramePart(view)
+            self._frames = FramePart(view, images)
         with tabs.add_tab("Measure"):
-            self._measure = MeasurePart(view)
+            self._measure = MeasurePart(view, images)
         with tabs.add_tab("Files"):
             FilesPart(view)
         window.scene.on_click()(self._clicked)
@@ -80,7 +81,8 @@ class ResultPage:
 
     def click(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Take a click by its ray, (3,) each, in the world of the submap that is shown, mm."""
-        pick, frames = self._view.surface.pick(origin, direction), self._frames
+        ray, frames = self._measure.picture.ray(origin, direction), self._frames
+        pick = None if ray is None else self._view.surface.pick(*ray)
         assert frames is not None
         if pick is None:
             self._view.note("There is no surface there.")

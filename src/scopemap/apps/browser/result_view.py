@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 LOOKING = "A click shows which frames saw the place."
 """What a click is for where nothing is measured."""
 
+MODEL = "/page/model"
+"""Node of the scene that holds the surface and the camera's path."""
+
 _NOTHING = "\u00a0"
 """Keeps a line's place."""
 _WHOLE_FOV = 0.9
@@ -47,6 +50,7 @@ class ResultView:
         self.row = self.rows[0] if self.rows else 0
         self.number, self.surface = 0, ShownSurface(whole)
         self._surfaces: dict[tuple[int, int | None], ShownSurface] = {(0, None): self.surface}
+        self._model = window.scene.add_frame(MODEL, show_axes=False)
         self._click_words = LOOKING
         self._of_note: list[Callable[[], None]] = []
         self._of_frame: list[Callable[[], None]] = []
@@ -139,6 +143,10 @@ class ResultView:
         inside = np.flatnonzero(self.whole.frames.submap == number)
         self.show_row(int(inside[0]) if len(inside) else self.row)
         self.look_at_all()
+
+    def show_model(self, *, shown: bool) -> None:
+        """Show what is below `MODEL` in the scene, or hide it."""
+        self._model.visible = shown
 
     def look_at_all(self) -> None:
         """Look at the whole surface from behind its first camera."""

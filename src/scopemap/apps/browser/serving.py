@@ -24,6 +24,28 @@ _TITLE = "scopemap"
 RUN_GOES_ON = "scopemap-run-goes-on"
 """Name of an element of the page; while it is there the page draws rarely, unless someone moves it."""
 _RARELY = (Path(__file__).parent / "draw_rarely.js").read_text(encoding="utf-8").replace("ELEMENT", RUN_GOES_ON)
+# viser docks panels at the left and right of the scene. The time line, which is docked at the left, belongs below the
+# scene; in windows of up to 900 px so does the panel at the right, which would leave half of the width to the scene.
+# In windows of 576 px and less viser has a layout of its own.
+_STYLE = b"""<style>
+@media (min-width: 577px) {
+  [data-dock-root] { display: grid; grid-template: minmax(0, 1fr) auto / minmax(0, 1fr) auto; }
+  [data-dock-root] > :first-child { position: relative !important; inset: 0 !important; grid-area: 1 / 1; }
+  [data-dock-root] > [data-dock-region] { position: relative !important; inset: 0 !important; }
+  [data-dock-root] > :not(:first-child):has(+ [data-dock-region]) { display: none; } /* shadows */
+  [data-dock-region="left"] { grid-area: 2 / 1; width: auto !important; height: min(310px, 34vh); }
+  [data-dock-region="left"] > div > div { width: 100% !important; }
+  [data-dock-region="left"] :is([data-dock-region-handle], [data-dock-region-resize]) { display: none !important; }
+  [data-dock-region="right"] { grid-area: 1 / 2 / 3 / 3; }
+}
+@media (min-width: 577px) and (max-width: 900px) {
+  [data-dock-root] { grid-template: minmax(0, 1fr) auto 38% / minmax(0, 1fr); }
+  [data-dock-region="left"] { height: min(270px, 28vh); }
+  [data-dock-region="right"] { grid-area: 3 / 1; width: auto !important; }
+  [data-dock-region="right"] > div > div { width: 100% !important; }
+  [data-dock-region-handle], [data-dock-region-resize] { display: none !important; }
+}
+</style>"""
 # What the page may load: itself, what it makes in memory, and its own connection.
 _POLICY = (
     "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval'; "
@@ -130,7 +152,7 @@ def _checked(answer: Callable[..., Any], *, only_own: bool, files: Mapping[str, 
             for name, value in _HEADERS.items():
                 response.headers[name] = value
             if response.headers.get("Content-Type", "").startswith("text/html"):
-                head = f"<title>{_TITLE}</title><script>{_RARELY}</script>".encode()
+                head = f"<title>{_TITLE}</title><script>{_RARELY}</script>".encode() + _STYLE
                 response.body = re.sub(rb"<title>.*?</title>", lambda found: head, response.body)
                 del response.headers["Content-Length"]
                 response.headers["Content-Length"] = str(len(response.body))

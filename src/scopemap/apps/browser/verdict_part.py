@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from scopemap.apps.browser.next_steps import NextRun, next_runs, plain_step, source_of
 from scopemap.apps.browser.result_view import ResultView
-from scopemap.apps.browser.window import escaped
+from scopemap.apps.browser.window import escaped, typed_number
 from scopemap.engine.notices import Level
 from scopemap.result.summary import summary_facts
 from scopemap.result.verdict import Reason, verdict
@@ -58,13 +58,21 @@ class VerdictPart:
     def _offer(self, run: NextRun) -> None:
         gui, window = self._view.window.gui, self._view.window
         if run.number is not None:
-            first, low, high = run.number
-            number = gui.add_number(run.question, first, min=low, max=high, step=0.01)
-            button = gui.add_button(run.label())
-            window.on(button, lambda: self._again(run, f"{number.value:g}"))
+            number = gui.add_text(run.question, "")
+            window.on(gui.add_button(run.label()), lambda: self._again_with(run, number.value))
         elif len(run.choices) > _MOST_BUTTONS:
             choice = gui.add_dropdown(run.question, run.choices)
             window.on(gui.add_button(run.label()), lambda: self._again(run, choice.value))
         else:
             for value in run.choices:
                 window.on(gui.add_button(run.label(value)), self._again, run, value)
+
+    def _again_with(self, run: NextRun, typed: str) -> None:
+        """Start the run with the number that was typed, if it is one that can be."""
+        assert run.number is not None
+        low, high = run.number
+        value = typed_number(typed)
+        if low <= value <= high:
+            self._again(run, f"{value:g}")
+        else:
+            self._view.note(f"{run.question}: type a number from {low:g} to {high:g} first.")

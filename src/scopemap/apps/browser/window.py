@@ -197,6 +197,15 @@ class BrowserWindow:
             self.fail(f"something unexpected went wrong: {error}", traceback.format_exc())
 
 
+def typed_number(text: str) -> float:
+    """Return the number that was typed, with a point or a comma; NaN for anything else."""
+    try:
+        found = float(text.strip().replace(",", "."))
+    except ValueError:
+        return float("nan")
+    return found if np.isfinite(found) else float("nan")
+
+
 def escaped(text: str) -> str:
     """Return a text as it is, in one line, for Markdown: names of files hold what has a meaning there."""
     line = " ".join(text.split())
