@@ -101,8 +101,8 @@ def record(page: Any) -> Film:
     page.wait_for_timeout(1500)
     for place in REFERENCE:
         click(page, place)
-    page.get_by_label(re.compile("Length of this line")).fill("10")
-    page.keyboard.press("Enter")
+    length = page.locator("label", has_text="Length of this line")
+    length.locator("xpath=ancestor::*[.//input][1]//input").fill("10")
     page.wait_for_timeout(1000)
     film.take(2000)
     page.get_by_role("button", name="Use as reference").click()
