@@ -14,7 +14,7 @@ from front_door import call, refused
 from tiny_phantom import write_tiny
 
 from scopemap.apps.verify.verifying import verify_result
-from scopemap.report.page import write_report
+from scopemap.report.page import keep_measurements, write_report
 from scopemap.result import checksums
 from scopemap.result.checksums import SUMS, input_checksum
 
@@ -111,6 +111,16 @@ def test_a_report_that_is_written_again_stays_whole_and_hides_no_damage(out: Pat
     write_report(out)
     found = verify_result(out)
     assert (found.damaged, found.missing, found.added) == (["depth/000002.png"], [], [])
+
+
+def test_what_the_window_adds_is_known_and_leaves_the_result_whole(out: Path) -> None:
+    keep_measurements(out, b"[]")
+    for name in ("exports/stl.stl", "exports_of_mine.stl"):
+        (out / name).parent.mkdir(exist_ok=True)
+        (out / name).write_bytes(b"solid")
+    found = verify_result(out)
+    assert found.is_whole  # the report, too, which has what is measured at once
+    assert (found.later, found.added) == (["measurements.json", "exports/stl.stl"], ["exports_of_mine.stl"])
 
 
 def test_a_run_names_its_input_by_its_content(out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

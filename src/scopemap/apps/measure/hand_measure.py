@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -101,7 +101,9 @@ class HandMeasure:
             length = "of unknown length" if self.reference_mm is None else f"{self.reference_mm:g} mm long"
             return f"reference, {length} (frame {self.frame})"
         name = f"{self.name}: " if self.name else ""
-        found = "; ".join(str(one).replace(" (", ", 95 % interval ").rstrip(")") for one in self.found)
+        # A lesion has five figures: what widens each is left to the command.
+        known = [replace(one, why="") for one in self.found] if self.kind == "lesion" else self.found
+        found = "; ".join(str(one).replace(" (", ", 95 % interval ").rstrip(")") for one in known)
         return f"{name}{found} (frame {self.frame})"
 
 
