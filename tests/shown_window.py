@@ -67,8 +67,12 @@ class ShownWindow:
         self._tell(handle)
 
     def _tell(self, handle: Any) -> None:
+        def send(name: str, content: bytes, *, save_immediately: bool) -> None:
+            assert save_immediately  # else one has to click once more
+            self.sent[name] = content
+
         for call in handle._impl.update_cb:
-            call(SimpleNamespace(client=SimpleNamespace(send_file_download=self.sent.__setitem__), target=handle))
+            call(SimpleNamespace(client=SimpleNamespace(send_file_download=send), target=handle))
         self.settle()
 
     @property

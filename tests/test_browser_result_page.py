@@ -200,7 +200,8 @@ def test_a_distance_is_measured_and_kept(tmp_path: Path) -> None:
         assert f"scopemap measure {folder}" in shown.words
         (kept,) = read_measurements(folder)
         assert f"straight: {kept['found'][0]['value']:.3g} mm, 95 % interval " in shown.words
-        assert shown.nodes["/page/measured/0/words"].text == f"{kept['found'][0]['value']:.3g} mm"
+        value, low, high = (f"{kept['found'][0][name]:.2g}" for name in ("value", "low", "high"))
+        assert shown.nodes["/page/measured/0/words"].text == f"{value} ({low} to {high}) mm"
         # One of points that no frame saw together is refused in a sentence.
         click(shown, page, (60.0, 44.0))
         shown.window.do(page.click, np.array([0.0, 0.0, 8.0]), np.array([1.0, 0.0, 0.0]))
@@ -287,7 +288,7 @@ def test_a_lesion_is_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureF
         (kept,) = read_measurements(folder)
         assert (kept["kind"], kept["name"], kept["found"]) == ("lesion", "polyp 1", facts)
         shown.show(ResultPage(folder))
-        assert f"1. polyp 1: {facts[0]['what']}: " in shown.words
+        assert f"1. polyp 1 (frame 4)\n- {facts[0]['what']}: " in shown.words
         assert shown.nodes["/page/measured/0/words"].text.startswith("polyp 1: ")
 
 

@@ -19,7 +19,7 @@ from scopemap.engine.fusion.open_glb import OpenGlb
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.srgb import LINEAR, srgb_picture
 from scopemap.report.pale_parts import PALE, faded
-from scopemap.report.shown_mesh import at_split_vertices, in_texture
+from scopemap.report.shown_mesh import in_texture
 from scopemap.result.result import Result
 
 FRAME = 4
@@ -69,8 +69,7 @@ def test_a_mesh_without_light_is_the_mesh() -> None:
 def test_a_texture_is_shown_as_it_is_and_darker_in_relief(tmp_path: Path) -> None:
     surface = ShownSurface(Result(draw_textured_run(tmp_path)))
     assert surface.textured is not None
-    light = at_split_vertices(np.where(surface.vertices[:, 2] < 40, 1.0, 0.6), surface.mesh, surface.textured)
-    content = unlit_textured_glb(surface.textured, light, surface.texture(pale=False))
+    content = unlit_textured_glb(surface.textured, surface.texture(pale=False, relief=False))
     scene = trimesh.load(io.BytesIO(content), file_type="glb", process=False)
     (read,) = scene.geometry.values()
     np.testing.assert_allclose(read.vertices, surface.mesh.vertices[surface.faces].reshape(-1, 3), atol=1e-5)
@@ -81,9 +80,13 @@ def test_a_texture_is_shown_as_it_is_and_darker_in_relief(tmp_path: Path) -> Non
     assert accessor["max"] == pytest.approx([2.0] * 3, rel=1e-3)
     shown = srgb_picture(tone_mapped(2.0 * LINEAR[picture[32, [5, 60]]])).astype(int)
     assert np.abs(shown - [[20, 160, 40], [20, 60, 200]]).max() <= 8
-    low = LINEAR[picture[32, [5, 60]]] * accessor["min"]
-    darker = srgb_picture(tone_mapped(low)).astype(int)
-    assert np.abs(darker - 0.6 * shown).max() <= 25
+    vars(surface)["facing"] = np.full(len(surface.vertices), 1 / 9)  # a light of 0.6
+    relief = cv2.imdecode(np.frombuffer(surface.texture(pale=False, relief=True), np.uint8), 1)[..., ::-1]
+    inside = round(0.3 * 64 - 0.5), round(0.2 * 64 - 0.5)  # where a triangle has a corner
+    before, after = (
+        srgb_picture(tone_mapped(2.0 * LINEAR[one[inside][None]])).astype(int) for one in (picture, relief)
+    )
+    assert np.abs(after - 0.6 * before).max() <= 8
 
 
 def test_what_few_frames_saw_is_pale_in_colours_and_in_the_texture(tmp_path: Path) -> None:
@@ -103,7 +106,9 @@ def test_what_few_frames_saw_is_pale_in_colours_and_in_the_texture(tmp_path: Pat
     # The triangles on the left have their corners at 0.2 of the texture's width and 0.7 of its height.
     assert shares[round(0.3 * height - 0.5), round(0.2 * width - 0.5)] == pytest.approx(0.4, abs=0.02)
     assert shares[-1, width // 2] == 1
-    whole, less = (cv2.imdecode(np.frombuffer(surface.texture(pale=pale), np.uint8), 1) for pale in (False, True))
+    whole, less = (
+        cv2.imdecode(np.frombuffer(surface.texture(pale=pale, relief=False), np.uint8), 1) for pale in (False, True)
+    )
     assert whole.shape == less.shape == (height, width, 3)
 
 

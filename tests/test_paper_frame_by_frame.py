@@ -53,7 +53,8 @@ def test_the_page_computes_what_the_preset_does(networks: str, tmp_path: Path) -
     result = reconstruct(open_sequence(phantom, settings=config.input), config, observers=(steps.append,))
     assert len(frames) == len(steps) > 6
     for frame, step in zip(frames, steps, strict=True):
-        np.testing.assert_array_equal(frame.depth_mm, step.frame.depth_mm)
+        # torch sums in another order on one thread, where the run calls it from threads of its own.
+        np.testing.assert_allclose(frame.depth_mm, step.frame.depth_mm, rtol=1e-5)
         np.testing.assert_allclose(frame.T_world_camera, step.frame.T_world_camera, atol=1e-9)
     np.testing.assert_allclose([f.T_world_camera for f in frames], result.trajectory.T_world_camera, atol=1e-9)
     assert np.linalg.norm(frames[-1].T_world_camera[:3, 3]) > 0.1  # it moves

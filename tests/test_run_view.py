@@ -42,13 +42,13 @@ class Looking(RunWatch):
 
     def __call__(self, step: Step) -> None:
         super().__call__(step)
-        self._look()
+        self._see()
 
     def final(self, frame: Frame) -> None:
         super().final(frame)
-        self._look()
+        self._see()
 
-    def _look(self) -> None:
+    def _see(self) -> None:
         self.folder.mkdir(exist_ok=True)
         look(self.folder)
         self._write()

@@ -70,8 +70,12 @@ class FilesPart:
         is_sent = client is not None and sum(part.stat().st_size for part in parts) <= _MOST_SENT
         if is_sent:
             content = file.read_bytes() if file.is_file() else zipped(file, parts)
-            client.send_file_download(self._name(file), content)
-        said = "Sent to your browser. It is also" if is_sent else "Too large to be sent to your browser. It is"
+            client.send_file_download(self._name(file), content, save_immediately=True)
+        said = (
+            "Sent to your browser, which saves it. It is also"
+            if is_sent
+            else "Too large to be sent to your browser. It is"
+        )
         self._words.content = f"{said} here: {escaped(where)}"
 
     def _name(self, file: Path) -> str:

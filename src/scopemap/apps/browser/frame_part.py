@@ -233,8 +233,16 @@ def frame_words(view: ResultView) -> str:
     submap, time_s = int(frames.submap[row]), float(frames["time_s"][row])
     words = f"Frame {view.index}, {time_s:.2f} s: "
     if submap >= 0:
-        here = "" if submap == view.number else f" in submap {submap + 1}, not the one that is shown"
-        return f"{words}tracked{here}"
+        if submap != view.number:
+            return f"{words}tracked in submap {submap + 1}, not the one that is shown"
+        segments = view.run.segments
+        if len(segments) < 2:
+            return f"{words}tracked"
+        shown = segments[view.surface.segment]
+        return (
+            f"{words}tracked. **The surface is that of {shown.start_s:.1f} to {shown.end_s:.1f} s**: "
+            f"the scene changes, and each of {len(segments)} parts of the video has its own."
+        )
     status = {
         LOST: "**lost**",
         ROTATED: "**lost**, only its rotation is known",

@@ -52,15 +52,19 @@ def frame_of_reference(surface: ShownSurface, reference: Reference, first: int |
 
 def kept_reference(surface: ShownSurface, kept: Sequence[HandMeasure]) -> Reference | None:
     """Return the reference of a surface among what is kept of its result; None where there is none, or no more."""
-    run, here = surface.run, folder_in_whole(surface.run)
     for one in kept:
-        if one.kind != "reference" or one.folder != here or one.frame not in run.tracked["index"]:
-            continue
-        if run.segment_at(one.frame) == surface.segment:
-            eye = pose_of(run, one.frame)[:3, 3]
+        if one.kind == "reference" and is_on(surface, one):
+            eye = pose_of(surface.run, one.frame)[:3, 3]
             first, second = (surface.pick(eye, place - eye) for place in one.world)
             return None if first is None or second is None else Reference((first, second), one.reference_mm)
     return None
+
+
+def is_on(surface: ShownSurface, one: HandMeasure) -> bool:
+    """Return whether a measurement, or a reference, was made on a surface."""
+    run = surface.run
+    is_here = one.folder == folder_in_whole(run) and one.frame in run.tracked["index"]
+    return bool(is_here and run.segment_at(one.frame) == surface.segment)
 
 
 def is_by(surface: ShownSurface, one: HandMeasure, reference: Reference | None) -> bool:

@@ -21,6 +21,7 @@ from scopemap.report.measured_by_hand import sizes_by
 Mode = Literal["Look", "Distance", "Area", "Lesion"]
 _CHOOSE = "Choose what to measure."
 _UNKNOWN = "Sizes are unknown. Choose **Distance** and click on both ends of something whose length you know."
+_ELSEWHERE = "Your reference is on the surface of another part of the video: go back there, or set one here."
 _FEWEST = 3
 _PICKED = "/page/picked"
 _REFERRED = "/page/reference"
@@ -50,8 +51,8 @@ class MeasurePart:
             view, lambda: self._reference, self._say_mode, lambda one, line: self._measured.add(one, line)
         )
         self._measured = MeasuredList(view)
-        view.follow(submap=self._follow_submap)
-        self._refer_to(self._measured.kept_reference())
+        view.follow(submap=self._follow_surface)
+        self._follow_surface()
 
     @property
     def _is_known(self) -> bool:
@@ -127,9 +128,11 @@ class MeasurePart:
         self._measured.show(reference)
         self._show()
 
-    def _follow_submap(self) -> None:
+    def _follow_surface(self) -> None:
         self._picks = []
-        self._refer_to(self._measured.kept_reference())
+        reference, is_elsewhere = self._measured.kept_reference()
+        self._refer_to(reference)
+        self._view.note(_ELSEWHERE if is_elsewhere else "")
         self._lesion.begin(shown=self.mode == "Lesion")
 
     def _show(self) -> None:

@@ -10,6 +10,7 @@ from scopemap.apps.browser.hand_measures import (
     Reference,
     broken,
     is_by,
+    is_on,
     kept_reference,
     line_on_surface,
     reference_as_kept,
@@ -52,7 +53,6 @@ class MeasuredList:
         with self._outer:
             self._place = gui.add_folder(None)
         self._remove = view.window.on(gui.add_button("Remove the last", color="gray"), self._remove_last)
-        view.follow(submap=self._draw)
 
     def add(self, one: HandMeasure, line: np.ndarray) -> None:
         """Show and keep a measurement, with its line (M, 3) on the surface."""
@@ -60,9 +60,11 @@ class MeasuredList:
         self.show(self._reference)
         add_measurement(self._view.whole.folder, one)
 
-    def kept_reference(self) -> Reference | None:
-        """Return the reference that is kept for the surface that is shown."""
-        return kept_reference(self._view.surface, kept_measures(self._view.whole.folder))
+    def kept_reference(self) -> tuple[Reference | None, bool]:
+        """Return the reference that is kept for the surface that is shown, and whether one is for another surface."""
+        kept = kept_measures(self._view.whole.folder)
+        found = kept_reference(self._view.surface, kept)
+        return found, found is None and any(one.kind == "reference" for one in kept)
 
     def keep_reference(self, reference: Reference | None) -> None:
         """Keep the reference of the surface that is shown; None: none. Raises as `reference_as_kept`."""
@@ -84,33 +86,37 @@ class MeasuredList:
             if self._all:
                 gui.add_markdown(f"Measured, and kept in {escaped(MEASUREMENTS)} for the report:")
             for number, listed in enumerate(self._all, 1):
-                gui.add_markdown(f"**{number}.** {escaped(str(listed.one))}{self._note(listed)}")
+                gui.add_markdown(f"**{number}.** {measured_words(listed.one)}{self._note(listed)}")
                 with gui.add_folder(f"Command of {number}", expand_by_default=False):
                     gui.add_markdown(fenced(broken(listed.one.command(self._view.folder_words))))
         self._draw()
+
+    def _is_here(self, listed: _Listed) -> bool:
+        """Whether it is on the surface that is shown: each segment of the video has one of its own."""
+        return is_on(self._view.surface, listed.one)
 
     def _is_earlier(self, listed: _Listed) -> bool:
         return not is_by(self._view.surface, listed.one, self._reference)
 
     def _note(self, listed: _Listed) -> str:
-        if listed.one.folder != folder_in_whole(self._view.run):
-            return " *on another submap*"
+        if not self._is_here(listed):
+            return " *on the surface of another part of the video*"
         return " *by an earlier reference*" if self._is_earlier(listed) else ""
 
     def _draw(self) -> None:
-        view, here = self._view, folder_in_whole(self._view.run)
+        view = self._view
         for place in range(len(self._all) + 1):
-            if place == len(self._all) or self._all[place].one.folder != here:
+            if place == len(self._all) or not self._is_here(self._all[place]):
                 view.window.scene.remove_by_name(f"{_KEPT}/{place}")
         for place, listed in enumerate(self._all):
             one = listed.one
-            if one.folder != here:
+            if not self._is_here(listed):
                 continue
             if listed.line is None:
                 listed = self._all[place] = replace(listed, line=line_on_surface(view.surface, one.frame, one.world))
             colour = PALE if self._is_earlier(listed) else INK
             name, size_mm = f"{_KEPT}/{place}", view.surface.size_mm
-            words = ": ".join(filter(None, (one.name, short(one.found[0]))))
+            words = ": ".join(filter(None, (one.name, with_interval(one.found[0]))))
             draw_marks(view.window.scene, name, one.world, size_mm, words, colour, listed.line)
 
     def _remove_last(self) -> None:
@@ -118,6 +124,25 @@ class MeasuredList:
         self.show(self._reference)
         remove_measurement(self._view.whole.folder, gone.one)
         self._view.note(f"Removed: {short(gone.one.found[0])}.")
+
+
+def measured_words(one: HandMeasure) -> str:
+    """Return what was found of a measurement as Markdown: a line each, then why intervals are wide."""
+    lines = [f"{escaped(one.name or 'Measured')} (frame {one.frame})"]
+    for found in one.found:
+        said = str(replace(found, why=""))
+        lines.append(f"- {escaped(said.replace(' (', ', 95 % interval ').rstrip(')'))}")
+    if whys := list(dict.fromkeys(found.why for found in one.found if found.why)):
+        lines.append(f"\nWide mainly because of {escaped('; of '.join(whys))}.")
+    return "\n".join(lines)
+
+
+def with_interval(measure: Measure) -> str:
+    """Return a value as the scene shows it, with its interval: "4.5 (1.1 to 13) mm"."""
+    if not np.isfinite([measure.value, measure.low, measure.high]).all():
+        return short(measure)
+    value, low, high = (f"{number:.2g}" for number in (measure.value, measure.low, measure.high))
+    return f"{value} ({low} to {high}) {_SHORT.get(measure.unit, measure.unit)}"
 
 
 def short(measure: Measure) -> str:

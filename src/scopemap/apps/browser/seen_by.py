@@ -29,12 +29,12 @@ class Sight:
 
 
 def frames_that_saw(surface: ShownSurface, picks: Sequence[SurfacePick], always: int | None = None) -> list[Sight]:
-    """Return the frames of a surface's submap that saw all of some places, the one that saw them best first.
+    """Return the frames of a surface's segment that saw all of some places, the one that saw them best first.
 
     Of many frames 150 are tried, evenly spread over those whose picture holds the places, and the frame `always`.
     """
     run, found = surface.run, []
-    tracked, camera = run.tracked, run.camera
+    tracked, camera = surface.frames, run.camera  # others have another surface
     normals = np.array([surface.normal(pick) for pick in picks])
     places = np.array([surface.position(pick) for pick in picks])
     for index, pose in zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True):

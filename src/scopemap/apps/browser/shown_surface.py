@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
@@ -19,6 +20,8 @@ from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 
 MOST_FACES = 200_000
+_AMBIENT = 0.55
+"""Of the light in relief, from everywhere; the rest is that of a lamp at the camera."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class ShownSurface:
         self.run, self.segment = run, run.main_segment if segment is None else segment
         self.mesh = simplified(run.surface(self.segment), most_faces)
         self.faces = np.asarray(self.mesh.faces)
-        self._textures: dict[bool, bytes] = {}
+        self._textures: dict[tuple[bool, bool], bytes] = {}
 
     @property
     def is_empty(self) -> bool:
@@ -61,25 +64,38 @@ class ShownSurface:
         """How sure it is at its vertices, (V,), 0 to 1."""
         return certainty(self.mesh)
 
-    def texture(self, *, pale: bool) -> bytes:
-        """Return the texture as `unlit_textured_glb` wants it; pale : what is not sure has lost its colour."""
-        if pale not in self._textures:
+    def texture(self, *, pale: bool, relief: bool) -> bytes:
+        """Return the texture as `unlit_textured_glb` wants it.
+
+        pale : what is not sure has lost its colour. relief : it is darker where it does not face a camera; in the
+        picture, since what is multiplied before the page's tone mapping changes colours.
+        """
+        if (pale, relief) not in self._textures:
             assert self.textured is not None
             picture = texture_picture(self.textured)
             if pale:
-                sure = at_split_vertices(self.sure, self.mesh, self.textured)
-                picture = faded(picture, in_texture(sure, self.textured))
-            self._textures[pale] = texture_before_tone_mapping(picture)
-        return self._textures[pale]
+                picture = faded(picture, self._in_texture(self.sure))
+            if relief:
+                light = self._in_texture(light_of(self.facing))
+                dark = [cv2.multiply(picture[..., channel], light, dtype=cv2.CV_8U) for channel in range(3)]
+                picture = np.dstack(dark)
+            self._textures[pale, relief] = texture_before_tone_mapping(picture)
+        return self._textures[pale, relief]
+
+    def _in_texture(self, values: np.ndarray) -> np.ndarray:
+        """Return values (V,), 0..1, at its vertices as a picture of its texture, (H, W) float32."""
+        assert self.textured is not None
+        shares = in_texture(at_split_vertices(values, self.mesh, self.textured), self.textured)
+        return np.asarray(shares, np.float32)
 
     @cached_property
     def facing(self) -> np.ndarray:
         """Cosines (V,), 0 to 1, at which the nearest camera sees the vertices."""
-        return facing_of(self.mesh, self._frames["T_world_camera"][:, :3, 3])
+        return facing_of(self.mesh, self.frames["T_world_camera"][:, :3, 3])
 
     @property
-    def _frames(self) -> FrameTable:
-        """The frames whose segment it is."""
+    def frames(self) -> FrameTable:
+        """The tracked frames of its segment; all of the submap where frames have none."""
         tracked = self.run.tracked
         own = tracked["segment"] == self.segment
         return tracked.only(own) if own.any() else tracked
@@ -116,6 +132,11 @@ class ShownSurface:
         first, second, third = self.vertices[self.faces[pick.face]]
         normal = np.cross(second - first, third - first)
         return np.asarray(normal / max(float(np.linalg.norm(normal)), 1e-12))
+
+
+def light_of(facing: np.ndarray) -> np.ndarray:
+    """Return the light (V,), 0..1, in relief, on vertices that face a camera so, by `facing_of`, (V,)."""
+    return _AMBIENT + (1 - _AMBIENT) * facing
 
 
 def facing_of(mesh: trimesh.Trimesh, cameras: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from scopemap.apps.browser.shown_surface import ShownSurface
+from scopemap.apps.browser.shown_surface import ShownSurface, light_of
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.report.pale_parts import WORDS as PALE_WORDS
 from scopemap.report.shown_mesh import SeenFrame, times_seen
@@ -21,8 +21,6 @@ _SAME_SURFACE = 0.1
 _WORST_PERCENTILE = 95
 _PICTURE, _PALE = "picture", "picture, pale where unsure"
 _UNKNOWN = (150, 150, 150)
-_AMBIENT = 0.55
-"""Of the light in relief, from everywhere; the rest is that of a lamp at the camera."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +74,6 @@ def looking_frames(run: Result, most: int = _LOOKED_AT) -> list[SeenFrame]:
 def in_relief(facing: np.ndarray, colours: np.ndarray) -> np.ndarray:
     """Return colours (V, 3) uint8 of vertices, darker where they do not face a camera, by `facing_of`, (V,)."""
     return np.asarray(np.round(colours * light_of(facing)[:, None]), np.uint8)
-
-
-def light_of(facing: np.ndarray) -> np.ndarray:
-    """Return the light (V,), 0..1, in relief, on vertices that face a camera so, by `facing_of`, (V,)."""
-    return _AMBIENT + (1 - _AMBIENT) * facing
 
 
 def stops_of(ramp: np.ndarray, count: int = 9) -> list[str]:

@@ -10,12 +10,12 @@ import trimesh
 from scopemap.apps.browser.legends import ramp_html, words_html
 from scopemap.apps.browser.result_view import MODEL, ResultView
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
-from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, light_of, stops_of
+from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, stops_of
 from scopemap.apps.browser.unlit_mesh import unlit_glb, unlit_textured_glb
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import COLOURS
 from scopemap.report.pale_parts import faded
-from scopemap.report.shown_mesh import at_split_vertices, simplified
+from scopemap.report.shown_mesh import simplified
 from scopemap.report.video_parts import video_parts
 from scopemap.result.verdict import level_of_submap
 from scopemap.result.wording import LEVEL_WORDS
@@ -113,10 +113,7 @@ class SurfacePart:
         surface, relief = self._view.surface, self._relief.value
         found = self._colouring
         if found.picture and (textured := surface.textured) is not None:
-            light = at_split_vertices(
-                light_of(surface.facing) if relief else np.ones(len(surface.vertices)), surface.mesh, textured
-            )
-            return unlit_textured_glb(textured, light, surface.texture(pale=found.pale))
+            return unlit_textured_glb(textured, surface.texture(pale=found.pale, relief=relief))
         colours = faded(found.colours, surface.sure) if found.pale else found.colours
         return unlit_glb(surface.vertices, surface.faces, in_relief(surface.facing, colours) if relief else colours)
 

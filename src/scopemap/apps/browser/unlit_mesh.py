@@ -28,8 +28,6 @@ _LARGEST_IN_TEXTURE = 2.0
 """Before the tone mapping, of a texture with 8 bits: level 240 of 255. With more, dark tissue would have few steps."""
 _ROWS = 128
 """Of a texture at once: in floating point all of it would take gigabytes."""
-_MEDIUM = 140
-"""Level of a grey that shading darkens exactly; other colours nearly so: the tone mapping is no straight line."""
 
 
 def unlit_glb(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> bytes:
@@ -41,15 +39,11 @@ def unlit_glb(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> b
     return _glb(vertices, faces, {WRITTEN_COLOURS: before_tone_mapping(LINEAR[colours]).astype(np.float32)})
 
 
-def unlit_textured_glb(textured: trimesh.Trimesh, light: np.ndarray, jpeg: bytes) -> bytes:
-    """Return a surface with a texture as GLB, as `unlit_glb` does.
-
-    light : (V,), 0..1, by which the sRGB levels at each vertex are darkened. jpeg : its `texture_before_tone_mapping`.
-    """
+def unlit_textured_glb(textured: trimesh.Trimesh, jpeg: bytes) -> bytes:
+    """Return a surface with a texture as GLB, as `unlit_glb` does; jpeg : its `texture_before_tone_mapping`."""
     visual: Any = textured.visual
-    medium = before_tone_mapping(np.full((1, 3), LINEAR[_MEDIUM]))
-    lit = before_tone_mapping(np.repeat(LINEAR[np.round(_MEDIUM * light).astype(int)][:, None], 3, axis=1))
-    attributes: dict[str, Any] = {WRITTEN_COLOURS: (_LARGEST_IN_TEXTURE * lit / medium).astype(np.float32)}
+    bright = np.full((len(textured.vertices), 3), _LARGEST_IN_TEXTURE, np.float32)
+    attributes: dict[str, Any] = {WRITTEN_COLOURS: bright}
     # glTF counts from the upper left.
     attributes[WRITTEN_UV] = (visual.uv * [1, -1] + [0, 1]).astype(np.float32)
     return _glb(textured.vertices, textured.faces, attributes, jpeg)

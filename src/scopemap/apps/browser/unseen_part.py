@@ -37,7 +37,15 @@ class UnseenPart:
         self._outer = gui.add_folder(None, visible=False)
         with self._outer:
             self._place = gui.add_folder(None)
-        view.follow(submap=self._clear)
+        self._number = view.number
+        view.follow(submap=self._follow_surface)
+
+    def _follow_surface(self) -> None:
+        """Forget what is said of another submap; that of another segment's time stays: it is of the whole submap."""
+        self._view.window.scene.remove_by_name(_MARK)
+        if self._number != self._view.number:
+            self._number = self._view.number
+            self._clear()
 
     def _clear(self) -> None:
         self._place.remove()

@@ -14,6 +14,7 @@ from scopemap.result.verdict import Reason, verdict
 _NAMES: dict[Level, str] = {"bad": "Not usable", "doubtful": "Caution", "note": "Note"}
 _GOOD = "The surface agrees with its own video. Its true shape was not measured."
 _MOST_BUTTONS = 3
+_CHOOSE = "choose"
 
 
 class VerdictPart:
@@ -61,11 +62,19 @@ class VerdictPart:
             number = gui.add_text(run.question, "")
             window.on(gui.add_button(run.label()), lambda: self._again_with(run, number.value))
         elif len(run.choices) > _MOST_BUTTONS:
-            choice = gui.add_dropdown(run.question, run.choices)
-            window.on(gui.add_button(run.label()), lambda: self._again(run, choice.value))
+            # None is preset: a wrong one makes the result worse, and takes the caution away.
+            choice = gui.add_dropdown(run.question, (_CHOOSE, *run.choices))
+            window.on(gui.add_button(run.label()), lambda: self._again_chosen(run, choice.value))
         else:
             for value in run.choices:
                 window.on(gui.add_button(run.label(value)), self._again, run, value)
+
+    def _again_chosen(self, run: NextRun, value: str) -> None:
+        """Start the run with what was chosen, if something was."""
+        if value == _CHOOSE:
+            self._view.note(f"{run.question} Choose one first.")
+        else:
+            self._again(run, value)
 
     def _again_with(self, run: NextRun, typed: str) -> None:
         """Start the run with the number that was typed, if it is one that can be."""

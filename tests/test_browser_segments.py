@@ -1,0 +1,75 @@
+"""Measuring where each part of a video has a surface of its own: what is on one is not looked for on another."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+from drawn_run import IN_RESULT, draw_run, tube
+from shown_window import shown_window
+from test_browser_result_page import click
+
+from scopemap.apps.browser.result_page import ResultPage
+from scopemap.result.result import Result
+from scopemap.result.surface_segments import SurfaceSegment, save_segments
+
+pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
+
+HALF = IN_RESULT // 2
+
+
+def in_two_segments(folder: Path) -> Path:
+    """A drawn result whose second half has a surface of its own, with fewer triangles."""
+    times_s = Result(folder).frames["time_s"]
+    ends = ((0, HALF - 1), (HALF, IN_RESULT - 1))
+    segments = [
+        SurfaceSegment(number, *frames, float(times_s[frames[0]]), float(times_s[frames[1]]), "doubtful", 0.02, 0.9)
+        for number, frames in enumerate(ends)
+    ]
+    whole = tube()
+    part = whole.submesh([range(len(whole.faces) // 2)], append=True, repair=False)
+    save_segments(segments, [whole, part], folder, comment="drawn")
+    with (folder / "frames.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        inside = int(row["index"]) < IN_RESULT
+        row["segment"] = str(int(int(row["index"]) >= HALF)) if inside else ""
+    with (folder / "frames.csv").open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    return folder
+
+
+def test_what_was_measured_on_one_surface_is_not_looked_for_on_another(tmp_path: Path) -> None:
+    folder = in_two_segments(draw_run(tmp_path))
+    page = ResultPage(folder)
+    with shown_window() as shown:
+        shown.show(page)
+        shown.choose("Slider", "Frame", 4)
+        shown.choose("ButtonGroup", "Measure", "Distance")
+        # In the half that the other surface has not.
+        for pixel in ((24.0, 45.0), (40.0, 45.0)):
+            click(shown, page, pixel)
+        shown.element("Text", "Length of this line").value = "5"
+        shown.press("Use as reference")
+        for pixel in ((20.0, 20.0), (60.0, 44.0)):
+            click(shown, page, pixel)
+        shown.until(lambda: "/page/measured/0/words" in shown.nodes)
+        for _ in range(2):
+            shown.choose("Slider", "Frame", HALF + 1)
+            shown.settle()
+            assert "Your reference is on the surface of another part of the video" in shown.words
+            assert "on the surface of another part of the video" in shown.words
+            assert "/page/measured/0/words" not in shown.nodes
+            assert "/page/reference/words" not in shown.nodes
+            assert "each of 2 parts of the video has its own" in shown.words
+            assert not shown.window._error.visible
+            shown.choose("Slider", "Frame", 4)
+            shown.settle()
+            assert "Sizes are in mm by your reference (5 mm)." in shown.words
+            assert "/page/measured/0/words" in shown.nodes
+            # Opened again it is the same.
+            page = ResultPage(folder)
+            shown.show(page)
