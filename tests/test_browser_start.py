@@ -302,19 +302,19 @@ def test_a_video_is_sent_looked_at_run_and_stopped(browser: Any, served: tuple[s
     # Nothing says that it was taken, and the button takes the next one.
     opened.page.wait_for_timeout(500)
     assert "uploaded successfully" not in opened.text()
-    assert "large.mp4" not in opened.text()
+    assert "large.mp4 was not taken" in opened.text()
     chooser.set_input_files(CLIP)
     opened.until(lambda: "The same in a terminal" in opened.text())
-    assert "video_001.mp4" in opened.text()
+    assert "scopemap run colon.mp4" in opened.text()
     assert "good: motion, sharpness and texture" in opened.text()
     opened.press("Reconstruct")
     opened.until(lambda: opened.points() > 0)
     opened.press("Stop")
     opened.until(lambda: "What was tracked is kept" in opened.text())
-    out = folder / "scopemap" / "video_001"
+    out = folder / "scopemap" / "colon"
     assert not (out / "provenance.json").exists()
     opened.press("Make a result of these frames")
-    part = folder / "scopemap" / "video_001_so_far"
+    part = folder / "scopemap" / "colon_so_far"
     opened.until(lambda: (part / "provenance.json").exists())
     assert Result(part).provenance["interrupted_at_frame"] is not None
     # What was stopped is still there, and goes on.

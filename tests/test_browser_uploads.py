@@ -39,18 +39,25 @@ def button(window: BrowserWindow) -> Any:
     return element(window, "Send a video")
 
 
-def test_a_file_is_written_as_it_comes_under_a_name_of_ours(opened: tuple[BrowserWindow, Workspace, Client]) -> None:
+def test_a_file_is_written_as_it_comes_under_its_safe_name(
+    opened: tuple[BrowserWindow, Workspace, Client],
+) -> None:
     window, workspace, client = opened
     client.start(button(window), "../../Müller 1970.MP4", 10)
     client.part(button(window), 0, b"01234")
     until(window, lambda: workspace.receiver(window.server).progress == 50)
-    assert files(workspace) == ["video_001.mp4.part"]
+    assert files(workspace) == ["Müller_1970.mp4.part"]
     assert workspace.sent == []
     client.part(button(window), 1, b"56789")
     until(window, lambda: isinstance(window._page, InputPage))
-    assert (workspace.uploads / "video_001.mp4").read_bytes() == b"0123456789"
-    assert workspace.sent == [workspace.uploads / "video_001.mp4"]
-    assert "Müller" not in words(window)
+    file = workspace.uploads / "Müller_1970.mp4"
+    assert file.read_bytes() == b"0123456789"
+    assert workspace.sent == [file]
+    # Messages name it, and no temporary folder; so does its result.
+    until(window, lambda: "reading the video" in words(window))
+    assert "reading the video Müller_1970.mp4" in words(window)
+    assert "scopemap-app-" not in words(window)
+    assert workspace.new_result(file) == workspace.results / "Müller_1970"
 
 
 @pytest.mark.parametrize(
@@ -71,12 +78,13 @@ def test_what_is_refused_is_refused_in_a_sentence(
     for index, content in parts:
         client.part(button(window), index, content)
     until(window, lambda: sentence in words(window))
+    assert "a.mp4 was not taken: " in words(window)
     assert files(workspace) == []
     # What is still sent of it is dropped, and the next one is taken.
     client.part(button(window), 5, b"more")
     client.start(button(window), "b.mkv", 1, "2")
     client.part(button(window), 0, b"x", "2")
-    until(window, lambda: files(workspace) == ["video_001.mkv"])
+    until(window, lambda: files(workspace) == ["b.mkv"])
 
 
 def test_a_full_disk_and_other_buttons_take_nothing(
@@ -104,7 +112,7 @@ def test_what_came_in_part_goes_with_its_browser_and_with_the_window(
     until(window, lambda: len(files(workspace)) == 2)
     other.part(button(window), 1, b"123456789", "1")  # of another's file
     other.close()
-    until(window, lambda: files(workspace) == ["video_001.mp4.part"])
+    until(window, lambda: files(workspace) == ["a.mp4.part"])
     until(window, lambda: "the connection to the page was lost" in words(window))
     workspace.receiver(window.server).close()
     assert files(workspace) == []
@@ -115,7 +123,44 @@ def test_uploads_go_with_the_session_unless_they_are_kept(tmp_path: Path, keep: 
     with Workspace(tmp_path, keep_uploads=keep) as workspace:
         file = workspace.new_upload("a.mp4")
         file.write_bytes(b"x")
-        assert workspace.new_upload("no ending").name == "video_002.video"
     assert file.exists() == keep
     assert file.is_relative_to(tmp_path / "scopemap" / "uploads") == keep
     assert workspace.uploads.parent.exists() == keep
+
+
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        ("Mu\u0308ller, Erika.MP4", "M\u00fcller_Erika.mp4"),
+        ("../../etc/passwd", "passwd.video"),
+        ("-rf $(x).mkv", "rf_x_.mkv"),
+        (".avi", "avi.video"),
+        ("", "video.video"),
+        ("a\0b\n<i>.avi", "a_b_i_.avi"),
+        ("clip.divx", "clip.divx.video"),
+        ("\u624b" * 300 + ".mp4", "\u624b" * 60 + ".mp4"),
+    ],
+)
+def test_a_name_is_made_safe_and_numbered_where_it_is_taken(tmp_path: Path, given: str, kept: str) -> None:
+    with Workspace(tmp_path) as workspace:
+        file = workspace.new_upload(given)
+        assert file == workspace.uploads / kept
+        file.write_bytes(b"x")
+        again = workspace.new_upload(given)
+        assert again == file.with_stem(f"{file.stem}_2")
+        again.with_name(f"{again.name}.part").write_bytes(b"x")
+        assert workspace.new_upload(given) == file.with_stem(f"{file.stem}_3")
+        assert workspace.sent == [file]
+
+
+def test_an_anonymous_page_names_no_file_that_was_refused(tmp_path: Path) -> None:
+    with Workspace(tmp_path, most_bytes=LIMIT) as workspace:
+        window = BrowserWindow(anonymous=True)
+        window.show(StartPage(workspace))
+        settle(window)
+        client = Client(window)
+        client.start(button(window), "Erika.mp4", 2 * LIMIT)
+        until(window, lambda: "video 1 was not taken" in words(window))
+        assert "Erika" not in words(window)
+        client.close()
+        window.close()

@@ -17,6 +17,11 @@ class Names:
         self._of: dict[tuple[str, Path], str] = {}
         self._instead: dict[str, str] = {}
         self._counts: dict[str, int] = {}
+        self._left_out: set[str] = set()
+
+    def leave_out(self, folder: Path) -> None:
+        """Show files of a folder by their names alone: it is a temporary one, of which nobody knows."""
+        self._left_out |= {f"{folder}/", f"{folder.resolve()}/"}
 
     def hide_folder(self, folder: Path) -> None:
         """Show no part of where a folder is."""
@@ -38,7 +43,9 @@ class Names:
         return self._of[key]
 
     def hidden(self, text: str) -> str:
-        """Return a text in which names that are known here are hidden, if they are to be."""
+        """Return a text without temporary folders; names that are known here are hidden in it, if they are to be."""
+        for folder in self._left_out:
+            text = text.replace(folder, "")
         if not (self.anonymous and self._instead):
             return text
         # The longest first: a folder's path before its name, "a_2" before "a".

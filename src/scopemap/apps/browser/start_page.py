@@ -47,6 +47,8 @@ class StartPage:
         self._window, gui = window, window.gui
         window.first_page = partial(StartPage, self._workspace)
         window.names.hide_folder(self._workspace.folder)
+        if not self._workspace.keeps_uploads:
+            window.names.leave_out(self._workspace.uploads)
         self._receiver = self._workspace.receiver(window.server)
         # What came before this page was opened is in the list.
         while self._receiver.take() is not None:
@@ -68,8 +70,11 @@ class StartPage:
         """Show what has changed: of the runs, and of what is being sent."""
         share = self._receiver.progress
         self._bar.visible, self._bar.value = share is not None, min(100.0, share or 0.0)
-        if (reason := self._receiver.take_refusal()) is not None:
-            self._window.fail(reason)
+        if (refused := self._receiver.take_refusal()) is not None:
+            name, reason = refused
+            self._window.fail(
+                f"{self._window.names.of(self._workspace.uploads / name, 'video')} was not taken: {reason}"
+            )
         if (sent := self._receiver.take()) is not None:
             self._choose(sent)
         runs = self._workspace.runs.runs[-_MOST_RUNS:]

@@ -1,4 +1,4 @@
-"""Videos that are sent to the page: written to disk part by part as they come, limited, under names of our own.
+"""Videos that are sent to the page: written to disk part by part as they come, limited, under their names made safe.
 
 viser's own handlers keep a whole file in memory. Its client sends all parts without waiting, shows a notification of
 its own, and takes a file for sent when as many bytes as it has were acknowledged.
@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-_PART = ".part"
+PART = ".part"
+"""What the name of a file ends in while it comes."""
 _MOST_AT_ONCE = 4
 _KEPT_FREE_BYTES = 500_000_000
 _QUIET_EVERY_S = 0.5
@@ -29,6 +30,7 @@ class _Transfer:
 
     client: int
     button: str
+    name: str
     size: int
     path: Path
     part: Path
@@ -53,7 +55,7 @@ class Receiver:
         self._transfers: dict[str, _Transfer] = {}
         self._buttons: set[str] = set()
         self._arrived: deque[Path] = deque()
-        self._refusals: deque[str] = deque()
+        self._refusals: deque[tuple[str, str]] = deque()
         self._lock = threading.Lock()
         server._websock_server.register_handler(messages.FileTransferStartUpload, self._start)
         server._websock_server.register_handler(messages.FileTransferPart, self._take_part)
@@ -78,8 +80,8 @@ class Receiver:
         """Return the next file that has come since the last call, or None."""
         return self._arrived.popleft() if self._arrived else None
 
-    def take_refusal(self) -> str | None:
-        """Return why a file was refused since the last call, in a sentence, or None."""
+    def take_refusal(self) -> tuple[str, str] | None:
+        """Return the name of a file that was refused since the last call, and why in a sentence; or None."""
         return self._refusals.popleft() if self._refusals else None
 
     def close(self) -> None:
@@ -91,20 +93,21 @@ class Receiver:
     def _start(self, client: int, message: Any) -> None:
         if message.source_component_uuid not in self._buttons:
             return
-        size, number = int(message.size_bytes), str(message.transfer_uuid)
+        size, number, button = int(message.size_bytes), str(message.transfer_uuid), message.source_component_uuid
+        name = Path(str(message.filename)).name or "video"
         with self._lock:
             if (reason := self._reason(size)) is None and number not in self._transfers:
                 try:
-                    path = self._new_file(str(message.filename))
-                    part = path.with_name(path.name + _PART)
+                    path = self._new_file(name)
+                    part = path.with_name(path.name + PART)
                     file = part.open("xb")
                 except OSError as error:
                     reason = f"the video cannot be kept: {error.strerror or error}"
                 else:
-                    self._transfers[number] = _Transfer(client, message.source_component_uuid, size, path, part, file)
+                    self._transfers[number] = _Transfer(client, button, name, size, path, part, file)
             if reason is not None:
-                self._refusals.append(reason)
-                self._end_in_client(client, number, message.source_component_uuid, size)
+                self._refusals.append((name, reason))
+                self._end_in_client(client, number, button, size)
                 return
         self._quiet(client, number)
 
@@ -143,7 +146,7 @@ class Receiver:
                     transfer.file.close()
                     transfer.part.replace(transfer.path)
             except OSError as error:
-                self._refusals.append(f"the video cannot be kept: {error.strerror or error}")
+                self._refusals.append((transfer.name, f"the video cannot be kept: {error.strerror or error}"))
                 self._drop(number)
                 self._end_in_client(client, number, transfer.button, transfer.size)
                 return
@@ -158,7 +161,7 @@ class Receiver:
     def _disconnected(self, client: Any) -> None:
         with self._lock:
             for number in [number for number, one in self._transfers.items() if one.client == client.client_id]:
-                self._refusals.append(_LOST)
+                self._refusals.append((self._transfers[number].name, _LOST))
                 self._drop(number)
 
     def _drop(self, number: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
+import unicodedata
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 
 from scopemap.apps.browser.runs import BrowserRun, RunQueue
-from scopemap.apps.browser.uploads import Receiver
+from scopemap.apps.browser.uploads import PART, Receiver
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.input.decoding import read_decoded
 from scopemap.input.opening import VIDEO_ENDINGS
@@ -30,9 +31,11 @@ _MASKS = "masks"
 DEMONSTRATION = "demonstration"
 """Folder in FOLDER/scopemap that holds the clip of the demonstration."""
 
-_UPLOADED = re.compile(r"video_(\d+)\.[a-z0-9]+")
 _MARK = "provenance.json"
 _MOST_NAMED = 80
+_MOST_KEPT = 60
+"""Letters that are kept of a sent file's name: with what is added to them the file's system takes them."""
+_UNKNOWN_KIND = ".video"
 _VIDEOS = {*VIDEO_ENDINGS, ".dcm", ".bag"}
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 _MOST_LISTED = 200
@@ -78,7 +81,8 @@ class Workspace:
     @property
     def sent(self) -> list[Path]:
         """Videos that were sent to the page, the latest first."""
-        return [path for path in reversed(_inside(self.uploads)) if _UPLOADED.fullmatch(path.name)][:_MOST_LISTED]
+        found = [path for path in _inside(self.uploads) if path.suffix in {*_VIDEOS, _UNKNOWN_KIND}]
+        return sorted(found, key=lambda path: -path.stat().st_mtime)[:_MOST_LISTED]
 
     @property
     def finished(self) -> list[Path]:
@@ -116,13 +120,11 @@ class Workspace:
         return self.folder / name
 
     def new_upload(self, name: str) -> Path:
-        """Return a file for a video that is sent, named by us; its folder is made."""
-        self.uploads.mkdir(parents=True, exist_ok=True)
+        """Return a file for a video that is sent, with its own name made safe; its folder is made."""
         ending = Path(name).suffix.lower()
-        ending = ending if ending in _VIDEOS else ".video"
-        taken = [int(found[1]) for file in self.uploads.iterdir() if (found := _UPLOADED.match(file.name))]
-        number = max(taken, default=0) + 1
-        return self.uploads / f"video_{number:03d}{ending}"
+        if ending in _VIDEOS:
+            return _free_place(self.uploads, Path(name).stem, ending)
+        return _free_place(self.uploads, Path(name).name, _UNKNOWN_KIND)
 
     def masks_of(self, source: Path) -> Path:
         """Return the folder for masks of an input's inset pictures; the same each time, so that a run resumes."""
@@ -162,6 +164,20 @@ def _inside(folder: Path) -> list[Path]:
         return [path for path in sorted(folder.iterdir()) if not path.is_symlink()]
     except OSError:
         return []
+
+
+def _free_place(folder: Path, stem: str, ending: str) -> Path:
+    """Return a file in a folder, which is made: with the name that a person gave it, numbered where that is taken.
+
+    Of the name are kept: letters, digits, "_", "." and "-". With "." or "-" first it would be hidden, or an option.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    kept = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", stem)).lstrip(".-")[:_MOST_KEPT] or "video"
+    number, path = 1, folder / f"{kept}{ending}"
+    while path.exists() or path.with_name(path.name + PART).exists():
+        number += 1
+        path = folder / f"{kept}_{number}{ending}"
+    return path
 
 
 def made_and_word(folder: Path) -> str:
