@@ -106,7 +106,7 @@ def test_a_choice_makes_the_arguments_of_a_run() -> None:
         "realtime",
         "colonoscope",
         Path("/v/c d.yaml"),
-        0,
+        None,
         "none",
         12.5,
         "-50:",
@@ -123,23 +123,24 @@ def test_a_choice_makes_the_arguments_of_a_run() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "sentence"),
     [
-        {"scope": "--overwrite"},
-        {"preset": "x"},
-        {"stereo": "use:/etc/passwd"},
-        {"fov_deg": 1.0},
-        {"fov_deg": float("nan")},
-        {"fps": -1.0},
-        {"fps": float("nan")},
-        {"frames": "5"},
-        {"frames": "1:2 --overwrite"},
-        {"near_mm": 5.0},
-        {"near_mm": 50.0, "far_mm": 5.0},
+        ({"scope": "--overwrite"}, "is no kind of endoscope"),
+        ({"preset": "x"}, "from their lists"),
+        ({"stereo": "use:/etc/passwd"}, "from their lists"),
+        *(({"fov_deg": value}, "field of view, 5 to 170 degrees") for value in (0.0, 1.0, 171.0, float("nan"))),
+        *(({"fps": value}, "most frames per second") for value in (0.0, -1.0, float("nan"))),
+        ({"frames": "5"}, "frames are a slice"),
+        ({"frames": "1:2 --overwrite"}, "frames are a slice"),
+        ({"near_mm": 5.0}, "type both"),
+        ({"far_mm": float("nan")}, "type both"),
+        ({"near_mm": 0.0, "far_mm": 5.0}, "as numbers of mm"),
+        ({"near_mm": 5.0, "far_mm": float("nan")}, "as numbers of mm"),
+        ({"near_mm": 50.0, "far_mm": 5.0}, "must be nearer"),
     ],
 )
-def test_what_a_run_would_refuse_is_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(SettingsError):
+def test_what_a_run_would_refuse_is_refused(wrong: dict[str, object], sentence: str) -> None:
+    with pytest.raises(SettingsError, match=sentence):
         RunChoice(**wrong).checked()  # type: ignore[arg-type]
 
 

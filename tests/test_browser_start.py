@@ -102,13 +102,24 @@ def test_switches_make_the_command(opened: tuple[BrowserWindow, Workspace]) -> N
     assert f"--camera={workspace.folder / 'camera.yaml'}" in words(window)
     assert "good: motion, sharpness and texture" in words(window)
     press(window, "Camera", "by its field of view")
-    press(window, "Field of view, degrees", 100.0)
+    # Nothing looks like a measured value, and what is typed is checked.
+    assert element(window, "Field of view, degrees").value == ""
+    for typed in ("", "wide", "0", "700"):
+        press(window, "Field of view, degrees", typed)
+        assert "type the horizontal field of view, 5 to 170 degrees" in words(window)
+        assert element(window, "Reconstruct").disabled
+    press(window, "Field of view, degrees", "100")
     press(window, "Endoscope", "colonoscope")
     press(window, "Frames", "0:30")
-    press(window, "Nearest tissue, mm", 5.0)
-    assert "both be given" in words(window)
+    numbers = ("Most frames per second", "Nearest tissue, mm", "Farthest tissue, mm")
+    assert [element(window, label).value for label in numbers] == ["", "", ""]
+    press(window, "Most frames per second", "fast")
+    assert "type the most frames per second" in words(window)
+    press(window, "Most frames per second", " ")
+    press(window, "Nearest tissue, mm", "5")
+    assert "type both the nearest and the farthest" in words(window)
     assert element(window, "Reconstruct").disabled
-    press(window, "Farthest tissue, mm", 80.0)
+    press(window, "Farthest tissue, mm", "80,0")
     assert not element(window, "Reconstruct").disabled
     said = " ".join(words(window).split())
     assert "--scope=colonoscope --fov=100 --frames=0:30 --near-far=5:80" in said

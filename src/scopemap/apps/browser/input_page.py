@@ -12,9 +12,9 @@ import numpy as np
 
 from scopemap.apps.browser.forecast import VideoForecast
 from scopemap.apps.browser.looking import LeftEarlier, Look, look, measured_rates, time_in_words
-from scopemap.apps.browser.run_choice import LAYOUTS, LEAST_FOV_DEG, MOST_FOV_DEG, PRESETS, RunChoice, boxes_of
+from scopemap.apps.browser.run_choice import LAYOUTS, PRESETS, RunChoice, boxes_of
 from scopemap.apps.browser.runs import BrowserRun
-from scopemap.apps.browser.window import escaped, fenced
+from scopemap.apps.browser.window import escaped, fenced, typed_number
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.engine.errors import ScopemapError, SettingsError
 from scopemap.input.scopes import SCOPES
@@ -33,7 +33,6 @@ _PICTURE_PX = 240
 _PICTURES = 3
 _MOST_MEASURED = 5
 _MOST_FINDINGS = 8
-_USUAL_FOV_DEG = 70.0
 _SET_BELOW = {"scope", "stereo", "rate-high", "black", "one-colour", "not-tissue", "inset"}
 """Codes of findings that a switch of this page answers."""
 _WORDS = {"error": "Error", "warning": "Caution", "info": "Note"}
@@ -118,7 +117,7 @@ class InputPage:
         seen, rest = list[Callable[[], None]](), list[Callable[[], None]]()
         for add, is_advised in (
             (self._add_layout, self.choice.stereo != LAYOUTS[0]),
-            (self._add_rate, bool(self.choice.fps)),
+            (self._add_rate, self.choice.fps is not None),
             (self._add_frames, bool(self.choice.frames)),
         ):
             (seen if is_advised else rest).append(add)
@@ -141,17 +140,15 @@ class InputPage:
             files[self._window.names.of(file, "calibration")] = file
         shown = next((label for label, file in files.items() if file == self.choice.camera), _ESTIMATED)
         camera = self._window.gui.add_dropdown("Camera", (_ESTIMATED, _BY_FOV, *files), initial_value=shown)
-        fov = self._window.gui.add_number(
-            "Field of view, degrees", _USUAL_FOV_DEG, min=LEAST_FOV_DEG, max=MOST_FOV_DEG, step=0.1, visible=False
-        )
+        fov = self._window.gui.add_text("Field of view, degrees", "", visible=False, hint="Horizontal, such as 90.")
 
         def chosen(label: str) -> None:
             fov.visible = label == _BY_FOV
             file = None if label in (_ESTIMATED, _BY_FOV) else _of_list(files, label)
-            self._set({"camera": file, "fov_deg": float(fov.value) if fov.visible else 0.0})
+            self._set({"camera": file, "fov_deg": typed_number(fov.value) if fov.visible else None})
 
         self._window.on(camera, chosen)
-        self._window.on(fov, lambda value: self._set({"fov_deg": float(value)}) if fov.visible else None)
+        self._window.on(fov, lambda text: self._set({"fov_deg": typed_number(text)}) if fov.visible else None)
 
     def _add_boxes(self, label: str, boxes: tuple[tuple[int, int, int, int], ...]) -> None:
         are_set = set(boxes) <= set(self.choice.redact)
@@ -173,9 +170,8 @@ class InputPage:
         self._add_list("Two views in a picture", _LAYOUTS, "stereo")
 
     def _add_rate(self) -> None:
-        hint = "Leave out frames beyond this rate; 0: use all."
-        handle = self._window.gui.add_number("Most frames per second", self.choice.fps, min=0.0, step=0.1, hint=hint)
-        self._window.on(handle, lambda value: self._set({"fps": float(value)}))
+        hint = "Leave out frames beyond this rate, such as 12.5. Empty: use all."
+        self._add_number("Most frames per second", "fps", hint)
 
     def _add_frames(self) -> None:
         hint = "From the first to before the last, such as 50:900; with a step: ::2. Empty: all."
@@ -183,10 +179,15 @@ class InputPage:
         self._window.on(handle, lambda text: self._set({"frames": str(text).strip()}))
 
     def _add_range(self) -> None:
-        hint = "In the first frame, mm; both set the scale. 0: not known."
+        hint = "In the first frame, such as 5 and 80; both set the scale. Empty: not known."
         for label, name in (("Nearest tissue, mm", "near_mm"), ("Farthest tissue, mm", "far_mm")):
-            handle = self._window.gui.add_number(label, 0.0, min=0.0, step=0.1, hint=hint)
-            self._window.on(handle, lambda value, name=name: self._set({name: float(value)}))
+            self._add_number(label, name, hint)
+
+    def _add_number(self, label: str, name: str, hint: str) -> None:
+        """Add a field for a number that may be left empty: 0 would look like a measured one."""
+        advised = getattr(self.choice, name)
+        handle = self._window.gui.add_text(label, "" if advised is None else f"{advised:g}", hint=hint)
+        self._window.on(handle, lambda text: self._set({name: typed_number(text) if text.strip() else None}))
 
     def _set(self, changes: dict[str, Any]) -> None:
         self.choice = replace(self.choice, **changes)

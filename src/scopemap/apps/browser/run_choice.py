@@ -33,21 +33,21 @@ Box = tuple[int, int, int, int]
 class RunChoice:
     """Options of `scopemap run`; those at their defaults are left to it.
 
-    camera : calibration file. fov_deg, fps, near_mm, far_mm : 0: not given. redact : boxes of the input's pictures to
-    blacken, px. masks : folder of masks.
+    camera : calibration file. fov_deg, fps, near_mm, far_mm : None: not given; NaN: no number was typed. redact : boxes
+    of the input's pictures to blacken, px. masks : folder of masks.
     """
 
     preset: str = "default"
     scope: str = ""
     camera: Path | None = None
-    fov_deg: float = 0.0
+    fov_deg: float | None = None
     stereo: str = "auto"
-    fps: float = 0.0
+    fps: float | None = None
     frames: str = ""
     redact: tuple[Box, ...] = ()
     masks: Path | None = None
-    near_mm: float = 0.0
-    far_mm: float = 0.0
+    near_mm: float | None = None
+    far_mm: float | None = None
 
     def checked(self) -> RunChoice:
         """Return these; raises `SettingsError` in a sentence where a run would refuse them."""
@@ -55,15 +55,25 @@ class RunChoice:
             raise SettingsError(f"{self.scope} is no kind of endoscope")
         if self.preset not in PRESETS or self.stereo not in LAYOUTS:
             raise SettingsError("choose the preset and the two views from their lists")
-        if self.fov_deg and not LEAST_FOV_DEG <= self.fov_deg <= MOST_FOV_DEG:
-            raise SettingsError(f"the field of view must be {LEAST_FOV_DEG:g} to {MOST_FOV_DEG:g} degrees")
-        if not (self.fps >= 0 and self.near_mm >= 0 and self.far_mm >= 0):
-            raise SettingsError("rates and distances must be positive; 0: not given")
+        if self.fov_deg is not None and not LEAST_FOV_DEG <= self.fov_deg <= MOST_FOV_DEG:
+            limits = f"{LEAST_FOV_DEG:g} to {MOST_FOV_DEG:g} degrees"
+            raise SettingsError(f"type the horizontal field of view, {limits}, or choose another camera")
+        if self.fps is not None and not self.fps > 0:
+            raise SettingsError("type the most frames per second, such as 12.5, or leave it empty for all frames")
         if self.frames and not _FRAMES.fullmatch(self.frames):
             raise SettingsError("frames are a slice such as 50:900 or ::2, empty: all")
-        if (self.near_mm or self.far_mm) and not 0 < self.near_mm < self.far_mm:
-            raise SettingsError("the nearest tissue must be nearer than the farthest, and both be given")
+        if (self.near_mm, self.far_mm) != (None, None):
+            self._check_range()
         return self
+
+    def _check_range(self) -> None:
+        near_mm, far_mm = self.near_mm, self.far_mm
+        if near_mm is None or far_mm is None:
+            raise SettingsError("type both the nearest and the farthest tissue, mm, or leave both empty")
+        if not (near_mm > 0 and far_mm > 0):
+            raise SettingsError("type the nearest and the farthest tissue as numbers of mm, such as 5 and 80")
+        if near_mm >= far_mm:
+            raise SettingsError("the nearest tissue must be nearer than the farthest")
 
     def arguments(self) -> list[str]:
         """Return the arguments of the command, in a fixed order: the same choice resumes the same run."""
@@ -71,11 +81,11 @@ class RunChoice:
             "--preset": self.preset if self.preset != PRESETS[0] else "",
             "--scope": self.scope,
             "--camera": "" if self.camera is None else str(self.camera),
-            "--fov": f"{self.fov_deg:g}" if self.fov_deg else "",
+            "--fov": "" if self.fov_deg is None else f"{self.fov_deg:g}",
             "--stereo": self.stereo if self.stereo != LAYOUTS[0] else "",
-            "--fps": f"{self.fps:g}" if self.fps else "",
+            "--fps": "" if self.fps is None else f"{self.fps:g}",
             "--frames": self.frames,
-            "--near-far": f"{self.near_mm:g}:{self.far_mm:g}" if self.near_mm else "",
+            "--near-far": f"{self.near_mm:g}:{self.far_mm:g}" if self.near_mm is not None else "",
             "--set": "" if self.masks is None else f"mask.files={self.masks}",
         }
         # In one word: a value may begin with "-".
@@ -95,7 +105,7 @@ def suggested(found: Inspection, findings: Sequence[VideoFinding], *, whole: boo
     return RunChoice(
         scope=scope if scope in SCOPES else "",
         stereo="auto" if found.packed is None else found.packed.layout,
-        fps=float(rates[0]) if rates else 0.0,
+        fps=float(rates[0]) if rates else None,
         frames=_without_ends(found, findings, whole=whole),
         redact=boxes_of(found, [one for one in found.overlays if not one.in_field]),
     )
