@@ -75,6 +75,17 @@ def test_a_calibration_beside_the_video_is_taken(tmp_path: Path) -> None:
     found = looked(video)
     assert found.suggested.camera is None
     assert found.calibrations == (tmp_path / "camera.yaml", tmp_path / "other_camera.yaml")
+    assert found.refused == ()
+
+
+def test_a_file_named_like_a_camera_is_listed_where_it_holds_none(tmp_path: Path) -> None:
+    video = tmp_path / "colon.mp4"
+    video.write_bytes((DEMO / "colon.mp4").read_bytes())
+    (tmp_path / "notes.txt").write_text("patient 12")
+    (tmp_path / "camera.json").write_text("{}")
+    found = looked(video)
+    assert (found.calibrations, found.refused) == ((), (tmp_path / "camera.json",))
+    assert found.suggested.camera is None
 
 
 def test_of_a_long_video_a_part_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

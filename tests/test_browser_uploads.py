@@ -9,14 +9,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from window_without_browser import Client, element, settle, until, words
+from window_without_browser import Client, element, press, settle, until, words
 
+from scopemap.apps.browser import command
 from scopemap.apps.browser.input_page import InputPage
 from scopemap.apps.browser.start_page import StartPage
 from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.browser.workspace import Workspace
 
 LIMIT = 100_000
+CLIP = Path(command.__file__).parents[1] / "demo" / "clip"
 
 
 @pytest.fixture
@@ -45,7 +47,7 @@ def test_a_file_is_written_as_it_comes_under_its_safe_name(
     window, workspace, client = opened
     client.start(button(window), "../../Müller 1970.MP4", 10)
     client.part(button(window), 0, b"01234")
-    until(window, lambda: workspace.receiver(window.server).progress == 50)
+    until(window, lambda: workspace.receiver(window.server, "video").progress == 50)
     assert files(workspace) == ["Müller_1970.mp4.part"]
     assert workspace.sent == []
     client.part(button(window), 1, b"56789")
@@ -114,8 +116,61 @@ def test_what_came_in_part_goes_with_its_browser_and_with_the_window(
     other.close()
     until(window, lambda: files(workspace) == ["a.mp4.part"])
     until(window, lambda: "the connection to the page was lost" in words(window))
-    workspace.receiver(window.server).close()
+    workspace.receiver(window.server, "video").close()
     assert files(workspace) == []
+
+
+def send(client: Client, handle: Any, name: str, content: bytes, number: str) -> None:
+    client.start(handle, name, len(content), number)
+    client.part(handle, 0, content, number)
+
+
+def test_a_calibration_is_sent_and_chosen(opened: tuple[BrowserWindow, Workspace, Client]) -> None:
+    window, workspace, client = opened
+    for name in ("colon.mp4", "camera.yaml"):
+        shutil.copyfile(CLIP / name, workspace.folder / name)
+    (workspace.folder / "broken_camera.yaml").write_text("patient: 12")
+    window.show(StartPage(workspace))
+    settle(window)
+    press(window, "Video", "colon.mp4")
+    until(window, lambda: "in a terminal" in words(window))
+    page: Any = window._page
+    first = page.choice
+    assert first.camera == workspace.folder / "camera.yaml"
+    # One beside the video that cannot be read is a sentence at once, and the choice stays.
+    press(window, "Camera", "broken_camera.yaml")
+    assert "broken_camera.yaml cannot be used: it has no 3x3 camera matrix" in words(window)
+    assert (page.choice, element(window, "Camera").value) == (first, "camera.yaml")
+    handle = element(window, "Send a calibration")
+    send(client, handle, "my camera.yaml", b"patient: 12", "1")
+    until(window, lambda: "the calibration my_camera.yaml cannot be used" in words(window))
+    assert workspace.sent_calibrations == []
+    client.start(handle, "large.yaml", 2_000_000, "2")
+    until(window, lambda: "large.yaml was not taken: the calibration has 2.0 MB, at most 1.0 MB" in words(window))
+    assert page.choice == first
+    # Two of one name are told from each other, and the one that was sent is chosen.
+    send(client, handle, "camera.yaml", (CLIP / "camera.yaml").read_bytes(), "3")
+    until(window, lambda: page.choice != first)
+    sent = workspace.calibrations / "camera.yaml"
+    assert page.choice.arguments() == [f"--camera={sent}"]
+    assert element(window, "Camera").value == "camera.yaml (2)"
+    assert "--camera=camera.yaml" in words(window)
+    assert "was not taken" not in words(window)
+    press(window, "Camera", "estimated from the video")
+    assert page.choice.arguments() == []
+    # It is there for the next video, and never taken unasked.
+    window.show(InputPage(workspace, workspace.folder / "colon.mp4", lambda run: None, window.start))
+    settle(window)
+    until(window, lambda: "in a terminal" in words(window))
+    assert "camera.yaml (2)" in element(window, "Camera").options
+    assert element(window, "Camera").value == "camera.yaml"
+
+
+def test_folders_of_ours_are_no_interrupted_runs(tmp_path: Path) -> None:
+    with Workspace(tmp_path, keep_uploads=True) as workspace:
+        workspace.new_upload("a.mp4")
+        assert workspace.uploads.is_dir()
+        assert workspace.interrupted == []
 
 
 @pytest.mark.parametrize("keep", [True, False])
@@ -135,7 +190,7 @@ def test_uploads_go_with_the_session_unless_they_are_kept(tmp_path: Path, keep: 
         ("../../etc/passwd", "passwd.video"),
         ("-rf $(x).mkv", "rf_x_.mkv"),
         (".avi", "avi.video"),
-        ("", "video.video"),
+        ("", "file.video"),
         ("a\0b\n<i>.avi", "a_b_i_.avi"),
         ("clip.divx", "clip.divx.video"),
         ("\u624b" * 300 + ".mp4", "\u624b" * 60 + ".mp4"),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scopemap.apps.browser.camera_part import CameraPart
 from scopemap.apps.browser.forecast import VideoForecast
 from scopemap.apps.browser.looking import LeftEarlier, Look, look, measured_rates, time_in_words
 from scopemap.apps.browser.run_choice import LAYOUTS, PRESETS, RunChoice, boxes_of
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
 
 _UNKNOWN = "not known"
-_ESTIMATED = "estimated from the video"
-_BY_FOV = "by its field of view"
 _PRESETS = {"default: best quality": PRESETS[0], "realtime: about twice as fast": PRESETS[1]}
 _LAYOUTS = {"found by itself": LAYOUTS[0], "one view": LAYOUTS[1], "left and right": LAYOUTS[2], "above": LAYOUTS[3]}
 _NEXT_LINE = " \\\n  "
@@ -46,6 +45,7 @@ class InputPage:
     ) -> None:
         self._workspace, self._source, self._started, self._back = workspace, source, started, back
         self._looked: Look | None = None
+        self._camera: CameraPart | None = None
         self._done, self._all, self._left = 0, 1, False
         self._forecast = VideoForecast(source, workspace.logs / "forecast.log")
         self.choice = RunChoice()
@@ -67,6 +67,8 @@ class InputPage:
             self._bar.value = min(100.0, 100 * self._done / self._all)
         elif self._forecast.poll():
             self._show_choice()
+        if self._camera is not None:
+            self._camera.tick()
 
     def close(self) -> None:
         """End the look, and what is measured."""
@@ -105,7 +107,7 @@ class InputPage:
     def _add_switches(self, found: Look) -> None:
         """Add what the findings advise, and what is usually asked, in sight; the rest in a folder."""
         self._add_list("Endoscope", {_UNKNOWN: "", **{scope: scope for scope in SCOPES}}, "scope")
-        self._add_camera(found)
+        self._camera = CameraPart(self._window, self._workspace, found, self.choice.camera, self._set)
         self._add_list("Quality", _PRESETS, "preset")
         overlays = found.spread.overlays
         for inside, label in ((False, "Blacken burned-in text"), (True, "Blacken what rests in the field of view")):
@@ -133,22 +135,6 @@ class InputPage:
         handle = self._window.gui.add_dropdown(label, tuple(values), initial_value=shown)
         # What a browser sends need not be of the list.
         self._window.on(handle, lambda chosen: self._set({name: _of_list(values, chosen)}))
-
-    def _add_camera(self, found: Look) -> None:
-        files: dict[str, Path] = {}
-        for file in found.calibrations:
-            files[self._window.names.of(file, "calibration")] = file
-        shown = next((label for label, file in files.items() if file == self.choice.camera), _ESTIMATED)
-        camera = self._window.gui.add_dropdown("Camera", (_ESTIMATED, _BY_FOV, *files), initial_value=shown)
-        fov = self._window.gui.add_text("Field of view, degrees", "", visible=False, hint="Horizontal, such as 90.")
-
-        def chosen(label: str) -> None:
-            fov.visible = label == _BY_FOV
-            file = None if label in (_ESTIMATED, _BY_FOV) else _of_list(files, label)
-            self._set({"camera": file, "fov_deg": typed_number(fov.value) if fov.visible else None})
-
-        self._window.on(camera, chosen)
-        self._window.on(fov, lambda text: self._set({"fov_deg": typed_number(text)}) if fov.visible else None)
 
     def _add_boxes(self, label: str, boxes: tuple[tuple[int, int, int, int], ...]) -> None:
         are_set = set(boxes) <= set(self.choice.redact)

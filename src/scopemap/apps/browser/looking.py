@@ -33,7 +33,7 @@ _OF_NEIGHBOURS = {
 _USUAL_FRAMES_PER_S = {"default": (4.0, 14.0), "realtime": (9.0, 21.0)}
 """Of the whole command on two idle cores, start-up included (README)."""
 _LEAST_S = 10.0
-_CALIBRATIONS = {".yaml", ".yml", ".json", ".txt"}
+_CALIBRATIONS = {".yaml", ".yml", ".json", ".txt", ".xml", ".mat", ".npz", ".ini", ".cal", ".cfg"}
 _NAME_OF_CAMERA = re.compile("cam|calib|intrin")
 """What the name of a file holds that is taken for the camera unasked."""
 _MOST_FILES = 200
@@ -53,7 +53,7 @@ class Look:
 
     spread : frames over all of it, or its beginning. together : frames that follow each other; the same where all
     were read. count : frames of the input, None: not known. whole : whether its end was seen. calibrations : files
-    beside it that hold a camera for pictures of this size.
+    beside it that hold a camera for pictures of this size. refused : those that are named like a camera, and hold none.
     """
 
     spread: Inspection
@@ -61,6 +61,7 @@ class Look:
     count: int | None
     whole: bool
     calibrations: tuple[Path, ...]
+    refused: tuple[Path, ...]
 
     @property
     def findings(self) -> list[VideoFinding]:
@@ -147,25 +148,32 @@ def look(path: Path, listener: Callable[[int, int], None]) -> Look:
         middle = slice(stop // 2, stop // 2 + _TOGETHER)
         together = inspect(path, frames=middle, listener=lambda done, _: listener(_SPREAD + done, every))
         whole = stop == count
-    return Look(spread, together, count, whole, tuple(_calibrations(path, spread.size)))
+    return Look(spread, together, count, whole, *_calibrations(path, spread.size))
 
 
-def _calibrations(path: Path, size: tuple[int, int]) -> Iterable[Path]:
-    """Yield files beside an input that hold a camera for pictures of a size, px."""
-    from scopemap.input.camera_files.reading import read_calibration
-
+def _calibrations(path: Path, size: tuple[int, int]) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Return files beside an input that hold a camera for pictures of a size, px, and those that are named like one."""
     files = [file for file in sorted(path.parent.iterdir()) if file.suffix.lower() in _CALIBRATIONS]
-    found = 0
+    found, refused = list[Path](), list[Path]()
     for file in files[:_MOST_FILES]:
         if file.is_symlink() or not file.is_file() or file.stat().st_size > _MOST_BYTES:
             continue
-        try:
-            read_calibration(file, size)
-        except (OSError, ScopemapError):
-            continue
-        yield file
-        if (found := found + 1) == _MOST_CALIBRATIONS:
-            return
+        if holds_camera(file, size):
+            found.append(file)
+        elif _NAME_OF_CAMERA.search(file.stem.lower()):
+            refused.append(file)
+    return tuple(found[:_MOST_CALIBRATIONS]), tuple(refused[:_MOST_CALIBRATIONS])
+
+
+def holds_camera(file: Path, size: tuple[int, int]) -> bool:
+    """Return whether a file is a calibration for pictures of a size, px."""
+    from scopemap.input.camera_files.reading import read_calibration
+
+    try:
+        read_calibration(file, size)
+    except (OSError, ScopemapError):
+        return False
+    return True
 
 
 def time_in_words(frames: int | None, preset: str, measured: Iterable[float]) -> str:

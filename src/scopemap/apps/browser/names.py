@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 _PLACES = ("the folder", "folder")
@@ -42,9 +43,20 @@ class Names:
                 self._instead.setdefault(name, alias)
         return self._of[key]
 
+    def labelled(self, paths: Iterable[Path], kind: str) -> dict[str, Path]:
+        """Return paths by what is shown of them; those of one name are numbered."""
+        out: dict[str, Path] = {}
+        for path in paths:
+            name = label = self.of(path, kind)
+            number = 1
+            while label in out:
+                label = f"{name} ({(number := number + 1)})"
+            out[label] = path
+        return out
+
     def hidden(self, text: str) -> str:
         """Return a text without temporary folders; names that are known here are hidden in it, if they are to be."""
-        for folder in self._left_out:
+        for folder in sorted(self._left_out, key=len, reverse=True):  # one may be inside of another
             text = text.replace(folder, "")
         if not (self.anonymous and self._instead):
             return text

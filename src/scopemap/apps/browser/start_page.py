@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
 from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -49,7 +48,8 @@ class StartPage:
         window.names.hide_folder(self._workspace.folder)
         if not self._workspace.keeps_uploads:
             window.names.leave_out(self._workspace.uploads)
-        self._receiver = self._workspace.receiver(window.server)
+            window.names.leave_out(self._workspace.calibrations)
+        self._receiver = self._workspace.receiver(window.server, "video")
         # What came before this page was opened is in the list.
         while self._receiver.take() is not None:
             pass
@@ -88,7 +88,7 @@ class StartPage:
 
     def _add_videos(self) -> None:
         gui, workspace = self._window.gui, self._workspace
-        videos = self._labelled([*workspace.videos, *workspace.sent], "video")
+        videos = self._window.names.labelled([*workspace.videos, *workspace.sent], "video")
         with gui.add_folder("A video of this folder"):
             if videos:
                 listed = gui.add_dropdown("Video", (_CHOOSE, *videos))
@@ -159,8 +159,10 @@ class StartPage:
         return f"**{name}** {'is stopping' if run.stopping else 'runs'}: {is_at}"
 
     def _add_results(self, finished: list[Path]) -> None:
-        gui, labelled = self._window.gui, self._labelled(finished, "result")
-        results = {f"{label}, {made_and_word(path)}": path for label, path in labelled.items()}
+        gui, names = self._window.gui, self._window.names
+        results = {
+            f"{label}, {made_and_word(path)}": path for label, path in names.labelled(finished, "result").items()
+        }
         if not results:
             return
         with gui.add_folder("Your results"):
@@ -177,17 +179,6 @@ class StartPage:
                 second = gui.add_dropdown("Compare with", tuple(results), initial_value=list(results)[1])
                 compare = gui.add_button("Compare the two", color="gray")
                 self._window.on(compare, lambda: self._compare(results, first.value, second.value))
-
-    def _labelled(self, paths: Iterable[Path], kind: str) -> dict[str, Path]:
-        """Return paths by what is shown of them; those of one name are numbered."""
-        out: dict[str, Path] = {}
-        for path in paths:
-            name = label = self._window.names.of(path, kind)
-            number = 1
-            while label in out:
-                label = f"{name} ({(number := number + 1)})"
-            out[label] = path
-        return out
 
     def _demonstrate(self) -> None:
         clip = self._workspace.results / DEMONSTRATION

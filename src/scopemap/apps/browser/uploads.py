@@ -1,4 +1,4 @@
-"""Videos that are sent to the page: written to disk part by part as they come, limited, under their names made safe.
+"""Files that are sent to the page: written to disk part by part as they come, limited, under their names made safe.
 
 viser's own handlers keep a whole file in memory. Its client sends all parts without waiting, shows a notification of
 its own, and takes a file for sent when as many bytes as it has were acknowledged.
@@ -21,7 +21,7 @@ PART = ".part"
 _MOST_AT_ONCE = 4
 _KEPT_FREE_BYTES = 500_000_000
 _QUIET_EVERY_S = 0.5
-_LOST = "the connection to the page was lost while the video was sent: send it again"
+_LOST = "the connection to the page was lost while it was sent: send it again"
 
 
 @dataclass
@@ -41,17 +41,21 @@ class _Transfer:
 
 
 class Receiver:
-    """Takes files that are sent by the page's button, in place of viser's handlers.
+    """Takes files of a kind that are sent by the page's button, in place of viser's handlers.
 
-    server : viser's. new_file : returns where a file of a name goes; its folder exists. most_bytes : of one file.
+    server : viser's. kind : in a word. new_file : returns where a file of a name goes; its folder exists.
+    most_bytes : of one file. advice : what to do with a larger one.
     What comes of them is asked for: `take` and `take_refusal`. Called in viser's thread, which therefore waits for the
     disk: no more than a few parts are ever in memory.
     """
 
-    def __init__(self, server: Any, new_file: Callable[[str], Path], most_bytes: int) -> None:
+    def __init__(
+        self, server: Any, kind: str, new_file: Callable[[str], Path], most_bytes: int, advice: str = ""
+    ) -> None:
         from viser import _messages as messages
 
-        self._server, self._new_file, self._most_bytes, self._messages = server, new_file, most_bytes, messages
+        self._server, self._messages, self._kind = server, messages, kind
+        self._new_file, self._most_bytes, self._advice = new_file, most_bytes, advice
         self._transfers: dict[str, _Transfer] = {}
         self._buttons: set[str] = set()
         self._arrived: deque[Path] = deque()
@@ -62,9 +66,9 @@ class Receiver:
         # Not the server's own: it tells nothing of clients that never sent where they look from.
         server._websock_server.on_client_disconnect(self._disconnected)
 
-    def button(self, gui: Any, label: str, kinds: str) -> Any:
-        """Return a new button that sends a file; kinds : of files that the browser offers, as in HTML's `accept`."""
-        handle = gui.add_upload_button(label, mime_type=kinds)
+    def button(self, gui: Any, label: str, offered: str = "*/*") -> Any:
+        """Return a new button that sends a file; offered : which files the browser offers, as in HTML's `accept`."""
+        handle = gui.add_upload_button(label, mime_type=offered)
         self._buttons = {handle._impl.uuid}
         return handle
 
@@ -94,7 +98,7 @@ class Receiver:
         if message.source_component_uuid not in self._buttons:
             return
         size, number, button = int(message.size_bytes), str(message.transfer_uuid), message.source_component_uuid
-        name = Path(str(message.filename)).name or "video"
+        name = Path(str(message.filename)).name or self._kind
         with self._lock:
             if (reason := self._reason(size)) is None and number not in self._transfers:
                 try:
@@ -102,7 +106,7 @@ class Receiver:
                     part = path.with_name(path.name + PART)
                     file = part.open("xb")
                 except OSError as error:
-                    reason = f"the video cannot be kept: {error.strerror or error}"
+                    reason = f"the {self._kind} cannot be kept: {error.strerror or error}"
                 else:
                     self._transfers[number] = _Transfer(client, button, name, size, path, part, file)
             if reason is not None:
@@ -116,16 +120,17 @@ class Receiver:
         if size <= 0:
             return "the file that was sent is empty"
         if size > self._most_bytes:
-            most = f"the video has {_in_words(size)}, at most {_in_words(self._most_bytes)} are taken"
-            return f"{most}: put it into the folder of scopemap app, or start that with --upload-limit GB"
+            most = _in_words(self._most_bytes)
+            return f"the {self._kind} has {_in_words(size)}, at most {most} are taken{self._advice}"
         if len(self._transfers) >= _MOST_AT_ONCE:
-            return f"{_MOST_AT_ONCE} videos are being sent: wait for one of them"
+            return f"{_MOST_AT_ONCE} files are being sent: wait for one of them"
         coming = sum(one.size - one.received for one in self._transfers.values())
         # Its folder may not exist before it has a name.
         folder = self._new_file("").parent
         free = shutil.disk_usage(folder).free - coming
         if size + _KEPT_FREE_BYTES > free:
-            return f"the video has {_in_words(size)}, and the disk has {_in_words(max(free, 0))} left: make room first"
+            left = _in_words(max(free, 0))
+            return f"the {self._kind} has {_in_words(size)}, and the disk has {left} left: make room first"
         return None
 
     def _take_part(self, client: int, message: Any) -> None:
@@ -146,7 +151,7 @@ class Receiver:
                     transfer.file.close()
                     transfer.part.replace(transfer.path)
             except OSError as error:
-                self._refusals.append((transfer.name, f"the video cannot be kept: {error.strerror or error}"))
+                self._refusals.append((transfer.name, f"the {self._kind} cannot be kept: {error.strerror or error}"))
                 self._drop(number)
                 self._end_in_client(client, number, transfer.button, transfer.size)
                 return

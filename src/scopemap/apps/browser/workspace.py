@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -28,9 +28,14 @@ from scopemap.result.wording import LEVEL_WORDS
 _RESULTS = "scopemap"
 _UPLOADS = "uploads"
 _MASKS = "masks"
+_CALIBRATIONS = "calibrations"
+_MOST_CALIBRATION_BYTES = 1_000_000
+_LARGER = ": put it into the folder of scopemap app, or start that with --upload-limit GB"
 DEMONSTRATION = "demonstration"
 """Folder in FOLDER/scopemap that holds the clip of the demonstration."""
 
+_OURS = (_UPLOADS, _MASKS, DEMONSTRATION)
+"""Folders in FOLDER/scopemap that are no results."""
 _MARK = "provenance.json"
 _MOST_NAMED = 80
 _MOST_KEPT = 60
@@ -52,7 +57,7 @@ class Workspace:
     """
 
     def __init__(self, folder: Path, *, keep_uploads: bool = False, most_bytes: int = 4_000_000_000) -> None:
-        self._receiver: Receiver | None = None
+        self._receivers: dict[str, Receiver] = {}
         # Absolute: a name that begins with "-" would be an option of the run's command.
         self.folder, self.most_bytes = folder.absolute(), most_bytes
         self.results = self.folder / _RESULTS
@@ -68,8 +73,8 @@ class Workspace:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.runs.close()
-        if self._receiver is not None:
-            self._receiver.close()
+        for receiver in self._receivers.values():
+            receiver.close()
         shutil.rmtree(self._session, ignore_errors=True)
 
     @property
@@ -94,18 +99,23 @@ class Workspace:
     def interrupted(self) -> list[Path]:
         """Folders in FOLDER/scopemap of killed runs, which no run of this session writes to or has kept."""
         writing = {run.out for run in self.runs.runs if run.status in ("waiting", "running", "stopped")}
-        return [path for path in _inside(self.results) if path not in writing and _is_left(path)][:_MOST_LISTED]
+        found = [path for path in _inside(self.results) if path not in writing and path.name not in _OURS]
+        return [path for path in found if _is_left(path)][:_MOST_LISTED]
 
     @property
     def logs(self) -> Path:
         """Folder for what processes print; it goes with the session."""
         return self._session / "logs"
 
-    def receiver(self, server: Any) -> Receiver:
-        """Return what takes videos that are sent to the page of viser's server."""
-        if self._receiver is None:
-            self._receiver = Receiver(server, self.new_upload, self.most_bytes)
-        return self._receiver
+    def receiver(self, server: Any, kind: Literal["video", "calibration"]) -> Receiver:
+        """Return what takes files of a kind that are sent to the page of viser's server."""
+        if kind not in self._receivers:
+            self._receivers[kind] = (
+                Receiver(server, kind, self.new_upload, self.most_bytes, _LARGER)
+                if kind == "video"
+                else Receiver(server, kind, self.new_calibration, _MOST_CALIBRATION_BYTES)
+            )
+        return self._receivers[kind]
 
     def inside(self, name: str) -> Path:
         """Return the path of a name in the folder; raises `InputError` where it leads out of it, or to nothing."""
@@ -125,6 +135,22 @@ class Workspace:
         if ending in _VIDEOS:
             return _free_place(self.uploads, Path(name).stem, ending)
         return _free_place(self.uploads, Path(name).name, _UNKNOWN_KIND)
+
+    @property
+    def calibrations(self) -> Path:
+        """Folder of calibrations that were sent; not that of the videos: what is beside one is taken unasked."""
+        return self.uploads / _CALIBRATIONS
+
+    @property
+    def sent_calibrations(self) -> list[Path]:
+        """Calibrations that were sent to the page, by name."""
+        return [path for path in _inside(self.calibrations) if path.suffix != PART][:_MOST_LISTED]
+
+    def new_calibration(self, name: str) -> Path:
+        """Return a file for a calibration that is sent, with its own name made safe; its folder is made."""
+        ending = Path(name).suffix.lower()
+        is_plain = re.fullmatch(r"\.[a-z0-9]+", ending) and ending != PART
+        return _free_place(self.calibrations, Path(name).stem, ending if is_plain else ".txt")
 
     def masks_of(self, source: Path) -> Path:
         """Return the folder for masks of an input's inset pictures; the same each time, so that a run resumes."""
@@ -146,7 +172,7 @@ class Workspace:
     @staticmethod
     def _stem(source: Path) -> str:
         stem = re.sub(r"[^\w.-]+", "_", source.name if source.is_dir() else source.stem).strip(".") or "video"
-        return f"{stem}_" if stem in (_UPLOADS, _MASKS, DEMONSTRATION) else stem
+        return f"{stem}_" if stem in _OURS else stem
 
     def reconstruct(self, source: Path, arguments: Sequence[str]) -> BrowserRun:
         """Put a run of an input at the end of the queue, and return it; the same one that was stopped goes on."""
@@ -172,7 +198,7 @@ def _free_place(folder: Path, stem: str, ending: str) -> Path:
     Of the name are kept: letters, digits, "_", "." and "-". With "." or "-" first it would be hidden, or an option.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    kept = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", stem)).lstrip(".-")[:_MOST_KEPT] or "video"
+    kept = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", stem)).lstrip(".-")[:_MOST_KEPT] or "file"
     number, path = 1, folder / f"{kept}{ending}"
     while path.exists() or path.with_name(path.name + PART).exists():
         number += 1
