@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -128,6 +129,52 @@ def test_switches_make_the_command(opened: tuple[BrowserWindow, Workspace]) -> N
     assert "--fov=100" in words(window)
     page: Any = window._page
     assert page.choice.arguments() == ["--scope=colonoscope", "--fov=100", "--frames=0:30", "--near-far=5:80"]
+
+
+def test_boxes_to_blacken_are_drawn_on_the_picture(opened: tuple[BrowserWindow, Workspace]) -> None:
+    window, workspace = opened
+    shutil.copyfile(CLIP, workspace.folder / "colon.mp4")
+    window.show(InputPage(workspace, workspace.folder / "colon.mp4", lambda run: None, window.start))
+    until(window, lambda: "in a terminal" in words(window))
+    page: Any = window._page
+    width, height = page._looked.spread.size
+
+    def click(x: float, y: float) -> None:
+        """Click on a place of the picture, as shares of its size, from where a browser looks."""
+        start = np.array([0.1, 0.2, -0.5])
+        place = np.array([x - 0.5, (y - 0.5) * height / width, 1.0])
+        event = SimpleNamespace(ray_origin=tuple(start), ray_direction=tuple((place - start) / 3))
+        for one in list(window.scene._scene_pointer_cb):
+            one.callback(event)
+        settle(window)
+
+    click(0.1, 0.1)  # nothing is drawn yet
+    press(window, "Draw boxes to blacken", True)
+    assert "Click on a corner of the box" in words(window)
+    for place in ((0.5, 0.25), (0.25, 0.125)):
+        click(*place)
+    x, y, w, h = page.choice.redact[0]
+    assert page.choice.redact == ((x, y, w, h),)
+    np.testing.assert_allclose([x / width, y / height], [0.25, 0.125], atol=1 / height)
+    np.testing.assert_allclose([(x + w) / width, (y + h) / height], [0.5, 0.25], atol=2 / height)
+    assert f"--redact={x},{y},{w},{h}" in words(window)
+    shown = window.scene._handle_from_node_name["/page/to_blacken"].image
+    rows, columns = shown.shape[:2]
+    assert shown[int(0.13 * rows) : int(0.25 * rows), int(0.26 * columns) : int(0.5 * columns)].max() == 0
+    # Beside the picture is on its rim, and no box is larger than the picture.
+    for place in ((0.9, 0.9), (1.5, 1.5)):
+        click(*place)
+    assert len(page.choice.redact) == 2
+    page.choice.checked()
+    click(0.5, 0.5)
+    click(0.5, 0.9)
+    assert "make no box" in words(window)
+    press(window, "Take back the last box")
+    assert page.choice.redact == ((x, y, w, h),)
+    press(window, "Draw boxes to blacken", False)
+    assert "/page/to_blacken" not in window.scene._handle_from_node_name
+    assert not window.scene._scene_pointer_cb
+    assert page.choice.redact == ((x, y, w, h),)
 
 
 def test_a_run_that_dies_is_told_and_goes_on_when_it_is_asked_again(opened: tuple[BrowserWindow, Workspace]) -> None:

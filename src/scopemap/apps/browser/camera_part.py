@@ -45,7 +45,7 @@ class CameraPart:
         self._camera = window.on(camera, self._choose)
         self._fov = gui.add_text("Field of view, degrees", "", visible=False, hint="Horizontal, such as 90.")
         window.on(self._fov, lambda text: self._show_fov() if self._fov.visible else None)
-        self._receiver.button(gui, "Send a calibration")
+        self._receiver.button(gui, "Send a calibration").color = "gray"
 
     def tick(self) -> None:
         """Choose a calibration that has come, or say what is wrong with it."""

@@ -13,7 +13,8 @@ import numpy as np
 from scopemap.apps.browser.camera_part import CameraPart
 from scopemap.apps.browser.forecast import VideoForecast
 from scopemap.apps.browser.looking import LeftEarlier, Look, look, measured_rates, time_in_words
-from scopemap.apps.browser.run_choice import LAYOUTS, PRESETS, RunChoice, boxes_of
+from scopemap.apps.browser.redact_part import RedactPart
+from scopemap.apps.browser.run_choice import LAYOUTS, PRESETS, Box, RunChoice, boxes_of
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.window import escaped, fenced, typed_number
 from scopemap.apps.browser.workspace import Workspace
@@ -46,6 +47,8 @@ class InputPage:
         self._workspace, self._source, self._started, self._back = workspace, source, started, back
         self._looked: Look | None = None
         self._camera: CameraPart | None = None
+        self._drawing: RedactPart | None = None
+        self._drawn: tuple[Box, ...] = ()
         self._done, self._all, self._left = 0, 1, False
         self._forecast = VideoForecast(source, workspace.logs / "forecast.log")
         self.choice = RunChoice()
@@ -74,6 +77,8 @@ class InputPage:
         """End the look, and what is measured."""
         self._left = True
         self._forecast.close()
+        if self._drawing is not None:
+            self._drawing.close()
 
     def _heard(self, done: int, all_: int) -> None:
         if self._left:
@@ -114,6 +119,7 @@ class InputPage:
             boxes = boxes_of(found.spread, [one for one in overlays if one.in_field is inside])
             if boxes:
                 self._add_boxes(f"{label} ({len(boxes)})", boxes)
+        self._drawing = RedactPart(self._window, found.spread, self._set_drawn)
         if found.spread.insets:
             self._add_mask()
         seen, rest = list[Callable[[], None]](), list[Callable[[], None]]()
@@ -145,6 +151,12 @@ class InputPage:
             self._set({"redact": tuple(sorted([*rest, *(boxes if is_on else ())]))})
 
         self._window.on(handle, changed)
+
+    def _set_drawn(self, drawn: tuple[Box, ...]) -> None:
+        """Blacken boxes that were drawn by hand in place of those so far."""
+        rest = set(self.choice.redact) - set(self._drawn)
+        self._drawn = drawn
+        self._set({"redact": tuple(sorted(rest | set(drawn)))})
 
     def _add_mask(self) -> None:
         folder = self._workspace.masks_of(self._source)
