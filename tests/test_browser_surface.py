@@ -86,7 +86,7 @@ def test_a_texture_is_shown_as_it_is_and_darker_in_relief(tmp_path: Path) -> Non
     before, after = (
         srgb_picture(tone_mapped(2.0 * LINEAR[one[inside][None]])).astype(int) for one in (picture, relief)
     )
-    assert np.abs(after - 0.6 * before).max() <= 8
+    assert np.abs(after - 0.6 * before).max() <= 15  # a JPEG of 64 px
 
 
 def test_what_few_frames_saw_is_pale_in_colours_and_in_the_texture(tmp_path: Path) -> None:
