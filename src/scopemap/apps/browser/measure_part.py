@@ -21,7 +21,9 @@ from scopemap.report.measured_by_hand import sizes_by
 Mode = Literal["Look", "Distance", "Area", "Lesion"]
 _CHOOSE = "Choose what to measure."
 _UNKNOWN = "Sizes are unknown. Choose **Distance** and click on both ends of something whose length you know."
-_ELSEWHERE = "Your reference is on the surface of another part of the video: go back there, or set one here."
+_ELSEWHERE = (
+    "Your reference is on the surface of another part of the video: go back there, or set one here, which replaces it."
+)
 _FEWEST = 3
 _PICKED = "/page/picked"
 _REFERRED = "/page/reference"

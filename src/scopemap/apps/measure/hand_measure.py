@@ -128,7 +128,7 @@ def kept_measures(folder: Path) -> list[HandMeasure]:
 
 
 def add_measurement(folder: Path, one: HandMeasure) -> None:
-    """Put a measurement to those kept in a result's folder, once; a reference replaces the one of the same surface.
+    """Put a measurement to those kept in a result's folder, once; a result, and each submap, has one reference.
 
     Raises `InputError` where they cannot be written.
     """
@@ -146,7 +146,7 @@ def remove_measurement(folder: Path, gone: HandMeasure) -> None:
 
 
 def remove_reference(folder: Path, of: str) -> None:
-    """Remove the reference of a surface, "." or "maps/1", where one is kept in a result's folder."""
+    """Remove the reference of a result, ".", or of a submap, "maps/1", where one is kept in a result's folder."""
     kept = read_measurements(folder)
     if len(left := _without_reference(kept, of)) < len(kept):
         _write(folder, left)

@@ -186,10 +186,7 @@ def run(
     looked: Literal["", "app", "window"] = "window" if watched else "app" if in_app else ""
     count, adjusts = sequence.used_count, resolved.mapping.global_adjustment
     with _window(out) if in_app else nullcontext():
-        with _shown(out, count, adjusts, quiet or as_json, looked) as (
-            shown,
-            interruption,
-        ):
+        with _shown(out, count, adjusts, quiet or as_json, looked) as (shown, interruption):
             observers = (*shown.observers, lambda step: finish)
             try:
                 result = reconstruct_with_report(
