@@ -145,6 +145,20 @@ def test_a_camera_at_rest_stays_and_every_frame_has_its_surface(run: Path, pushe
         assert np.median(np.abs(vertices[:, 2] - truth_mm)) < 0.05
 
 
+@pytest.mark.parametrize(("stated", "stays"), [(None, True), (False, False)])
+def test_the_camera_rests_where_the_data_set_states_it(
+    pushed: Path, tmp_path: Path, stated: bool | None, stays: bool
+) -> None:
+    sequence = open_sequence(pushed)
+    sequence.source.camera_at_rest = True
+    settings = {"depth.backend": f"files:{pushed}", "tracking.camera_at_rest": stated, "fusion.enabled": False}
+    found = reconstruct(sequence, Config.load(settings=settings), out=tmp_path / "run")
+    codes = {notice["code"] for notice in found.provenance["notices"]}
+    assert ("camera-at-rest-stated" in codes) is stays
+    assert (tmp_path / "run" / "surfaces" / "000009.ply").is_file() is stays
+    assert found.config.tracking.camera_at_rest is stays
+
+
 def test_depth_of_a_camera_at_rest_leaves_no_room_for_an_adjustment(pushed: Path) -> None:
     def largest_mm(settings: dict[str, object]) -> float:
         config = Config.load(settings=settings)

@@ -135,6 +135,8 @@ def test_poses_that_start_at_the_identity_are_camera_to_world_and_may_be_missing
     assert sequence.source.truth(2).depth_mm[30, 30] == 62
     assert any("as they are" in str(note) for note in sequence.notes)
     assert not any("at rest" in str(note) for note in sequence.notes)
+    assert not sequence.source.camera_at_rest
+    assert open_sequence(write_endonerf(tmp_path / "still")).source.camera_at_rest
     rows[:, 3] = np.inf
     np.save(sequence.path / "pose_bounds.npy", rows)
     assert any("no finite pose" in warning for warning in open_sequence(sequence.path).warnings)

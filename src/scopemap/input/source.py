@@ -86,6 +86,7 @@ class Source:
     depth_scale_mm : mm per unit of depth files by the calibration beside the frames, or None.
     depth_sensor : the camera that took the depth files beside the frames, None where they show what the images show.
     frame_limit_s : longest time that a frame may take to read, s, and a second for each that is passed over; None: any.
+    camera_at_rest : whether the data set states that the camera does not move.
     masks : folder of the data set's own masks of what is no tissue, as `MaskFiles` reads them, or None.
     notes : what had to be assumed.
     warnings : what was found wrong so far; grows while frames are read.
@@ -109,6 +110,7 @@ class Source:
     quality: TruthQuality = "registered"
     depth_scale_mm: float | None = None
     depth_sensor: DepthSensor | None = None
+    camera_at_rest = False
     masks: Path | None = None
     warnings: Kept[list[str | Notice]]
     left_out: Kept[dict[int, SkippedFrame]]

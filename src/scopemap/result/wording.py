@@ -79,10 +79,10 @@ WORDINGS: dict[str, Wording] = {
         "Check the calibration.",
     ),
     "camera-at-rest": Wording(
-        "The data set states that the camera is at rest while the tissue moves: the estimated path means little.",
+        "The data set states that the camera is at rest while the tissue moves: an estimated path means little.",
     ),
     "camera-at-rest-stated": Wording(
-        "You stated that the camera is at rest: each frame has its own surface, wrong if the camera moved."
+        "The camera is stated to be at rest: each frame has its own surface, wrong if the camera moved."
     ),
     "masks-missing": Wording(
         "{missing} of {frames} frames have no mask in {folder}: instruments may be part of the surface.",

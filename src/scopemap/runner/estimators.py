@@ -55,7 +55,7 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         networks.device,
         None if folder is None else _files_of(sequence),
         calibrated=sequence.calibrated,
-        averaged=config.tracking.camera_at_rest,  # no parallax corrects its shape
+        averaged=bool(config.tracking.camera_at_rest),  # no parallax corrects its shape
         pair=sequence.pair,
     )
     corner_flow = own.flow or create_flow(networks.keyframe_flow, networks.device)

@@ -110,7 +110,7 @@ def _reconstruct(
     tracker: FrameTracker | None,
 ) -> Result:
     clock = Clock()
-    config = _with_selection(config, sequence)
+    config = _of_camera(_with_selection(config, sequence), sequence, tracker)
     plan = memory_plan(config, sequence)
     if out is not None:
         refuse_own_input(out, sequence, config)
@@ -262,3 +262,16 @@ def _with_selection(config: Config, sequence: Sequence) -> Config:
         return config
     chosen = config.input.model_copy(update={"frames": selection_text(sequence.selection)})
     return config.model_copy(update={"input": chosen})
+
+
+def _of_camera(config: Config, sequence: Sequence, tracker: FrameTracker | None) -> Config:
+    """Return the settings with a camera at rest where the data set states that and the settings leave it open.
+
+    Pictures cannot tell: where tissue moves as a whole, no part of them stands still. A tracker of the caller decides
+    by itself.
+    """
+    stated = config.tracking.camera_at_rest
+    if stated is not None or tracker is not None or not sequence.source.camera_at_rest:
+        return config
+    tracking = config.tracking.model_copy(update={"camera_at_rest": True})
+    return Config.model_validate(dict(config) | {"tracking": tracking})

@@ -68,6 +68,7 @@ class EndoNerfFolder(LayoutFolder):
         else:
             self.notes.append(f"poses in {file.name} start at the identity: taken as they are, camera to world, in mm")
         if np.abs(poses - poses[0]).max() < _REST_TOLERANCE:
+            self.camera_at_rest = True
             self.notes.append(Notice("camera-at-rest"))
         if len(rows) != len(self.numbers):
             found = f"{len(rows)} rows for {len(self.numbers)} images"

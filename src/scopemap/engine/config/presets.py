@@ -14,6 +14,7 @@ _PAPER: dict[str, Any] = {
     "networks.flow": "raft-large",
     "networks.perceptual": "lpips",
     "tracking.method": "paper",
+    "tracking.camera_at_rest": False,
     "tracking.keyframe_every": 2,
     "smoothing.method": "wema",
     "mapping.method": "none",

@@ -59,10 +59,10 @@ class TrackingSettings(StageSettings):
         "realtime": {"fast": True},
     }
     method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, realtime, paper, ...")
-    camera_at_rest: bool = Field(
-        False,
+    camera_at_rest: bool | None = Field(
+        None,
         description="the camera does not move: poses stay the first one, every frame has a surface (surfaces/); "
-        "mapping.method is none then",
+        "mapping.method is none then; default: where the data set states it",
     )
     keyframe_every: int = Field(
         10, ge=1, description="every n-th frame becomes a keyframe, once the camera has moved (the paper: 2)"
