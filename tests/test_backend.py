@@ -37,6 +37,13 @@ def _errors(poses: list[np.ndarray], true: list[np.ndarray]) -> tuple[float, flo
     return float(rotation_angle_rad(off[:, :3, :3]).max()), float(np.linalg.norm(off[:, :3, 3], axis=1).max())
 
 
+def _deformed(frame: Frame, rng: np.random.Generator) -> Frame:
+    """Return a frame with a smooth deformation, by some 3 px."""
+    x, y = np.meshgrid(np.arange(240, dtype=np.float32), np.arange(180, dtype=np.float32))
+    swell = cv2.resize(rng.normal(0, 3, (4, 5, 2)).astype(np.float32), (240, 180), interpolation=cv2.INTER_CUBIC)
+    return replace(frame, rgb=cv2.remap(frame.rgb, x + swell[..., 0], y + swell[..., 1], cv2.INTER_LINEAR))
+
+
 def test_drift_is_corrected_in_keyframes_and_frames_between_them() -> None:
     drift = [se3_exp(0.01 * n * np.array([0.5, -0.6, 1.0, 20, 10, -10])) for n in range(6)]
     tracked = [error @ pose for error, pose in zip(drift, POSES, strict=True)]
@@ -191,19 +198,27 @@ def test_corrections_are_not_interpolated_across_a_loss(
 
 
 def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
-    rng, frames = np.random.default_rng(1), []
-    x, y = np.meshgrid(np.arange(240, dtype=np.float32), np.arange(180, dtype=np.float32))
-    for frame in map(_frame, range(5)):
-        # A smooth deformation that differs between keyframes, by some 3 px.
-        swell = cv2.resize(rng.normal(0, 3, (4, 5, 2)).astype(np.float32), (240, 180), interpolation=cv2.INTER_CUBIC)
-        moved = cv2.remap(frame.rgb, x + swell[..., 0], y + swell[..., 1], cv2.INTER_LINEAR)
-        frames.append(replace(frame, rgb=moved))
-    correction = plane_scene.adjusted(frames)
+    rng = np.random.default_rng(1)
+    correction = plane_scene.adjusted([_deformed(frame, rng) for frame in map(_frame, range(5))])
     assert correction.refused
     assert correction.sigma_px > 0.8
     assert correction.depth_factor(20) == 1.0
     np.testing.assert_array_equal(correction.pose(20, POSES[2]), POSES[2])
     assert "no rigid scene" in text_of(correction.notice)
+
+
+def test_a_second_in_which_tissue_moves_is_not_hidden_by_the_rest_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert judge.refusal_by_views(0.6, 0.9, 0.8, ShapeTest(), 20) is None
+    moving = judge.refusal_by_views(0.6, 1.7, 0.8, ShapeTest(), 20)
+    assert moving is not None and (moving.code, moving.values["sigma_px"]) == ("mapping-not-rigid", 1.7)
+    asked = []
+    monkeypatch.setattr(hypotheses, "refusal_by_views", lambda *errors: asked.append(errors[:2]))
+    frames = [_frame(number) for number in range(6)]
+    plane_scene.adjusted(frames)
+    plane_scene.adjusted([*frames[:5], _deformed(frames[5], np.random.default_rng(1))])
+    (_, near_rigid_px), (moving_px, near_moving_px) = asked
+    assert near_rigid_px < 0.4
+    assert near_moving_px > max(0.96, 2 * moving_px)
 
 
 def test_an_adjustment_says_what_determines_the_shape() -> None:

@@ -31,6 +31,7 @@ from scopemap.engine.mapping.bundle_problem import BundleProblem, State, success
 from scopemap.engine.mapping.correction import FrameCorrection, TrackedPose
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField
 from scopemap.engine.mapping.judge import (
+    LEAST_COMPARED,
     Interval,
     MapErrors,
     ShapeTest,
@@ -192,7 +193,8 @@ def adjust_maps(keyframes: MapKeyframes, problem: BundleProblem, loops: np.ndarr
     found, shape = _solution(keyframes, problem)
     fields: tuple[DepthCorrectionField, ...] = ()
     loop_frames = keyframes.index[loops].tolist()
-    refused = refusal_by_views(found.sigma_px, keyframes.settings.max_sigma_px, shape, len(keyframes.index))
+    near_px, most_px = _largest_near_px(problem, found.state), keyframes.settings.max_sigma_px
+    refused = refusal_by_views(found.sigma_px, near_px, most_px, shape, len(keyframes.index))
     if refused is None:
         fields = keyframes.depth_fields(problem.points, found)
         # Other starts have judged the shape, where they could; else the depths do.
@@ -246,6 +248,15 @@ def _errors_of_maps(
     within_px = {number: sigma_px((host == number) & (observer == number)) for number in maps}
     between_px = [sigma_px((host == number) != (observer == number)) for number in maps if number != main]
     return within_px, float(np.max(between_px or math.nan))
+
+
+def _largest_near_px(problem: BundleProblem, state: State) -> float:
+    """Return the largest robust standard deviation of the errors between two neighbouring keyframes; 0 without any."""
+    length_px, seen = errors_px(problem, state), problem.observations
+    ends = np.column_stack([problem.points.host[seen.point], seen.keyframe])
+    first, is_near = ends.min(1), np.ptp(ends, axis=1) == 1
+    compared = (length_px[is_near & (first == k)] for k in range(len(state.T_camera_world) - 1))
+    return max((robust_sigma_2d(one) for one in compared if len(one) >= LEAST_COMPARED), default=0.0)
 
 
 def _largest(within_px: Mapping[int, float]) -> float:

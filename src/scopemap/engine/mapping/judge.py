@@ -10,8 +10,8 @@
 | the same from another start | `is_clearly_less`, `is_same_shape` | the shape stays, or is not determined |
 | the same with another lens | `LensTest.contradicts`, `LensKinds.better_than` (reported only) | the lens stays |
 
-A window, a whole map and merged maps are refused first where the reprojection errors that they leave stay large. Small
-errors of what was adjusted prove little, so what an adjustment has not used judges it, too:
+A window, a whole map and merged maps are refused first where they leave large reprojection errors. Small errors of what
+was adjusted prove little, so what an adjustment has not used judges it, too:
 
 - tracks that were left out: part of the points is adjusted, others are placed in the keyframes that were found
   (`halves`, `placed`). Their errors are compared (`left_out_px`) with those of another hypothesis, or as tracked
@@ -49,10 +49,13 @@ LEAST_COMPARED = 50  # by hand
 RIGID_SIGMA_PX = 0.4
 """Robust standard deviation of reprojection errors above which the fit alone does not show that a scene is rigid.
 
-Rigid scenes leave at most 0.3 px between near keyframes, but 0.45 in a fast, interlaced video (C3VD trans_t2_a); moving
-tissue leaves 0.4 to 1.5. The ranges overlap, so there are two limits. Windows of keyframes as they come, the last word
-of other starts and the merging of segments use this one. The adjustment of all keyframes is refused above the larger
+Rigid scenes leave at most 0.3 px, but 0.45 in a fast, interlaced video (C3VD trans_t2_a); moving tissue 0.4 to 1.5. The
+ranges overlap: windows of keyframes, other starts and the merging of segments use this limit, all keyframes the larger
 `MappingSettings.max_sigma_px`."""
+
+# The same between two neighbouring keyframes, over `max_sigma_px`. Worst neighbours of adjusted clips: rigid ones .28 to
+# .48 of it, fast and interlaced 1.03 (C3VD trans_t2_a), a laparoscopy .78; a push let go 1.3, fluid on the lens 2.2.
+_MOST_NEAR = 1.2
 
 # Windows of keyframes as they come.
 _LEAST_SEEN = 0.1  # by hand: of a keyframe's points that those before it must observe: else nothing corrects its depth
@@ -79,8 +82,8 @@ MOST_LENS_RATIO = 0.97
 """Of left-out errors through another lens over those through this one."""
 _SIGNIFICANT = 3.0  # standard deviations that the focal length must change by
 _LEAST_CHANGE = 0.02  # of ln f: changes the shape of a colon by 1.5 %, by which surfaces are off with a right lens
-# Of left-out tracks with the focal length free, above which a scene is not rigid enough: rigid clips that constrain the
-# lens had 0.14 to 0.41 px, moving ones 0.53 (laparoscopy_rvim) and 1.03 (colonoscopy_nflba_03).
+# Of left-out tracks with the focal length free: rigid clips that constrain the lens had 0.14 to 0.41 px, moving ones
+# 0.53 (laparoscopy_rvim) and 1.03 (colonoscopy_nflba_03).
 _MOST_FREE_PX = 0.45
 _FOCAL_SIGMA = 0.05  # by hand: of ln f, above which the motion says too little of the lens to confirm it
 
@@ -93,8 +96,7 @@ _NOISE_PX = 0.05  # by hand; of either: that of exact phantoms, whose poses as t
 _MOST_OVER_ALONE = 1.5  # by hand
 # Keyframes of either map with loops to the other, where errors between maps are larger than within or untested.
 _MIN_LOOPED = 4  # by hand
-# Learned features are matched to about a pixel: errors between maps of one place were up to 0.96 px, of two from 1.38.
-_MAX_FEATURE_PX = 1.2
+_MAX_FEATURE_PX = 1.2  # learned features are matched to a pixel: between maps of one place up to 0.96, of two from 1.38
 
 # Does one scene explain an interval? Left-out errors of a union over those of its parts, where these are not those of a
 # rigid scene.
@@ -146,12 +148,16 @@ def left_out_px(left_out: BundleProblem, state: State, unit: np.ndarray | float 
 # ---- all keyframes: why an adjustment is refused; None: it is not
 
 
-def refusal_by_views(sigma_px: float, max_sigma_px: float, shape: ShapeTest, keyframes: int) -> Notice | None:
+def refusal_by_views(
+    sigma_px: float, near_px: float, max_sigma_px: float, shape: ShapeTest, keyframes: int
+) -> Notice | None:
     """Return why the views refuse an adjustment of so many keyframes.
 
-    sigma_px : of its reprojection errors, robust standard deviation; NaN without observations.
+    sigma_px : of its reprojection errors, robust standard deviation; NaN without observations. near_px : the largest of
+    neighbours alone: a second in which tissue moves is a small part of a long map.
     """
-    if not_rigid := _not_rigid(sigma_px, max_sigma_px, keyframes):
+    largest_px = near_px if near_px > _MOST_NEAR * max_sigma_px else sigma_px
+    if not_rigid := _not_rigid(largest_px, max_sigma_px, keyframes):
         return not_rigid
     if shape.refuses(sigma_px):
         return Notice("mapping-not-determined", {"error_px": shape.error_px, "other_px": shape.other_px})
@@ -225,10 +231,7 @@ class ShapeTest(NamedTuple):
         return self.outcome == "not determined" and not is_clearly_less(self.error_px, self.other_px)
 
     def refuses(self, sigma_px: float) -> bool:
-        """Whether all keyframes stay as tracked in the end; sigma_px : robust, of the reprojection errors.
-
-        Where these are as small as those of a rigid scene the adjusted poses fit the views all the same.
-        """
+        """Whether all keyframes stay as tracked in the end; sigma_px : robust, of errors larger than a rigid scene's."""
         return self.is_contradicted and sigma_px > RIGID_SIGMA_PX
 
     @property
@@ -319,8 +322,8 @@ class MapErrors(NamedTuple):
     def fit(self, alone: MapErrors, max_sigma_px: float) -> bool:
         """Whether merged maps fit together: each is rigid, all fit, the main one as well as alone.
 
-        Where tissue moves, so that not even the main map is adjusted, the pose graph merges them: loops of several
-        keyframes agree with each other and with both maps as tracked, which fit as well as alone.
+        Where not even the main map is adjusted, the pose graph merges them: loops of several keyframes agree with each
+        other and with both maps as tracked, which fit as well as alone.
         """
         if not alone.is_adjusted and not self.is_adjusted:
             fits = self.graph_px <= _MOST_OVER_ALONE * alone.graph_px + _NOISE_PX
@@ -374,8 +377,7 @@ class Interval(NamedTuple):
 def refusal_of_interval(interval: Interval, max_sigma_px: float) -> Notice | None:
     """Return that no rigid scene explains an interval, so that its keyframes stay as tracked; None: one does.
 
-    Where left-out tracks or depth prefer the poses as tracked, none does either. It is known before the keyframes are
-    adjusted all together: a clip that gets nothing from that does not pay for it twice.
+    Where left-out tracks or depth prefer the poses as tracked, none does either; no second adjustment is paid for.
     """
     most_px = max_sigma_px if interval.prefers_adjustment else -math.inf
     return _not_rigid(interval.error_px, most_px, interval.last - interval.first + 1)
