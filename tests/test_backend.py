@@ -210,7 +210,8 @@ def test_poses_stay_as_tracked_where_tissue_deforms() -> None:
 def test_a_second_in_which_tissue_moves_is_not_hidden_by_the_rest_of_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     assert judge.refusal_by_views(0.6, 0.9, 0.8, ShapeTest(), 20) is None
     moving = judge.refusal_by_views(0.6, 1.7, 0.8, ShapeTest(), 20)
-    assert moving is not None and (moving.code, moving.values["sigma_px"]) == ("mapping-not-rigid", 1.7)
+    assert moving is not None
+    assert (moving.code, moving.values["sigma_px"]) == ("mapping-not-rigid", 1.7)
     asked = []
     monkeypatch.setattr(hypotheses, "refusal_by_views", lambda *errors: asked.append(errors[:2]))
     frames = [_frame(number) for number in range(6)]

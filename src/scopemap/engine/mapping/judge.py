@@ -53,8 +53,8 @@ Rigid scenes leave at most 0.3 px, but 0.45 in a fast, interlaced video (C3VD tr
 ranges overlap: windows of keyframes, other starts and the merging of segments use this limit, all keyframes the larger
 `MappingSettings.max_sigma_px`."""
 
-# The same between two neighbouring keyframes, over `max_sigma_px`. Worst neighbours of adjusted clips: rigid ones .28 to
-# .48 of it, fast and interlaced 1.03 (C3VD trans_t2_a), a laparoscopy .78; a push let go 1.3, fluid on the lens 2.2.
+# Between two neighbouring keyframes, over `max_sigma_px`. Worst neighbours of adjusted clips: rigid .28 to .48, fast
+# and interlaced 1.03 (C3VD trans_t2_a), a laparoscopy .78; a push that was let go 1.3, fluid on the lens 2.2.
 _MOST_NEAR = 1.2
 
 # Windows of keyframes as they come.
@@ -231,7 +231,7 @@ class ShapeTest(NamedTuple):
         return self.outcome == "not determined" and not is_clearly_less(self.error_px, self.other_px)
 
     def refuses(self, sigma_px: float) -> bool:
-        """Whether all keyframes stay as tracked in the end; sigma_px : robust, of errors larger than a rigid scene's."""
+        """Whether all keyframes stay as tracked in the end; sigma_px : robust, where larger than a rigid scene's."""
         return self.is_contradicted and sigma_px > RIGID_SIGMA_PX
 
     @property
