@@ -39,14 +39,14 @@ def wavy_sheet(side: int, step_mm: float) -> trimesh.Trimesh:
 
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), step_mm=st.sampled_from([0.7, 1.5, 6.0]))
-def test_near_the_surface_the_distance_is_exact(seed: int, step_mm: float) -> None:
+def test_the_distance_is_exact(seed: int, step_mm: float) -> None:
     mesh = wavy_sheet(20, step_mm)
     rng = np.random.default_rng(seed)
     points = mesh.vertices[rng.integers(len(mesh.vertices), size=60)] + rng.normal(scale=1.5, size=(60, 3))
     np.testing.assert_allclose(distance_to_mesh(points, mesh), brute_force(points, mesh), atol=1e-9)
 
 
-def test_a_crowd_of_nearer_centroids_costs_no_more_than_the_bound() -> None:
+def test_a_crowd_of_nearer_centroids_hides_no_triangle() -> None:
     # 200 specks 10 mm from the origin, and the tip of one larger triangle at 9.5 mm whose centroid lies behind them.
     rng = np.random.default_rng(1)
     directions = rng.normal(size=(200, 3))
@@ -55,9 +55,7 @@ def test_a_crowd_of_nearer_centroids_costs_no_more_than_the_bound() -> None:
     tip = np.array([[[9.5, 0, 0], [11.2, 0.5, 0], [11.2, -0.5, 0]]])
     crowd = trimesh.Trimesh(np.concatenate([specks, tip]).reshape(-1, 3), np.arange(603).reshape(-1, 3), process=False)
     origin = np.zeros((1, 3))
-    assert brute_force(origin, crowd)[0] == pytest.approx(9.5)
-    radius = np.linalg.norm(tip[0] - tip[0].mean(axis=0), axis=1).max()
-    assert 9.9 < distance_to_mesh(origin, crowd)[0] < 9.5 + radius
+    assert distance_to_mesh(origin, crowd)[0] == pytest.approx(9.5)
 
 
 def test_large_and_few_triangles() -> None:
