@@ -102,7 +102,7 @@ def test_progress_comes_now_and_then_and_preparing_takes_no_time_of_the_rest(
         for _ in range(21):
             observers[0](_step("lost", "too dark"))  # type: ignore[arg-type]
             clock.now += 0.5
-    of, left = (" of 100", "about 64 s left, ") if total else ("", "")
+    of, left = (" of 100", "about 90 s left, ") if total else ("", "")
     assert capfd.readouterr().err.splitlines() == [
         f"frame 1{of}: lost: too dark",
         f"frame 21{of}: {left}lost: too dark",
