@@ -44,7 +44,7 @@ ALONE = {
 
 def _ends(field: FieldInfo) -> list[Any]:
     """The ends that belong to a field's range, or all its values where these are named."""
-    if field.annotation is bool:
+    if bool in {field.annotation, *get_args(field.annotation)}:
         return [not field.default]
     if get_origin(field.annotation) is Literal:
         return [value for value in get_args(field.annotation) if value != field.default]
