@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,9 @@ from shown_window import shown_window
 from test_browser_result_page import click
 
 from scopemap.apps.browser.result_page import ResultPage
+from scopemap.engine.fusion.mesh_files import save_mesh
+from scopemap.engine.notices import Level
+from scopemap.report.page_data import page_data, shown_meshes
 from scopemap.result.result import Result
 from scopemap.result.surface_segments import SurfaceSegment, save_segments
 
@@ -19,17 +23,23 @@ pytest.importorskip("viser", reason="viser is not installed: pip install 'scopem
 HALF = IN_RESULT // 2
 
 
-def in_two_segments(folder: Path) -> Path:
-    """A drawn result whose second half has a surface of its own, with fewer triangles."""
+def in_two_segments(folder: Path, levels: tuple[Level, Level] = ("doubtful", "doubtful"), main: int = 0) -> Path:
+    """A drawn result whose second half has a surface of its own, with fewer triangles.
+
+    levels : of the two segments. main : the one whose surface stands for the result.
+    """
     times_s = Result(folder).frames["time_s"]
     ends = ((0, HALF - 1), (HALF, IN_RESULT - 1))
     segments = [
-        SurfaceSegment(number, *frames, float(times_s[frames[0]]), float(times_s[frames[1]]), "doubtful", 0.02, 0.9)
+        SurfaceSegment(number, *frames, float(times_s[frames[0]]), float(times_s[frames[1]]), levels[number], 0.02, 0.9)
         for number, frames in enumerate(ends)
     ]
     whole = tube()
     part = whole.submesh([range(len(whole.faces) // 2)], append=True, repair=False)
     save_segments(segments, [whole, part], folder, comment="drawn")
+    save_mesh((whole, part)[main], folder / "mesh.ply", comment="drawn")
+    provenance = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))
+    (folder / "provenance.json").write_text(json.dumps(provenance | {"main_segment": main}), encoding="utf-8")
     with (folder / "frames.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     for row in rows:
@@ -40,6 +50,28 @@ def in_two_segments(folder: Path) -> Path:
         table.writeheader()
         table.writerows(rows)
     return folder
+
+
+def test_window_and_report_open_at_the_main_segment_and_the_list_goes_to_others(tmp_path: Path) -> None:
+    folder = in_two_segments(draw_run(tmp_path), ("doubtful", "good"), main=1)
+    assert page_data(Result(folder), shown_meshes(Result(folder), 1000))["opens_at"] == HALF
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        part, slider = shown.element("Dropdown", "Go to part"), shown.element("Slider", "Frame")
+        assert (slider.value, part.value) == (HALF, part.options[1])
+        assert part.options[0].endswith(" s: doubtful")
+        assert part.options[1].endswith(" s: good, the main part")
+        shown.choose("Dropdown", "Go to part", part.options[0])
+        assert slider.value == 0
+        shown.choose("Slider", "Frame", HALF + 2)
+        assert part.value == part.options[1]
+
+
+def test_a_result_of_one_surface_lists_no_parts(tmp_path: Path) -> None:
+    with shown_window() as shown:
+        shown.show(ResultPage(draw_run(tmp_path)))
+        assert "Go to part" not in shown.labels("Dropdown")
+        assert shown.element("Slider", "Frame").value == 0
 
 
 def test_what_was_measured_on_one_surface_is_not_looked_for_on_another(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from scopemap.engine.geometry.align import align_trajectories
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.report.measured_by_hand import advice_by_reference, read_measurements
 from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
-from scopemap.report.shown_maps import MapOnPage, shown_map_numbers, shown_maps
+from scopemap.report.shown_maps import MapOnPage, opening_row, shown_map_numbers, shown_maps
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified, textured_surface
 from scopemap.report.video_parts import video_parts
 from scopemap.result.evidence import notices_of, scale_source
@@ -81,6 +81,7 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
         "frames_per_s": frames_per_s(run),
         "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "frames": _frames(run, maps),
+        "opens_at": opening_row(run),
         "depth_range": [near_mm, far_mm],
         "pictures": [_picture_data(p) for p in pictures],
         "depth_unit_mm": float(np.float32(run.depth.scale_mm)),

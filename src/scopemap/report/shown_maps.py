@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.notices import Level
+from scopemap.result.frame_table import NOT_USED
 from scopemap.result.result import Result
 from scopemap.result.verdict import level_of_submap
 from scopemap.result.wording import LEVEL_WORDS
@@ -59,6 +60,19 @@ def shown_maps(run: Result) -> list[MapOnPage]:
     for one in sorted(others, key=lambda one: one.segment):
         found.append(MapOnPage(run, one.segment, f"Segment {one.words}", f"S{one.segment}", ".", one.level))
     return found
+
+
+def opening_row(run: Result) -> int:
+    """Return the row in the run's table of the frame that is shown first: the first of the result's main segment.
+
+    Where no frame is in the main segment, it is the first that was used; 0 where there is none.
+    """
+    frames = run.frames
+    inside = frames.submap == 0
+    for found in (inside & (frames["segment"] == run.main_segment), inside, frames.submap != NOT_USED):
+        if found.any():
+            return int(np.argmax(found))
+    return 0
 
 
 def shown_map_numbers(run: Result, maps: list[MapOnPage]) -> np.ndarray:

@@ -18,7 +18,10 @@ from scopemap.apps.browser.window import escaped
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.result.frame_table import ELSEWHERE, LOST, ROTATED
 from scopemap.result.losses import ADVICE
+from scopemap.result.result import Result
 from scopemap.result.run_input import places_of_input
+from scopemap.result.surface_segments import SurfaceSegment
+from scopemap.result.wording import LEVEL_WORDS
 
 _FRUSTUM = "/page/frame"
 _CLICK = "Click on the surface to see which frames saw that place."
@@ -65,6 +68,11 @@ class FramePart:
         self._strip = TimeStrip(view)
         self._strip_image = gui.add_image(self._strip.picture(), format="png")
         gui.add_html(self._strip.legend)
+        self._segments = [segment_words(view.whole, one) for one in view.whole.segments]
+        # A picture takes no clicks: the list goes where a click on the strip would.
+        several = len(self._segments) > 1
+        self._segment = gui.add_dropdown("Go to part", self._segments or [""], visible=several)
+        view.window.on(self._segment, self._choose_segment)
         self._words = gui.add_markdown("")
         self._image = gui.add_image(np.zeros((8, 640, 3), np.uint8))
 
@@ -127,6 +135,9 @@ class FramePart:
         if value == self._slider.value:
             self._view.show_row(self._view.rows[int(value)])
 
+    def _choose_segment(self, name: str) -> None:
+        self._view.show_segment(self._segments.index(name))
+
     def _choose(self, name: str) -> None:
         if name in self._listed:
             self._view.show_frame(self._listed[name])
@@ -181,6 +192,8 @@ class FramePart:
         view = self._view
         if view.row in view.rows:
             self._slider.value = view.rows.index(view.row)
+        if self._segment.visible and view.number == 0:
+            self._segment.value = self._segments[view.surface.segment]
         self._words.content, self._strip_image.image = frame_words(view), self._strip.picture()
         if self._with_camera.value and view.pose is not None:
             view.look_from_frame()
@@ -225,6 +238,12 @@ class FramePart:
             self._show_images(index)
 
         self._view.window.job("reading the video", lambda: self._images.sharp(index), show)
+
+
+def segment_words(whole: Result, segment: SurfaceSegment) -> str:
+    """Return number, time and grade of a segment of a result: "2. 3.1 to 5.2 s: good, the main part"."""
+    main = ", the main part" if segment.segment == whole.main_segment else ""
+    return f"{segment.segment + 1}. {segment.words}: {LEVEL_WORDS[segment.level]}{main}"
 
 
 def frame_words(view: ResultView) -> str:

@@ -16,6 +16,7 @@ from scopemap.apps.browser.window import escaped
 from scopemap.engine.errors import InputError
 from scopemap.report.measured_by_hand import advice_with_sizes
 from scopemap.report.page import PAGE, write_report
+from scopemap.report.shown_maps import opening_row
 from scopemap.report.summary_picture import NOT_A_DEVICE, TONES
 from scopemap.result.frame_table import NOT_USED
 from scopemap.result.result import Result
@@ -47,7 +48,7 @@ class ResultView:
     def __init__(self, window: BrowserWindow, whole: Result, workspace: Workspace | None) -> None:
         self.window, self.whole, self.workspace = window, whole, workspace
         self.rows = np.flatnonzero(whole.frames.submap != NOT_USED).tolist()
-        self.row = self.rows[0] if self.rows else 0
+        self.row = opening_row(whole)
         self.number, self.surface = 0, ShownSurface(whole)
         self._surfaces: dict[tuple[int, int | None], ShownSurface] = {(0, None): self.surface}
         self._model = window.scene.add_frame(MODEL, show_axes=False)
@@ -137,12 +138,23 @@ class ResultView:
         self.show_row(int(np.flatnonzero(self.whole.frames["index"] == index)[0]))
 
     def show_submap(self, number: int) -> None:
-        """Show the surface of another submap, and its first frame."""
+        """Show the main surface of another submap, and its first frame."""
+        self._show_part(number)
+
+    def _show_part(self, number: int, segment: int | None = None) -> None:
+        """Show the surface of a segment of a submap, None: its main one, and its first frame."""
         self.number = number
-        self._show_surface()
-        inside = np.flatnonzero(self.whole.frames.submap == number)
-        self.show_row(int(inside[0]) if len(inside) else self.row)
+        self._show_surface(segment)
+        frames = self.surface.frames
+        if len(frames):
+            self.show_frame(int(frames["index"][0]))
+        else:
+            self.show_row(self.row)
         self.look_at_all()
+
+    def show_segment(self, segment: int) -> None:
+        """Show the surface of a segment of the result, and its first frame."""
+        self._show_part(0, segment)
 
     def show_model(self, *, shown: bool) -> None:
         """Show what is below `MODEL` in the scene, or hide it."""
@@ -150,7 +162,7 @@ class ResultView:
 
     def look_at_all(self) -> None:
         """Look at the whole surface from behind its first camera."""
-        poses = self.run.tracked["T_world_camera"]
+        poses = self.surface.frames["T_world_camera"]
         points = np.asarray(self.surface.mesh.vertices)
         points = points if len(points) else poses[:, :3, 3]
         if len(poses):

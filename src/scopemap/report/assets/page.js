@@ -254,7 +254,7 @@ function open(number) {
   showMap(0);
   drawStrip(element("strip"), run);
   openAtlas(run, setRow);
-  row = Math.max(run.places.indexOf(0), 0);
+  row = run.opens_at;
   openMeasures();
 }
 
