@@ -17,7 +17,7 @@ from scopemap.apps.run.command import run as run_command
 from scopemap.engine.config.config import Config
 from scopemap.input.opening import open_sequence
 from scopemap.result.result import Result
-from scopemap.result.wording import WORDINGS
+from scopemap.result.wording import STILL_PART, WORDINGS
 
 # Options that need a file, a box or a choice that nobody can make for the user.
 NOT_OFFERED = {"camera", "redact", "memory", "frames"}
@@ -57,9 +57,8 @@ def test_a_step_in_plain_words_names_no_option() -> None:
         assert step == plain if "--" not in step else plain != step
         assert not plain or plain.endswith(".")
     assert plain_step("Calibrate (--camera), or run again with --fov or --scope.") == "Calibrate."
-    assert plain_step("Use the segments in which it holds still, or a part with --frames A:B.") == (
-        "Use the segments in which it holds still."
-    )
+    assert plain_step(STILL_PART) == "Reconstruct a part in which it holds still."
+    assert plain_step("See surfaces/segments.csv.") == ""
     assert plain_step("Run again with --set mapping.method=local.") == ""
 
 

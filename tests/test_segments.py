@@ -24,10 +24,12 @@ from scopemap.engine.mapping.correction import FrameCorrection, KeyframeStep, Tr
 from scopemap.engine.mapping.judge import Interval
 from scopemap.engine.mapping.keyframes import MapKeyframes
 from scopemap.engine.mapping.segments import choose_segments, joined
+from scopemap.engine.notices import Level, Notice
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 from scopemap.result.surface_segments import SurfaceSegment, main_segment, read_segments, write_segments
-from scopemap.result.verdict import graded, verdict
+from scopemap.result.verdict import Reason, graded, verdict
+from scopemap.result.wording import facts_of_notices
 
 CAMERA = PinholeCamera(200.0, 200.0, 159.5, 119.5, 320, 240)
 COUNT = 17
@@ -217,6 +219,28 @@ def test_the_verdict_says_what_is_usable_and_when() -> None:
     (counted,) = (reason for reason in found.reasons if reason.code == "frames-in-result")
     assert "60 of 80" in counted.text
     assert {reason.code for reason in found.reasons if reason.level == "note"} >= {"segments"}
+
+
+def test_the_verdict_names_the_good_segments_where_they_differ() -> None:
+    def reasons_of(*levels: Level) -> tuple[str, dict[str, Reason]]:
+        result = segmented_result()
+        segments = [replace(one, level=level) for one, level in zip(result.segments, levels, strict=True)]
+        moves = {"frames": 10, "measured": 80, "most": 3, "share": 0.2, "threshold": 3.0, "x": 1.0, "y": 1.0}
+        result.provenance["notices"] = facts_of_notices([Notice("tissue-moves", moves)])
+        found = verdict(result.with_segments(segments, [_square(10.0)] * 3))
+        return found.advice, {reason.code: reason for reason in found.reasons}
+
+    advice, reasons = reasons_of("doubtful", "good", "doubtful")
+    assert advice.startswith("Usable: 0.0 to 7.9 s (good: 2.0 to 5.9 s), 100 % of the video.")
+    assert reasons["tissue-moves"].next_step == "Use the good segments: 2.0 to 5.9 s."
+    assert "(1 good, 2 doubtful). Good: 2.0 to 5.9 s." in reasons["segments"].text
+    for alike in ("doubtful", "good"):
+        advice, reasons = reasons_of(alike, alike, alike)
+        assert "good:" not in advice
+        assert reasons["tissue-moves"].next_step == ""
+        assert "Good:" not in reasons["segments"].text
+    # Without a good one there is nothing to recommend; what may be looked at is in the advice.
+    assert reasons_of("doubtful", "bad", "bad")[1]["tissue-moves"].next_step == ""
 
 
 def test_a_result_keeps_the_surface_of_every_segment(tmp_path: Path) -> None:

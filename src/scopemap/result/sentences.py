@@ -9,7 +9,7 @@ from scopemap.result.evidence import LEAST_SUBMAP_S, Evidence
 from scopemap.result.losses import ADVICE
 from scopemap.result.submap_summaries import doubt_words
 from scopemap.result.surface_segments import SurfaceSegment
-from scopemap.result.wording import LEVEL_WORDS, text_of
+from scopemap.result.wording import LEVEL_WORDS, STILL_PART, WORDINGS, text_of
 
 _MOST_RANGES = 3
 """Parts of the time that the verdict's sentence names, the longest."""
@@ -88,8 +88,22 @@ def segments(evidence: Evidence, level: Level) -> str:
     """Return that several surfaces, each for a part of the time, make up the result."""
     levels = [segment.level for segment in evidence.segments]
     text = f"The scene changes, so {len(levels)} segments of the video have a surface each ({_counted(levels)})."
+    good = _good_parts(evidence)
+    text += f" Good: {good}." if good else ""
     loose = evidence.loose_segments
     return text + (f" {loose} are joined by tracking alone." if loose else "")
+
+
+def next_step(code: str, evidence: Evidence) -> str:
+    """Return what to do about a notice of the run; where tissue moves and segments differ, which of them are good.
+
+    "" where there is nothing to do: segments that are all alike give no choice.
+    """
+    step = WORDINGS[code].next_step
+    if step != STILL_PART or evidence.segment_count < 2:
+        return step
+    good = _good_parts(evidence)
+    return f"Use the good segments: {good}." if good else ""
 
 
 def advice(evidence: Evidence, level: Level) -> str:
@@ -135,13 +149,25 @@ def _usable_parts(evidence: Evidence) -> str:
     usable = [segment for segment in evidence.segments if segment.level != "bad"]
     if not usable:
         return "No part of the video can be used."
-    ranges = _ranges_s(usable)
+    share = percent_words(evidence.frames_usable / max(evidence.frames_used, 1))
+    good = [segment for segment in usable if segment.level == "good"]
+    which = f" (good: {_times(good)})" if 0 < len(good) < len(usable) else ""
+    return f"Usable: {_times(usable)}{which}, {share} of the video{'' if good else ', for looking, not for measuring'}."
+
+
+def _good_parts(evidence: Evidence) -> str:
+    """Return the times of the good segments; "" where none is good, or all are."""
+    good = [segment for segment in evidence.segments if segment.level == "good"]
+    return _times(good) if len(good) < len(evidence.segments) else ""
+
+
+def _times(segments: list[SurfaceSegment]) -> str:
+    """Return the times of segments in words, successive ones together; of many the longest. "" for none."""
+    ranges = _ranges_s(segments)
     longest = sorted(sorted(ranges, key=lambda ends: ends[0] - ends[1])[:_MOST_RANGES])
     words = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in longest)
-    words += f" and {len(ranges) - len(longest)} shorter parts" if len(ranges) > len(longest) else ""
-    share = percent_words(evidence.frames_usable / max(evidence.frames_used, 1))
-    good = any(segment.level == "good" for segment in usable)
-    return f"Usable: {words}, {share} of the video{'' if good else ', for looking, not for measuring'}."
+    left = len(ranges) - len(longest)
+    return words + (f" and {left} shorter {'part' if left == 1 else 'parts'}" if left else "")
 
 
 def _ranges_s(usable: list[SurfaceSegment]) -> list[list[float]]:

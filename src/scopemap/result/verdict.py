@@ -310,7 +310,7 @@ def _of_notices(evidence: Evidence, rules: Sequence[Rule]) -> list[Reason]:
             notice.code,
             _graded(notice.code, notice.level, evidence, rules),
             text_of(notice),
-            WORDINGS[notice.code].next_step,
+            sentences.next_step(notice.code, evidence),
         )
         for notice in evidence.notices
         if gives_reason(notice.code)

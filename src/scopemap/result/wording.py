@@ -26,7 +26,8 @@ class Wording:
     next_step: str = ""
 
 
-_HOLDS_STILL = "Use the segments in which it holds still, or a part with --frames A:B."
+STILL_PART = "Reconstruct a part in which it holds still (--frames A:B)."
+"""Next step where tissue moves and one surface stands for all frames; of several the verdict names the good ones."""
 _MORE_MOTION = "Do not trust the relief; try a part with sideways motion (--frames A:B)."
 
 WORDINGS: dict[str, Wording] = {
@@ -127,7 +128,7 @@ WORDINGS: dict[str, Wording] = {
     ),
     "tissue-moves": Wording(
         "Tissue moves on its own in {frames} of {measured} frames, most in frame {most} ({share:.0%} of the picture).",
-        _HOLDS_STILL,
+        STILL_PART,
     ),
     "mapping-none": Wording(
         "Keyframes were not adjusted: no other view confirms depth and path.",
@@ -138,7 +139,7 @@ WORDINGS: dict[str, Wording] = {
     ),
     "mapping-local-not-rigid": Wording(
         "The tissue moves: {refused:keyframe} could not be adjusted ({adjusted} were).",
-        _HOLDS_STILL,
+        STILL_PART,
     ),
     "mapping-adjusted": Wording(
         "Bundle adjustment of {keyframes:keyframe} left {sigma_px:.2f} px reprojection error and closed {loops:loop} "
@@ -149,7 +150,7 @@ WORDINGS: dict[str, Wording] = {
     ),
     "mapping-not-rigid": Wording(
         "The tissue moves: no rigid scene fits the views ({sigma_px:.2f} px error), so bundle adjustment was rejected.",
-        _HOLDS_STILL,
+        STILL_PART,
     ),
     "shape-determined": Wording(
         "The motion determines the shape: another start finds it, too (correlation {correlation:.2f})."

@@ -22,6 +22,8 @@ _BUTTONS = {"scope": "Run again with this endoscope", "fov": "Run again with thi
 # A part of a sentence that names an option of the command: in brackets, after "; ", or after "or", "and", "with".
 _IN_BRACKETS = re.compile(r" \([^()]*--[^()]*\)")
 _CLAUSE = re.compile(r"(?:;|,? (?:or|and)|,? with) [^,.;]*--[^,.;]*")
+_NOT_SAID = ("Run again with --", "See surfaces/")
+"""How sentences of next steps begin that the window leaves out."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,8 @@ def next_runs(step: str, run: Result) -> list[NextRun]:
 
 
 def plain_step(step: str) -> str:
-    """Return a next step without options of the command: what the window offers as a button it does not say."""
-    others = [one for one in re.split(r"(?<=\.) ", step) if not one.startswith("Run again with --")]
+    """Return a next step without options and tables: the window has buttons and lists."""
+    others = [one for one in re.split(r"(?<=\.) ", step) if not one.startswith(_NOT_SAID)]
     return _CLAUSE.sub("", _IN_BRACKETS.sub("", " ".join(others)))
 
 
