@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 from drawn_run import CAMERA, changed, draw_run, drawn_result
 from front_door import call
+from shown_window import shown_window
 
 from scopemap.apps.browser.next_steps import NextRun, arguments_again, next_runs, plain_step, source_of
+from scopemap.apps.browser.result_page import ResultPage
+from scopemap.apps.browser.runs import BrowserRun
+from scopemap.apps.browser.workspace import Workspace
 from scopemap.apps.run.command import run as run_command
 from scopemap.engine.config.config import Config
 from scopemap.input.opening import open_sequence
@@ -104,6 +108,25 @@ def test_a_result_whose_input_is_gone_or_was_live_has_no_source(tmp_path: Path) 
     assert source_of(Result(folder)) == video
     draw_run(tmp_path / "live", name=str(video), dataset="live")
     assert source_of(Result(tmp_path / "live")) is None
+
+
+def test_an_endoscope_that_was_stated_is_not_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
+    (tmp_path / "video.mp4").write_bytes(b"")
+    monkeypatch.setattr(BrowserRun, "start", lambda run: None)
+    camera = FACTS | {"source": "70 deg", "origin": "assumed"}
+    folder = draw_run(tmp_path / "one", name=str(tmp_path / "video.mp4"), camera=camera)
+    (folder / "config.toml").write_text(Config.load(settings={"input.scope": "laparoscope"}).toml(), encoding="utf-8")
+    with Workspace(tmp_path) as workspace, shown_window() as shown:
+        shown.show(ResultPage(folder, workspace))
+        assert not [label for label in shown.labels("Dropdown") if label.startswith("Which endoscope")]
+        assert shown.element("Dropdown", "Run as: laparoscope").value == "laparoscope"
+        shown.press("Run again with this endoscope")
+        assert "This result was run as: laparoscope. Choose another endoscope first." in shown.words
+        assert not workspace.runs.runs
+        shown.choose("Dropdown", "Run as: laparoscope", "cystoscope")
+        shown.press("Run again with this endoscope")
+        assert workspace.runs.runs[0].arguments[-2:] == ("--scope", "cystoscope")
 
 
 @pytest.mark.slow

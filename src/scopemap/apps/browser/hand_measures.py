@@ -13,6 +13,7 @@ from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
 from scopemap.apps.measure.hand_measure import HandMeasure, folder_in_whole, rounded
 from scopemap.apps.measure.measure import measure
 from scopemap.engine.errors import InputError
+from scopemap.result.result import Result
 
 _MOST_TRIED = 4
 _SAME_PX = 0.15
@@ -65,6 +66,23 @@ def is_on(surface: ShownSurface, one: HandMeasure) -> bool:
     run = surface.run
     is_here = one.folder == folder_in_whole(run) and one.frame in run.tracked["index"]
     return bool(is_here and run.segment_at(one.frame) == surface.segment)
+
+
+def submap_of(whole: Result, one: HandMeasure) -> int | None:
+    """Return the number of the submap that a measurement of a whole result was made in; None: it is there no more."""
+    found = (number for number, run in enumerate(whole.submaps) if folder_in_whole(run) == one.folder)
+    return next((number for number in found if one.frame in whole.submaps[number].tracked["index"]), None)
+
+
+def part_words(whole: Result, one: HandMeasure) -> str:
+    """Return the time of the surface that a measurement was made on, "3.1 to 5.2 s"; in words where that is gone."""
+    if (number := submap_of(whole, one)) is None:
+        return "another part of the video"
+    run = whole.submaps[number]
+    if len(run.segments) > 1:
+        return run.segments[run.segment_at(one.frame)].words
+    times_s = run.tracked["time_s"]
+    return f"{times_s[0]:.1f} to {times_s[-1]:.1f} s"
 
 
 def is_by(surface: ShownSurface, one: HandMeasure, reference: Reference | None) -> bool:

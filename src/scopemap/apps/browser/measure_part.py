@@ -7,7 +7,13 @@ from typing import Literal, get_args
 import numpy as np
 
 from scopemap.apps.browser.frame_images import FrameImages
-from scopemap.apps.browser.hand_measures import Reference, line_on_surface, measure_by_hand
+from scopemap.apps.browser.hand_measures import (
+    Reference,
+    line_on_surface,
+    measure_by_hand,
+    part_words,
+    submap_of,
+)
 from scopemap.apps.browser.lesion_part import LesionPart
 from scopemap.apps.browser.marks import REFERENCE, draw_marks
 from scopemap.apps.browser.measured_list import MeasuredList, short
@@ -21,9 +27,8 @@ from scopemap.report.measured_by_hand import sizes_by
 Mode = Literal["Look", "Distance", "Area", "Lesion"]
 _CHOOSE = "Choose what to measure."
 _UNKNOWN = "Sizes are unknown. Choose **Distance** and click on both ends of something whose length you know."
-_ELSEWHERE = (
-    "Your reference is on the surface of another part of the video: go back there, or set one here, which replaces it."
-)
+_BACK = "Go to the reference"
+_ELSEWHERE = "Your reference is on the surface of {part}. “{back}”, in Measure, shows it; one set here replaces it."
 _FEWEST = 3
 _PICKED = "/page/picked"
 _REFERRED = "/page/reference"
@@ -37,7 +42,9 @@ class MeasurePart:
         self.mode: Mode = "Look"
         self._picks: list[SurfacePick] = []
         self._reference: Reference | None = None
+        self._elsewhere: HandMeasure | None = None
         self._hint = gui.add_markdown("")
+        self._back = window.on(gui.add_button(_BACK, visible=False), self._go_to_reference)
         modes = gui.add_button_group("Measure", get_args(Mode)[1:])
         modes.on_click(lambda event: window.do(self._choose, modes.value))
         self.picture = PicturePart(view, images)
@@ -125,23 +132,34 @@ class MeasurePart:
 
     def _refer_to(self, reference: Reference | None) -> None:
         """Use a reference, or none, and say what sizes are by it."""
-        self._reference = reference
+        self._reference, self._elsewhere = reference, self._measured.kept_reference()[1]
         self._view.say_sizes("" if reference is None else sizes_by(reference.length_mm))
         self._measured.show(reference)
         self._show()
 
     def _follow_surface(self) -> None:
         self._picks = []
-        reference, is_elsewhere = self._measured.kept_reference()
-        self._refer_to(reference)
-        self._view.note(_ELSEWHERE if is_elsewhere else "")
+        self._refer_to(self._measured.kept_reference()[0])
+        self._view.note(self._where_reference_is())
         self._lesion.begin(shown=self.mode == "Lesion")
+
+    def _where_reference_is(self) -> str:
+        """Return on which surface the reference is, where that is another than the one shown; else ""."""
+        one, whole = self._elsewhere, self._view.whole
+        return "" if one is None else _ELSEWHERE.format(part=part_words(whole, one), back=_BACK)
+
+    def _go_to_reference(self) -> None:
+        one = self._elsewhere
+        if one is not None and (number := submap_of(self._view.whole, one)) is not None:
+            self._view.show_frame_of(number, one.frame)
 
     def _show(self) -> None:
         view, picks, scene = self._view, self._picks, self._view.window.scene
         two = self.mode == "Distance" and len(picks) == 2
         self._length.visible = self._refer.visible = two
         self._forget.visible = self._reference is not None
+        elsewhere = self._elsewhere
+        self._back.visible = elsewhere is not None and submap_of(view.whole, elsewhere) is not None
         self._area.visible = self.mode == "Area" and len(picks) >= _FEWEST
         self._hint.content = _CHOOSE if self._is_known else _UNKNOWN
         size_mm = view.surface.size_mm

@@ -13,6 +13,7 @@ from scopemap.apps.browser.hand_measures import (
     is_on,
     kept_reference,
     line_on_surface,
+    part_words,
     reference_as_kept,
 )
 from scopemap.apps.browser.marks import INK, PALE, draw_marks
@@ -60,11 +61,12 @@ class MeasuredList:
         self.show(self._reference)
         add_measurement(self._view.whole.folder, one)
 
-    def kept_reference(self) -> tuple[Reference | None, bool]:
-        """Return the reference that is kept for the surface that is shown, and whether one is for another surface."""
-        kept = kept_measures(self._view.whole.folder)
-        found = kept_reference(self._view.surface, kept)
-        return found, found is None and any(one.kind == "reference" for one in kept)
+    def kept_reference(self) -> tuple[Reference | None, HandMeasure | None]:
+        """Return the reference that is kept for the surface that is shown; where there is none, that of another one."""
+        surface, kept = self._view.surface, kept_measures(self._view.whole.folder)
+        others = [one for one in kept if one.kind == "reference" and not is_on(surface, one)]
+        found = kept_reference(surface, kept)
+        return found, next(iter(others), None) if found is None else None
 
     def keep_reference(self, reference: Reference | None) -> None:
         """Keep the reference of the surface that is shown; None: none. Raises as `reference_as_kept`."""
@@ -100,7 +102,7 @@ class MeasuredList:
 
     def _note(self, listed: _Listed) -> str:
         if not self._is_here(listed):
-            return " *on the surface of another part of the video*"
+            return f" *on the surface of {part_words(self._view.whole, listed.one)}*"
         return " *by an earlier reference*" if self._is_earlier(listed) else ""
 
     def _draw(self) -> None:

@@ -31,16 +31,19 @@ class NextRun:
     """Another run that a next step names.
 
     option : of `scopemap run`. choices : values of which one is chosen, (): a number is asked for.
-    number : its lowest and its highest value; None: no number.
+    number : its lowest and its highest value; None: no number. stated : what the run was given; "": nothing.
     """
 
     option: str
     choices: tuple[str, ...] = ()
     number: tuple[float, float] | None = None
+    stated: str = ""
 
     @property
     def question(self) -> str:
-        """What is asked for beside the button, "": nothing."""
+        """What is asked for beside the button, or what was stated before; "": nothing."""
+        if self.stated:
+            return f"Run as: {self.stated}. Was it another?"
         return _QUESTIONS.get(self.option, "")
 
     def label(self, value: str = "") -> str:
@@ -68,7 +71,7 @@ def next_runs(step: str, run: Result) -> list[NextRun]:
             found.append(NextRun(option, (value,)))
         elif option == "scope":
             known = [kind for kind in value.split("|") if kind in _SCOPES]
-            found.append(NextRun(option, tuple(known) or _SCOPES))
+            found.append(NextRun(option, tuple(known) or _SCOPES, stated=run.config.input.scope))
         elif option == "fov":
             found.append(NextRun(option, number=(5.0, 170.0)))
     return found

@@ -137,6 +137,13 @@ class ResultView:
         """Show the frame with this number."""
         self.show_row(int(np.flatnonzero(self.whole.frames["index"] == index)[0]))
 
+    def show_frame_of(self, number: int, index: int) -> None:
+        """Show the frame with this number of a submap, and the surface of its segment."""
+        if number != self.number:
+            self.show_submap(number)
+        self.show_frame(index)
+        self.look_at_all()
+
     def show_submap(self, number: int) -> None:
         """Show the main surface of another submap, and its first frame."""
         self._show_part(number)

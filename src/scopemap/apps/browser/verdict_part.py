@@ -62,8 +62,9 @@ class VerdictPart:
             number = gui.add_text(run.question, "")
             window.on(gui.add_button(run.label()), lambda: self._again_with(run, number.value))
         elif len(run.choices) > _MOST_BUTTONS:
-            # None is preset: a wrong one makes the result worse, and takes the caution away.
-            choice = gui.add_dropdown(run.question, (_CHOOSE, *run.choices))
+            # Without a statement none is preset: a wrong one makes the result worse, and takes the caution away.
+            preset = run.stated if run.stated in run.choices else _CHOOSE
+            choice = gui.add_dropdown(run.question, (_CHOOSE, *run.choices), initial_value=preset)
             window.on(gui.add_button(run.label()), lambda: self._again_chosen(run, choice.value))
         else:
             for value in run.choices:
@@ -73,6 +74,8 @@ class VerdictPart:
         """Start the run with what was chosen, if something was."""
         if value == _CHOOSE:
             self._view.note(f"{run.question} Choose one first.")
+        elif value == run.stated:
+            self._view.note(f"This result was run as: {value}. Choose another endoscope first.")
         else:
             self._again(run, value)
 
