@@ -6,14 +6,19 @@ import csv
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from drawn_run import IN_RESULT, draw_run, tube
 from shown_window import shown_window
 from test_browser_result_page import click
 
+from scopemap.apps.browser.files_part import mm_per_unit, surface_words
 from scopemap.apps.browser.result_page import ResultPage
+from scopemap.apps.measure.hand_measure import kept_measures
 from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.notices import Level
+from scopemap.report.measured_by_hand import read_measurements
+from scopemap.report.page import write_report
 from scopemap.report.page_data import page_data, shown_meshes
 from scopemap.result.result import Result
 from scopemap.result.surface_segments import SurfaceSegment, save_segments
@@ -72,6 +77,53 @@ def test_a_result_of_one_surface_lists_no_parts(tmp_path: Path) -> None:
         shown.show(ResultPage(draw_run(tmp_path)))
         assert "Go to part" not in shown.labels("Dropdown")
         assert shown.element("Slider", "Frame").value == 0
+
+
+def test_the_files_say_which_part_they_show_and_how_their_numbers_become_mm(tmp_path: Path) -> None:
+    folder = in_two_segments(draw_run(tmp_path))
+    times = Result(folder).segments[0].words
+    page = ResultPage(folder)
+    with shown_window() as shown:
+        shown.show(page)
+        assert f"The surface is that of the part from {times}. Its scale is unknown: its numbers are no mm." in (
+            shown.words
+        )
+        shown.choose("ButtonGroup", "Measure", "Distance")
+        for pixel in ((24.0, 45.0), (40.0, 45.0)):
+            click(shown, page, pixel)
+        shown.element("Text", "Length of this line").value = "5"
+        shown.press("Use as reference")
+        ends = np.array(read_measurements(folder)[0]["world"])
+        factor = 5 / np.linalg.norm(ends[1] - ends[0])
+        assert f"by your reference, times {factor:.3g} its numbers are mm in STL and 3D Slicer, m in GLB." in (
+            shown.words
+        )
+        # The files hold the main surface: a reference on another one does not count.
+        other = Result(folder)
+        other.provenance["main_segment"] = 1
+        assert mm_per_unit(Result(folder), kept_measures(folder)) == pytest.approx(factor)
+        assert mm_per_unit(other, kept_measures(folder)) is None
+        shown.press("Forget the reference")
+        assert "its numbers are no mm" in shown.words
+    known = Result(draw_run(tmp_path / "known", scale={"known": True, "source": "a ruler", "measured": True}))
+    assert surface_words(known, []) == (
+        "The surface is that of the whole result. Its numbers are mm in STL and 3D Slicer, m in GLB."
+    )
+
+
+def test_the_downloaded_report_has_no_links_to_files_that_are_not_beside_it(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    (page, _) = write_report(folder)
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        shown.press("Download the report")
+        (sent,) = shown.sent.values()
+    assert b"<a data-file>" not in sent
+    assert b"In the result's folder: summary.png, mesh.ply, mesh.glb" in sent
+    kept = page.read_bytes()
+    assert b"Beside this page: <a data-file>summary.png</a>" in kept
+    # Nothing else differs.
+    assert len(kept) - len(sent) < 500
 
 
 def test_what_was_measured_on_one_surface_is_not_looked_for_on_another(tmp_path: Path) -> None:

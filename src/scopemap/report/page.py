@@ -32,6 +32,8 @@ _SCRIPTS = (
     "gestures",
 )  # fmt: skip
 _DATA = re.compile(r'(<script type="application/json" id="data">)(.*?)(</script>)', re.DOTALL)
+_LINK = re.compile(r"<a data-file>([^<]*)</a>")
+"""A link to a file beside the page."""
 _LICENCES = (
     "Licences: scopemap and its depth network scopenet are under Apache-2.0. Weights of other networks have licences "
     "of their own, named by `scopemap models list`; some forbid commercial use. The video and its data set keep theirs."
@@ -53,6 +55,19 @@ def write_report(folder: Path | str) -> list[Path]:
     if (Path(folder) / SUMS).is_file():
         write_checksums(Path(folder), only=(PAGE, PICTURE, PICTURES))
     return [page, picture]
+
+
+def page_to_send(page: Path) -> bytes:
+    """Return a report as it is sent without the files beside it: their names are text, not links.
+
+    Raises `InputError` where it cannot be read.
+    """
+    with reporting(f"cannot read {page}"):
+        text = page.read_text(encoding="utf-8")
+    # The data holds no "<", and the scripts none of these.
+    for linked, alone in (("Beside this page:", "In the result's folder:"), (" beside this page.", " in its folder.")):
+        text = text.replace(linked, alone)
+    return _LINK.sub(r"\1", text).encode("utf-8")
 
 
 def write_comparison(folders: Sequence[Path], names: Sequence[str], file: Path) -> Path:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import escaped
 from scopemap.apps.export.formats import FORMATS, export_run
-from scopemap.report.page import PAGE, PICTURE
+from scopemap.apps.measure.hand_measure import HandMeasure, folder_in_whole, kept_measures
+from scopemap.report.page import PAGE, PICTURE, page_to_send
+from scopemap.result.result import Result
 
 EXPORTS = "exports"
 """Folder of a result with what the window wrote; `verify` knows it."""
@@ -45,12 +49,19 @@ class FilesPart:
             self._on_press("Download the report", partial(self._send, page))
             gui.add_markdown("It is one file to keep, print or send.")
         if not view.surface.is_empty:
+            self._which = gui.add_markdown("")
+            view.follow(submap=self._say_which, sizes=self._say_which)
+            self._say_which()
             for label, name in _SURFACES.items():
                 self._on_press(label, partial(self._write, name))
         with gui.add_folder("All other forms", expand_by_default=False):
             self._to = gui.add_dropdown("Format", [_FILM, *FORMATS])
             self._on_press("Write", lambda client: self._write(self._to.value, client))
         self._words = gui.add_markdown("")
+
+    def _say_which(self) -> None:
+        view = self._view
+        self._which.content = escaped(surface_words(view.run, kept_measures(view.whole.folder)))
 
     def _on_press(self, label: str, call: Callable[[Any], None]) -> None:
         """Make a button whose press calls with the browser that it came from."""
@@ -69,7 +80,7 @@ class FilesPart:
         parts = [file] if file.is_file() else [part for part in sorted(file.rglob("*")) if part.is_file()]
         is_sent = client is not None and sum(part.stat().st_size for part in parts) <= _MOST_SENT
         if is_sent:
-            content = file.read_bytes() if file.is_file() else zipped(file, parts)
+            content = zipped(file, parts) if file.is_dir() else sent_bytes(file)
             client.send_file_download(self._name(file), content, save_immediately=True)
         said = (
             "Sent to your browser, which saves it. It is also"
@@ -84,6 +95,40 @@ class FilesPart:
         video = Path(self._view.window.names.of(source, "video")).stem or "result"
         ending = file.suffix if file.is_file() else ".zip"
         return f"{video}{ending}" if file.stem.split("_")[0] in _SURFACES.values() else f"{video}_{file.stem}{ending}"
+
+
+def surface_words(run: Result, kept: Sequence[HandMeasure]) -> str:
+    """Return which part of the video the surface in the files is, and what its numbers are, as sentences.
+
+    run : the result or the submap that is exported. kept : what was measured by hand in the whole result.
+    """
+    segments, main = run.segments, run.main_segment
+    part = f"the part from {segments[main].words}" if len(segments) > 1 else "the whole result"
+    which = f"The surface is that of {part}."
+    if run.scale_known:
+        return f"{which} Its numbers are mm in STL and 3D Slicer, m in GLB."
+    if (factor := mm_per_unit(run, kept)) is None:
+        return f"{which} Its scale is unknown: its numbers are no mm."
+    return (
+        f"{which} Its scale is unknown: by your reference, times {factor:.3g} its numbers are mm in STL and 3D Slicer, "
+        "m in GLB."
+    )
+
+
+def mm_per_unit(run: Result, kept: Sequence[HandMeasure]) -> float | None:
+    """Return by which factor numbers of a result's main surface become mm, by a reference on it; None: by none."""
+    for one in kept:
+        is_here = one.kind == "reference" and one.folder == folder_in_whole(run)
+        if not is_here or one.reference_mm is None or run.segment_at(one.frame) != run.main_segment:
+            continue
+        length = float(np.linalg.norm(one.world[1] - one.world[0]))
+        return one.reference_mm / length if length > 0 else None
+    return None
+
+
+def sent_bytes(file: Path) -> bytes:
+    """Return the content of a file as it is sent; the report without links to the files beside it."""
+    return page_to_send(file) if file.name == PAGE else file.read_bytes()
 
 
 def zipped(folder: Path, parts: list[Path]) -> bytes:

@@ -57,6 +57,7 @@ class ResultView:
         self._of_frame: list[Callable[[], None]] = []
         self._of_measuring: list[Callable[[], None]] = []
         self._of_submap: list[Callable[[], None]] = []
+        self._of_sizes: list[Callable[[], None]] = []
         self._coverage: dict[int, Coverage] = {}
 
     @property
@@ -100,12 +101,14 @@ class ResultView:
         submap: Callable[[], None] | None = None,
         measuring: Callable[[], None] | None = None,
         note: Callable[[], None] | None = None,
+        sizes: Callable[[], None] | None = None,
     ) -> None:
-        """Call where another frame, submap or note is shown, or where measuring begins or ends."""
+        """Call where another frame, submap or note is shown, where measuring begins or ends, or sizes change."""
         self._of_frame += [frame] if frame else []
         self._of_submap += [submap] if submap else []
         self._of_measuring += [measuring] if measuring else []
         self._of_note += [note] if note else []
+        self._of_sizes += [sizes] if sizes else []
 
     def clicks_are_for(self, words: str) -> None:
         """Say above all tabs what the next click does; `LOOKING`: nothing is measured."""
@@ -207,6 +210,8 @@ class ResultView:
         found = verdict(self.whole)
         advice = advice_with_sizes(found.advice, words) if words else found.advice
         self._head.content = f"### {found.word.capitalize()}\n{escaped(advice)}"
+        for call in self._of_sizes:
+            call()
 
     def add_headline(self) -> None:
         """Make the place of the verdict in a word, and of what the result may be used for."""
