@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,11 @@ from scopemap.apps.browser.hand_measures import (
     reference_as_kept,
 )
 from scopemap.apps.browser.lesion_part import lesion_by_hand
+from scopemap.apps.browser.measured_list import measured_words, short, with_interval
 from scopemap.apps.browser.seen_by import corners_in
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
 from scopemap.apps.measure.hand_measure import HandMeasure, add_measurement, kept_measures
+from scopemap.apps.measure.measure import Measure
 from scopemap.engine.errors import InputError
 from scopemap.report.measured_by_hand import read_measurements
 from scopemap.report.page import write_report
@@ -197,3 +200,13 @@ def test_commands_are_broken_before_options() -> None:
     command = 'scopemap measure "a b" --frame 3 --points "1.0,2.0 3.0,4.0"'
     assert re.sub(r" \\\n +", " ", broken(command)) == command
     assert broken(command).count("\n") == 2
+
+
+def test_a_measure_whose_interval_begins_at_0_is_not_measurable() -> None:
+    height = Measure("height", 0.4716, 0.0, 10.91, "mm", "the relief")
+    assert str(height) == "height: not measurable (0 to 10.9 mm; wide mainly because of the relief)"
+    assert with_interval(height) == "not measurable (to 11 mm)"
+    assert short(height) == "not measurable"
+    one = HandMeasure(".", 4, np.zeros((3, 2)), None, None, [height], np.zeros((3, 3)), "lesion", "Polyp")
+    assert "height: not measurable, 95 % interval 0 to 10.9 mm" in measured_words(one).replace("\\", "")
+    assert str(replace(height, low=0.2, why="")) == "height: 0.472 mm (0.2 to 10.9)"

@@ -31,6 +31,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is install
 DESKTOP, PHONE = (1280, 800), (390, 844)
 # Without a graphics card: WebGL on the processor.
 ARGUMENTS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
+_ENDS = ("value", "low", "high")
 LIGHT_GROUND, DARK_GROUND = (0xE4, 0xE9, 0xF0), (0x0A, 0x0F, 0x15)
 
 
@@ -208,6 +209,35 @@ def test_keys_move_the_slider_and_turn_the_surface(browser: Any, report: Path) -
         assert off(opened.picture("#scene") - before, (0, 0, 0)).mean() > 0.01
 
 
+def test_the_wheel_scrolls_the_page_until_the_surface_is_clicked(browser: Any, report: Path) -> None:
+    opened = Opened(browser, report)
+    page, box = opened.page, opened.page.locator("#scene").bounding_box()
+    scrolled = "() => window.scrollY"
+
+    def wheel(delta: int) -> tuple[bool, bool]:
+        """Turn the wheel over the surface; return whether the page scrolled, and whether the surface changed."""
+        top, before = page.evaluate(scrolled), opened.picture("#scene")
+        page.mouse.wheel(0, delta)
+        page.wait_for_timeout(300)
+        has_scrolled = page.evaluate(scrolled) != top
+        page.evaluate("top => window.scrollTo(0, top)", top)
+        return has_scrolled, bool(np.abs(opened.picture("#scene") - before).max() > 24)
+
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    assert wheel(60) == (True, False)
+    page.keyboard.down("Control")
+    assert wheel(60) == (False, True)
+    page.keyboard.up("Control")
+    page.mouse.down()
+    page.mouse.up()
+    assert wheel(60) == (False, True)
+    page.mouse.move(2, 2)
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    assert wheel(60) == (True, False)
+    assert "the wheel after a click or with Ctrl" in opened.text("#surface .hint:not(.touch)")
+    assert opened.complaints == []
+
+
 def test_colours_views_and_curves_can_be_chosen(browser: Any, report: Path) -> None:
     opened = Opened(browser, report)
     before = opened.picture("#scene")
@@ -275,9 +305,18 @@ def measured_in_both(opened: Opened, folder: Path, number: int) -> tuple[str, di
     assert words.startswith(f"Frame {frame}: " + "; ".join(str(replace(one, why="")) for one in exact))
     rows = csv.DictReader(opened.page.locator("#csv").input_value().splitlines())
     found = {row["what"]: row for row in rows if row["number"] == str(number + 1)}
-    return words, {
-        one.what: [float(found[one.what][end]) / getattr(one, end) for end in ("value", "low", "high")] for one in exact
-    }
+    for one in exact:
+        # As few digits as the interval is worth.
+        assert [found[one.what][end] for end in _ENDS] == [f"{float(f'{getattr(one, end):.3g}'):.15g}" for end in _ENDS]
+    values = {one["what"]: one for one in saved(opened)[number]["found"]}
+    return words, {one.what: [values[one.what][end] / getattr(one, end) for end in _ENDS] for one in exact}
+
+
+def saved(opened: Opened) -> list[dict[str, Any]]:
+    """Return what the page hands over as JSON, with all digits."""
+    with opened.page.expect_download() as download:
+        opened.page.locator("#save-json").click()
+    return list(json.loads(Path(download.value.path()).read_text(encoding="utf-8")))
 
 
 def click(opened: Opened, selector: str, *shares: tuple[float, float]) -> None:
@@ -332,6 +371,23 @@ def test_measuring_by_hand_agrees_with_the_command(browser: Any, tmp_path: Path)
     assert opened.complaints == again.complaints == []
 
 
+def test_what_is_not_measurable_and_cards_of_segments_are_whole_sentences(browser: Any, tmp_path: Path) -> None:
+    from test_browser_segments import in_two_segments
+
+    folder = in_two_segments(draw_run(tmp_path))
+    height = {"what": "height", "value": 0.4716, "low": 0.0, "high": 10.912345, "unit": "mm"}
+    kept = {"kind": "lesion", "name": "Polyp", "folder": ".", "frame": 4, "points": [[1, 2]], "reference": None}
+    kept |= {"reference_mm": None, "found": [height], "command": "", "world": [[0, 0, 1]]}
+    keep_measurements(folder, json.dumps([kept]).encode())
+    opened = Opened(browser, write_report(folder)[0])
+    assert "Polyp, frame 4: height: not measurable (0 to 10.9 mm)" in opened.text("#measures li")
+    assert '"0.472","0","10.9","mm"' in opened.page.locator("#csv").input_value()
+    cards = opened.page.locator("#submap-list small").all_inner_texts()
+    assert len(cards) == 3  # the result, its other submap, its other segment
+    assert not any(card.rstrip().endswith(",") or ", ," in card for card in cards)
+    assert opened.complaints == []
+
+
 def test_points_on_the_surface_are_measured_where_a_frame_sees_the_reference_too(browser: Any, tmp_path: Path) -> None:
     folder = draw_run(tmp_path)
     opened = Opened(browser, write_report(folder)[0])
@@ -382,9 +438,10 @@ def test_without_a_scale_a_reference_is_the_unit(browser: Any, tmp_path: Path) -
     opened.page.locator("#pick-distance").click()
     click(opened, "#video", (0.3, 0.4), (0.62, 0.7))
     opened.wait("measures", "1")
+    told = opened.text("#hand-note")
     words, ratios = measured_in_both(opened, folder, 0)
     # What was found is said where it is seen without scrolling.
-    assert words.startswith(opened.text("#hand-note"))
+    assert words.startswith(told)
     note = opened.page.locator("#hand-note").bounding_box()
     assert 0 < note["y"] < note["y"] + note["height"] < DESKTOP[1]
     assert "scopemap measure maps/1" in words

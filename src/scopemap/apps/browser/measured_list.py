@@ -143,6 +143,8 @@ def with_interval(measure: Measure) -> str:
     """Return a value as the scene shows it, with its interval: "4.5 (1.1 to 13) mm"."""
     if not np.isfinite([measure.value, measure.low, measure.high]).all():
         return short(measure)
+    if not measure.is_measurable:
+        return f"not measurable (to {measure.high:.2g} {_SHORT.get(measure.unit, measure.unit)})"
     value, low, high = (f"{number:.2g}" for number in (measure.value, measure.low, measure.high))
     return f"{value} ({low} to {high}) {_SHORT.get(measure.unit, measure.unit)}"
 
@@ -151,4 +153,6 @@ def short(measure: Measure) -> str:
     """Return a value as the scene shows it: "16 mm", "0.75 x"."""
     if not np.isfinite(measure.value):
         return "gap"
+    if not measure.is_measurable:
+        return "not measurable"
     return f"{measure.value:.3g} {_SHORT.get(measure.unit, measure.unit)}"

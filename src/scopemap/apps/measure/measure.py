@@ -54,6 +54,11 @@ class Measure:
         why = changes.main_source(of_own) if high > WIDE * low else ""
         return cls(what, float(value), float(value * low), float(value * high), unit, why)
 
+    @property
+    def is_measurable(self) -> bool:
+        """Whether it is told from nothing: its interval does not begin at 0."""
+        return self.low != 0
+
     def __str__(self) -> str:
         if not np.isfinite(self.value):
             return f"{self.what}: none, the surface has a gap between the points"
@@ -61,6 +66,8 @@ class Measure:
             np.format_float_positional(float(f"{one:.3g}"), trim="-") for one in (self.value, self.low, self.high)
         )
         why = f"; wide mainly because of {self.why}" if self.why else ""
+        if not self.is_measurable:
+            return f"{self.what}: not measurable ({low} to {high} {self.unit}{why})"
         return f"{self.what}: {value} {self.unit}" + (f" ({low} to {high}{why})" if np.isfinite(self.low) else "")
 
 

@@ -36,7 +36,11 @@ function listenToScene(scene) {
     else if (event.shiftKey || event.buttons === 2) moveBy(dx, dy);
     else turnBy(-dx * 0.007, dy * 0.007);
   });
-  scene.addEventListener("wheel", (event) => (event.preventDefault(), zoom(Math.exp(event.deltaY * 0.001))), { passive: false });
+  // The wheel scrolls the page over a surface that was not clicked since the pointer came.
+  let taken = false;
+  scene.addEventListener("pointerdown", () => (taken = true));
+  scene.addEventListener("pointerleave", () => (taken = false));
+  scene.addEventListener("wheel", (event) => (taken || event.ctrlKey) && (event.preventDefault(), zoom(Math.exp(event.deltaY * 0.001))), { passive: false });
   scene.addEventListener("contextmenu", (event) => event.preventDefault());
   const keys = {
     ArrowLeft: () => turnBy(0.1, 0), ArrowRight: () => turnBy(-0.1, 0), ArrowUp: () => turnBy(0, -0.1), ArrowDown: () => turnBy(0, 0.1),

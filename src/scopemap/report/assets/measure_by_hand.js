@@ -6,7 +6,12 @@ const rounded = (pixel) => pixel.map((value) => Math.round(100 * value) / 100);
 const inWords = (pixels) => pixels.map((pixel) => pixel.join(",")).join(" ");
 const tell = (text) => put("hand-note", text);
 const lengthOf = (one) => (one.reference_mm === null ? "of unknown length" : `${one.reference_mm} mm long`);
-const foundIn = (one) => one.found.map((f) => `${f.what}: ${rounded3(f.value)}${f.value === null ? "" : ` ${f.unit} (${rounded3(f.low)} to ${rounded3(f.high)})`}`).join("; ");
+const valueIn = (f) => {
+  if (f.value === null) return rounded3(f.value);
+  if (f.low === 0) return `not measurable (0 to ${rounded3(f.high)} ${f.unit})`;
+  return `${rounded3(f.value)} ${f.unit} (${rounded3(f.low)} to ${rounded3(f.high)})`;
+};
+const foundIn = (one) => one.found.map((f) => `${f.what}: ${valueIn(f)}`).join("; ");
 const wordsOf = (one) => (one.kind === "reference" ? `Reference, ${lengthOf(one)}, in frame ${one.frame}` : `${one.name ? `${one.name}, frame` : "Frame"} ${one.frame}: ${foundIn(one)}`);
 
 // A picture's frame for `measured`, with its depth and its standard deviation at a pixel, NaN where unknown.
@@ -136,7 +141,8 @@ function markPictures() {
 
 function csvOf() {
   const cell = (value) => `"${String(value ?? "").replaceAll('"', '""')}"`;
-  const rows = hand.list.flatMap((one, n) => one.found.map((f) => [n + 1, one.folder, one.frame, f.what, f.value, f.low, f.high, f.unit, inWords(one.points)]));
+  const number = (value) => (value === null ? "" : Number(value.toPrecision(3)));
+  const rows = hand.list.flatMap((one, n) => one.found.map((f) => [n + 1, one.folder, one.frame, f.what, number(f.value), number(f.low), number(f.high), f.unit, inWords(one.points)]));
   return [["number", "folder", "frame", "what", "value", "low", "high", "unit", "pixels"], ...rows].map((cells) => cells.map(cell).join(",")).join("\n");
 }
 

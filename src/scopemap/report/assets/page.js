@@ -174,7 +174,8 @@ function writeSubmaps() {
     button.dataset.map = String(number);
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", `Surface: ${run.titles[number].name}`);
-    note.textContent = [`${number || isSegment(run, 0) ? `verdict: ${run.titles[number].word}, ` : ""}${map.frames} frames, ${partsInWords(run, number)}`, map.inliers].filter(Boolean).join(", ");
+    const word = number || isSegment(run, 0) ? `verdict: ${run.titles[number].word}` : "", parts = number && isSegment(run, number) ? "" : partsInWords(run, number);
+    note.textContent = [word, `${map.frames} frames`, parts, map.inliers].filter(Boolean).join(", ");
     const pair = document.createElement("span"), seen = run.pictures.filter((picture) => run.places[picture.row] === number);
     pair.className = "pair";
     pair.append(canvas);
