@@ -37,7 +37,7 @@ NEEDS = {
 }
 # Others of which some tests skip without the networks.
 PARTLY_NETWORKS = {"test_alike", "test_depth_benchmark", "test_weights"}
-BROWSER = {"test_browser_result_chromium", "test_browser_start", "test_report_browser"}
+BROWSER = {"test_browser_result_chromium", "test_browser_start", "test_report_browser", "test_report_measuring"}
 CLUSTER = {"test_engines", "test_addresses"}
 # Runs of whole clips, or of many processes: a module takes more than three seconds on an idle core. In other modules
 # single tests are marked `slow`, for the same reason.
