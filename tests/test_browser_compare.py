@@ -23,9 +23,11 @@ from front_door import call, refused
 from window_without_browser import element, elements, press, until, words
 
 from scopemap.apps.browser.compare_page import ComparePage
+from scopemap.apps.browser.surface_pair import distance_to_see
 from scopemap.apps.browser.two_results import apart_of, compare_results, is_alone, is_same_input
 from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.exams.compare_exams import Change, ExamComparison
+from scopemap.apps.exams.registration import Correspondences3D, Registration
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.rendering import vertex_colours
@@ -131,6 +133,12 @@ def test_the_input_is_known_by_its_content_else_by_its_name(tmp_path: Path) -> N
 # ---- the page
 
 
+def registered(residual: float) -> Registration:
+    """How two examinations of one world lie to each other."""
+    pairs = Correspondences3D(np.zeros((40, 3)), np.zeros((40, 3)))
+    return Registration(Similarity.identity(), residual, pairs, 1.0, 0.9, by_second=True)
+
+
 @contextmanager
 def opened(page: ComparePage, *, anonymous: bool = False) -> Iterator[BrowserWindow]:
     window = BrowserWindow(anonymous=anonymous)
@@ -197,11 +205,12 @@ def test_the_changes_of_two_examinations_are_flown_to(tmp_path: Path, monkeypatc
     place = np.array([0.0, 10.0, 40.0])
     compared = 1 + (np.linalg.norm(tube().vertices - place, axis=1) < 4).astype(np.uint8)
     change = Change("shape", place, 12.34, 1.5, 0.0, 21.0, 5, (6, 8))
-    found = ExamComparison(Similarity.identity(), 0.01, 0.9, tube(), [change], [(0, 1), (9, 10)], 0.1, 0.2, compared)
+    found = ExamComparison(registered(0.01), tube(), [change], [(0, 1), (9, 10)], 0.1, 0.2, compared)
     monkeypatch.setattr("scopemap.apps.exams.compare_exams.compare_exams", lambda *folders: found)
     with opened(ComparePage(first, second)) as window:
         until(window, lambda: "One over the other" in words(window))
         assert "1 place changed" in words(window)
+        assert "They fit: matched points are 1.0% of the depth apart" in words(window)
         assert "changed" in element(window, "Colours").options[0]
         nodes, camera = window.scene._handle_from_node_name, window.server.initial_camera
         before = np.array(camera.position)
@@ -209,14 +218,45 @@ def test_the_changes_of_two_examinations_are_flown_to(tmp_path: Path, monkeypatc
         assert np.asarray(camera.look_at) == pytest.approx(place)
         assert np.linalg.norm(np.array(camera.position) - before) > 1
         assert np.asarray(nodes["/page/first/change"].position) == pytest.approx(place)
-        assert "1.50 units nearer to the camera in the second" in words(window)
+        assert "1.50 units nearer to the camera in b" in words(window)
         labels = [getattr(one, "label", "") for one in elements(window)]
-        assert {"1: shape, first, frame 6", "second, frame 8"} <= set(labels)
+        assert {"1: shape, a, frame 6", "b, frame 8"} <= set(labels)
         press(window, "The same place", "frames 9 and 10")
-        assert "first, frame 9" in words(window)
+        assert "a, frame 9" in words(window)
         sent = nodes["/page/first/surface"].glb_data
         press(window, "Colours", "picture")
         assert nodes["/page/first/surface"].glb_data != sent
+        assert [nodes[f"/page/{side}/name"].text for side in ("first", "second")] == ["a", "b"]
+
+
+def test_of_two_that_do_not_fit_no_change_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = draw_run(tmp_path / "a"), draw_run(tmp_path / "b", name="another.mp4")
+    compared = np.zeros(len(tube().vertices), np.uint8)
+    found = ExamComparison(registered(0.286), tube(), [], [(0, 1)], 0.88, 0.63, compared)
+    asked: list[tuple[Path, ...]] = []
+    monkeypatch.setattr(
+        "scopemap.apps.exams.compare_exams.compare_exams", lambda *folders: (asked.append(folders), found)[1]
+    )
+    with opened(ComparePage(first, second)) as window:
+        until(window, lambda: "One over the other" in words(window))
+        said = words(window)
+        assert said.index("They do not fit: matched points are 28.6%") < said.index("Found in a")
+        assert "Changed places are not judged" in said
+        assert "what changed" not in said
+        press(window, "Exchange the two")
+        until(window, lambda: "Found in b: 90% of the keyframes of a" in words(window))
+    assert asked == [(first, second), (second, first)]
+
+
+@pytest.mark.parametrize("aspect", [0.4, 0.6, 1.0, 2.5])
+def test_both_surfaces_are_in_the_picture_whatever_its_shape(aspect: float) -> None:
+    fov_rad = np.deg2rad(75)
+    points = np.random.default_rng(0).uniform([-9, -2, -3], [9, 2, 3], (500, 3))
+    back = distance_to_see(points, fov_rad, aspect)
+    z = points[:, 2] + back
+    seen = np.abs(points[:, :2]) / z[:, None] / (np.tan(fov_rad / 2) * np.array([aspect, 1.0]))
+    assert z.min() > 0
+    assert 0.8 < seen.max() < 0.95
 
 
 # ---- the command

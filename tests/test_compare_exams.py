@@ -12,7 +12,12 @@ from drawn_run import Shown, changed, drawn_result
 from front_door import call, refused
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, pose, see
 
+from scopemap.apps.exams import registration
 from scopemap.apps.exams.compare_exams import ExamComparison, compare_exams
+from scopemap.apps.exams.examination import Examination
+from scopemap.apps.exams.exams_page import facts_of
+from scopemap.apps.exams.fit import GOOD_RESIDUAL, MOST_FAR, MOST_RESIDUAL, ExamFit, fit_of, judgement
+from scopemap.apps.exams.wording import names_of, summary
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.align import Similarity
@@ -81,8 +86,9 @@ def found(runs: tuple[Path, Path]) -> ExamComparison:
 
 def test_the_second_is_brought_to_the_first(found: ExamComparison) -> None:
     wanted = ANOTHER_WORLD.inverse()
-    assert found.located == 1
-    assert found.S_first_second.scale == pytest.approx(wanted.scale, rel=0.01)
+    by = found.registration
+    assert (by.located_first, by.located_second) == (1, 1)
+    assert by.S_first_second.scale == pytest.approx(wanted.scale, rel=0.01)
     assert np.median(np.abs(np.asarray(found.second.vertices)[:, 2] - PLANE_MM)) < 0.5
     assert len(found.views) == 6
     assert all(one + other == 5 for one, other in found.views[1:-1])  # it came from the other side
@@ -117,24 +123,88 @@ def test_what_only_one_saw(found: ExamComparison) -> None:
 def test_the_same_examination_has_no_change(runs: tuple[Path, Path]) -> None:
     same = compare_exams(runs[0], runs[0])
     assert same.changes == []
-    assert same.S_first_second.scale == pytest.approx(1, abs=1e-3)
+    assert same.fit is ExamFit.GOOD
+    assert same.registration.S_first_second.scale == pytest.approx(1, abs=1e-3)
 
 
 def test_the_command_writes_a_page(runs: tuple[Path, Path], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     film = tmp_path / "out.mp4"
     assert call("compare-exams", *runs, "--out", tmp_path / "out", "--video", film) == 0
     assert film.stat().st_size > 1000
-    assert "2 places changed" in capfd.readouterr().out
+    said = capfd.readouterr().out
+    assert said.startswith("They fit: matched points are ")
+    assert "2 places changed" in said
+    assert "Found in first: 100% of the keyframes of second." in said
     facts = json.loads((tmp_path / "out" / "changes.json").read_text())
     assert len(facts["changes"]) == 2
+    assert (facts["fit"], facts["located_first"]) == ("fit", 1)
+    assert facts["registered_by"] in ("first", "second")
     assert "area_unit2" in facts["changes"][0]  # its scale is not known
     page = (tmp_path / "out" / "compare.html").read_text()
     assert page.count("<tr>") == 3
-    assert "Above 0 the wall is nearer" in page
+    assert "Above 0 the wall is nearer to the camera, and redder, in second." in page
+    assert page.index("<strong>They fit: ") < page.index("Found in first")
     for name in ("changes.png", "views.png", "second.ply"):
         assert (tmp_path / "out" / name).stat().st_size > 1000
     assert "exists" in refused(capfd, "compare-exams", *runs, "--out", tmp_path / "out")
     assert "no finished run" in refused(capfd, "compare-exams", runs[0], tmp_path, "--out", tmp_path / "b")
+
+
+def test_the_order_does_not_decide_whether_they_fit(runs: tuple[Path, Path], found: ExamComparison) -> None:
+    back = compare_exams(runs[1], runs[0])
+    one, other = found.registration, back.registration
+    assert other.residual == pytest.approx(one.residual)
+    assert (other.by_second, other.located_first) == (not one.by_second, one.located_second)
+    assert back.fit is found.fit is ExamFit.GOOD
+
+
+def test_the_way_whose_points_agree_better_is_kept(
+    runs: tuple[Path, Path], found: ExamComparison, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad = {runs[0].name}
+
+    def spoiled(one: Examination, other: Examination) -> tuple[registration.Correspondences3D, int]:
+        pairs, located = whole(one, other)
+        if one.folder.name in bad:
+            pairs = pairs._replace(second=np.random.default_rng(0).permutation(pairs.second))
+        return pairs, located
+
+    whole = registration._correspondences
+    monkeypatch.setattr(registration, "_correspondences", spoiled)
+    one, other = (Examination(folder) for folder in runs)
+    for spoiled_map in runs:
+        bad = {spoiled_map.name}
+        kept = registration.register(one, other)
+        assert kept.by_second == (spoiled_map == runs[1])
+        assert kept.residual < GOOD_RESIDUAL
+    bad = {folder.name for folder in runs}
+    none = compare_exams(*runs)
+    assert none.registration.residual > MOST_RESIDUAL
+    assert none.fit is ExamFit.NONE
+    assert (none.changes, none.compared.any()) == ([], False)
+    assert facts_of(none, "mm")["changes"] is None
+    said = list(summary(none, "guessed", ("a", "b")))
+    assert said[0].startswith("They do not fit: matched points are ")
+    assert "Changed places are not judged." in said
+    assert not any("changed by more" in line for line in said)
+
+
+def test_the_judgement_has_the_figures_that_decide() -> None:
+    assert fit_of(GOOD_RESIDUAL, 0.9, 0.1) is ExamFit.GOOD
+    assert judgement(0.021, 0.9, 0.1) == "They fit: matched points are 2.1% of the depth apart (median)."
+    assert fit_of(GOOD_RESIDUAL + 0.01, 0.0, 0.0) is ExamFit.ROUGH
+    assert judgement(0.1, 0.4, 0.5).startswith("They fit roughly: matched points are 10.0% of the depth apart")
+    assert fit_of(0.01, MOST_FAR + 0.2, MOST_FAR + 0.1) is ExamFit.ROUGH
+    assert "but 60% or more of each surface is far from the other" in judgement(0.01, 0.7, 0.6)
+    assert fit_of(MOST_RESIDUAL + 0.01, 0.0, 0.0) is ExamFit.NONE
+    assert judgement(0.286, 0.88, 0.63) == (
+        "They do not fit: matched points are 28.6% of the depth apart (median); do not rely on what follows."
+    )
+
+
+def test_examinations_have_their_names_where_these_differ() -> None:
+    assert names_of("before", "after") == ("before", "after")
+    assert names_of("result", "result") == ("the first", "the second")
 
 
 def test_other_places_cannot_be_compared(runs: tuple[Path, Path], tmp_path: Path) -> None:

@@ -32,9 +32,12 @@ RIGHT_DEG = 10.0
 
 
 def changes(folder: Path, run: Path, first: Path, second: Path) -> tuple[bool, bool, int]:
-    """Return whether the polyp that went was found, whether the new one was, and how many changes are false."""
+    """Return whether the polyp that went was found, whether the new one was, and how many changes are false.
+
+    Of examinations that do not fit no changes are listed.
+    """
     S = match(read_trajectory(run), read_trajectory(first), "sim3").similarity
-    found = json.loads((folder / "changes.json").read_text(encoding="utf-8"))["changes"]
+    found = json.loads((folder / "changes.json").read_text(encoding="utf-8"))["changes"] or []
     places = np.array([S.transform_points(np.array(change["place"])) for change in found]).reshape(-1, 3)
     near = np.zeros((2, len(places)), bool)
     for number, source in enumerate((first, second)):

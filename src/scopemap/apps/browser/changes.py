@@ -15,7 +15,9 @@ from scopemap.apps.browser.surface_pair import SurfacePair
 from scopemap.apps.browser.window import escaped
 from scopemap.apps.exams.change_painting import COMPARED
 from scopemap.apps.exams.compare_exams import Change, ExamComparison
-from scopemap.apps.exams.exams_page import pictures_of, pictures_of_view, summary
+from scopemap.apps.exams.exams_page import pictures_of, pictures_of_view
+from scopemap.apps.exams.fit import ExamFit
+from scopemap.apps.exams.wording import summary
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.sheet import rgb_of
 from scopemap.result.result import Result
@@ -31,27 +33,29 @@ _PICTURE = "picture"
 _COMPARED = "compared"
 """Attribute of a vertex, as in `ExamComparison`."""
 
-_NO_FRAME = "Choose a change, or a place that both examinations show."
+_NO_FRAME = "Choose a place that both examinations show, or a change."
 
 
 class ShownChanges:
     """The part of the page that shows two examinations."""
 
     def __init__(
-        self, window: BrowserWindow, found: ExamComparison, runs: tuple[Result, Result], folders: tuple[Path, Path]
+        self, window: BrowserWindow, found: ExamComparison, folders: tuple[Path, Path], names: tuple[str, str]
     ) -> None:
-        self._window, self._found, self._runs, self._folders = window, found, runs, folders
+        runs = Result(folders[0]), Result(folders[1])
+        self._window, self._found, self._runs, self._folders, self._names = window, found, runs, folders, names
         self._poses = runs[0].frames["T_world_camera"][runs[0].frames.tracked]
 
     def open(self) -> None:
         """Make the elements."""
         window, gui, found, first = self._window, self._window.gui, self._found, self._runs[0]
-        gui.add_markdown("\n".join(f"- {escaped(line)}" for line in summary(found, first.scale)))
+        judged, *lines = (escaped(line) for line in summary(found, first.scale, self._names))
+        gui.add_markdown("\n".join([f"**{judged}**\n", *(f"- {line}" for line in lines)]))
         mesh = trimesh.Trimesh(
             first.mesh.vertices, first.mesh.faces, vertex_colors=vertex_colours(first.mesh), process=False
         )
         mesh.vertex_attributes[_COMPARED] = found.compared.astype(float)
-        self._pair = SurfacePair(window, (mesh, found.second), self._poses)
+        self._pair = SurfacePair(window, (mesh, found.second), self._poses, self._names)
         draw_path(window.scene, f"{self._pair.nodes[0]}/path", self._poses[:, :3, 3])
         unit = "mm" if first.scale_known else "units"
         for number, change in enumerate(found.changes[:_MOST], 1):
@@ -62,13 +66,15 @@ class ShownChanges:
             window.on(gui.add_dropdown("The same place", names), self._show_view, names)
         self._words = gui.add_markdown(_NO_FRAME)
         self._pictures = [gui.add_image(np.zeros((8, 10, 3), np.uint8), visible=False) for _ in range(2)]
-        window.on(gui.add_dropdown("Colours", (_CHANGED, _PICTURE)), self._colour)
+        is_judged = found.fit is not ExamFit.NONE
+        if is_judged:
+            window.on(gui.add_dropdown("Colours", (_CHANGED, _PICTURE)), self._colour)
         self._legend = gui.add_html("")
         window.on(gui.add_checkbox("One over the other", initial_value=False), self._pair.place)
         if not window.anonymous:
             command = shlex.join(["scopemap", "compare-exams", *map(str, self._folders), "--out", "comparison"])
             gui.add_markdown(f"The same as a page:\n```\n{command}\n```")
-        self._colour(_CHANGED)
+        self._colour(_CHANGED if is_judged else _PICTURE)
 
     def _colour(self, chosen: str) -> None:
         colours = [np.asarray(vertex_colours(surface)[:, :3]) for surface in self._pair.shown]
@@ -90,12 +96,12 @@ class ShownChanges:
         scene.add_icosphere(f"{node}/change", radius, _MARK, position=tuple(place), cast_shadow=False)
         look_from(self._window, pose[:3, 3], place, -pose[:3, 1])
         nearer = f"{abs(change.rise_mm):.2f} {'mm' if self._runs[0].scale_known else 'units'}"
-        nearer += f" {'nearer to' if change.rise_mm > 0 else 'farther from'} the camera in the second"
+        nearer += f" {'nearer to' if change.rise_mm > 0 else 'farther from'} the camera in {escaped(self._names[1])}"
         words = f"**{number}: {change.what}**, {nearer}; {change.sigmas:.0f} sigmas, in {change.views} views"
-        self._show(words, pictures_of(self._runs, self._found, change, number))
+        self._show(words, pictures_of(self._runs, self._names, self._found, change, number))
 
     def _show_view(self, chosen: str, names: list[str]) -> None:
-        self._show(f"**{chosen}**", pictures_of_view(self._runs, self._found.views[names.index(chosen)]))
+        self._show(f"**{chosen}**", pictures_of_view(self._runs, self._names, self._found.views[names.index(chosen)]))
 
     def _show(self, words: str, pictures: dict[str, np.ndarray]) -> None:
         self._words.content = words

@@ -14,6 +14,7 @@ from scopemap.apps.browser.scene import draw_path, look_at
 from scopemap.apps.browser.surface_pair import SurfacePair
 from scopemap.apps.browser.two_results import TwoResults, apart_of, compare_results, is_alone, is_same_input
 from scopemap.apps.browser.window import escaped
+from scopemap.apps.exams.wording import names_of
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import OUTSIDE
@@ -48,7 +49,7 @@ class ComparePage:
         """Make the elements; what takes long is done beside."""
         self._window, gui = window, window.gui
         given = [window.names.of(folder.resolve(), "result") for folder in self._folders]
-        self._names = (given[0], given[1]) if given[0] != given[1] else ("the first", "the second")
+        self._names = names_of(given[0], given[1])
         if window.first_page is not None:
             window.on(gui.add_button("Back to the start", color="gray"), window.start)
         first, second = (escaped(name) for name in self._names)
@@ -58,8 +59,8 @@ class ComparePage:
         else:
             from scopemap.apps.exams.compare_exams import compare_exams
 
-            gui.add_markdown("Two videos: they are compared as two examinations of one place.")
-            words = "Looking for the places of the second examination in the first, which takes minutes"
+            self._kind = gui.add_markdown("Two videos: they are compared as two examinations of one place.")
+            words = "Looking for the places of each examination in the other, which can take minutes"
             window.job(words, partial(compare_exams, *self._folders), self._show_exams)
 
     def tick(self) -> None:
@@ -71,14 +72,17 @@ class ComparePage:
     def _show_exams(self, found: Any) -> None:
         from scopemap.apps.browser.changes import ShownChanges
 
-        ShownChanges(self._window, found, self._runs, self._folders).open()
+        self._kind.visible = False  # the judgement stands first
+        ShownChanges(self._window, found, self._folders, self._names).open()
+        exchange = self._window.gui.add_button("Exchange the two", color="gray")
+        self._window.on_button(exchange, lambda: self._window.show(ComparePage(*reversed(self._folders))))
 
     def _show_results(self, found: TwoResults) -> None:
         window, gui, self._found = self._window, self._window.gui, found
         gui.add_markdown("\n".join(f"- {escaped(line)}" for line in found.sentences(*self._names)))
         self._legend = gui.add_html("")
         if found.surfaces is not None:
-            self._pair = SurfacePair(window, found.surfaces, np.concatenate(found.poses))
+            self._pair = SurfacePair(window, found.surfaces, np.concatenate(found.poses), self._names)
             chosen = gui.add_dropdown("Colours", (_DISTANCE, _ALONE, _PICTURE, _PLAIN), initial_value=_DISTANCE)
             window.on(chosen, self._colour)
             overlaid = gui.add_checkbox("One over the other", initial_value=False)
@@ -89,7 +93,8 @@ class ComparePage:
         places = ("/page", "/page") if found.surfaces is None else self._pair.nodes
         for place, poses, colour, name in zip(places, found.poses, (_FIRST, _SECOND), self._names, strict=True):
             draw_path(window.scene, f"{place}/path {colour}", poses[:, :3, 3], rgb_of(colour))
-            window.scene.add_label(f"{place}/name {colour}", name, position=tuple(poses[0, :3, 3]))
+            if found.surfaces is None:  # else the surfaces have names
+                window.scene.add_label(f"{place}/name {colour}", name, position=tuple(poses[0, :3, 3]))
         if found.surfaces is None:
             look_at(window, found.poses[0][0], np.concatenate([poses[:, :3, 3] for poses in found.poses]))
         if not window.anonymous:

@@ -17,6 +17,7 @@ from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.surface_part import SurfacePart
 from scopemap.apps.browser.unseen_part import UnseenPart
 from scopemap.apps.browser.verdict_part import VerdictPart
+from scopemap.apps.browser.workspace import in_time
 from scopemap.result.result import Result
 from scopemap.result.run_input import find_input
 from scopemap.result.run_view import view_folder
@@ -103,7 +104,7 @@ class ResultPage:
             shown = [f"result {n}" for n in range(1, len(names) + 1)] if window.anonymous else names
             chosen = gui.add_dropdown("Other result", shown)
             button = gui.add_button("Compare with it")
-            window.on(button, lambda: self._compare(others[names[shown.index(chosen.value)]]))
+            window.on_button(button, lambda: self._compare(others[names[shown.index(chosen.value)]]))
 
     def _ways_now(self) -> tuple[str, ...]:
         # Not more than two: they stay in one row, and the tabs where they are.
@@ -125,7 +126,7 @@ class ResultPage:
     def _compare(self, other: Path) -> None:
         from scopemap.apps.browser.compare_page import ComparePage
 
-        self._window.show(ComparePage(self._run.folder, other))
+        self._window.show(ComparePage(*in_time(self._run.folder, other)))
 
     def _run_again(self, again: NextRun, value: str) -> None:
         """Start this run with one more option, and show it."""

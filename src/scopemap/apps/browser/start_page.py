@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -13,7 +14,7 @@ from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage, words_of
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.window import escaped
-from scopemap.apps.browser.workspace import DEMONSTRATION, VIDEO_KINDS, Workspace, made_and_word, thumbnail
+from scopemap.apps.browser.workspace import DEMONSTRATION, VIDEO_KINDS, Workspace, in_time, made_and_word, thumbnail
 from scopemap.engine.errors import InputError
 from scopemap.result.run_view import read_state, view_folder
 
@@ -64,7 +65,7 @@ class StartPage:
         with gui.add_folder("A camera or a stream", expand_by_default=False):
             hint = "Number of a camera, /dev/video0, or an address such as rtsp://..."
             source = gui.add_text("Source", "", hint=hint)
-            window.on(gui.add_button("Watch it live"), lambda: self._open_live(str(source.value).strip()))
+            window.on_button(gui.add_button("Watch it live"), lambda: self._open_live(str(source.value).strip()))
 
     def tick(self) -> None:
         """Show what has changed: of the runs, and of what is being sent."""
@@ -97,7 +98,9 @@ class StartPage:
                 gui.add_markdown("There is none. Send one, or start `scopemap app` in the folder of your videos.")
             hint = "Of a video, of a folder of images or of a data set, below this folder."
             typed = gui.add_text("Other path", "", hint=hint)
-            self._window.on(gui.add_button("Choose this path"), lambda: self._choose_typed(str(typed.value).strip()))
+            self._window.on_button(
+                gui.add_button("Choose this path"), lambda: self._choose_typed(str(typed.value).strip())
+            )
 
     def _add_upload(self) -> None:
         gui, workspace = self._window.gui, self._workspace
@@ -174,11 +177,13 @@ class StartPage:
                     picture.image = thumbnail(results[label])
 
             self._window.on(first, show)
-            self._window.on(gui.add_button("Look at this result"), lambda: self._show_result(results, first.value))
+            look = gui.add_button("Look at this result")
+            self._window.on_button(look, lambda: self._show_result(results, first.value))
             if len(results) > 1:
-                second = gui.add_dropdown("Compare with", tuple(results), initial_value=list(results)[1])
+                second = gui.add_dropdown("Compare with", _without(results, first.value))
+                self._window.on(first, lambda label: _offer(second, _without(results, label)))
                 compare = gui.add_button("Compare the two", color="gray")
-                self._window.on(compare, lambda: self._compare(results, first.value, second.value))
+                self._window.on_button(compare, lambda: self._compare(results, first.value, second.value))
 
     def _demonstrate(self) -> None:
         clip = self._workspace.results / DEMONSTRATION
@@ -217,7 +222,7 @@ class StartPage:
         if first in results and second in results:
             from scopemap.apps.browser.compare_page import ComparePage
 
-            self._window.show(ComparePage(results[first], results[second]))
+            self._window.show(ComparePage(*in_time(results[first], results[second])))
 
     def show_run(self, run: BrowserRun) -> None:
         """Show a run while it goes on, or its result."""
@@ -232,3 +237,13 @@ class StartPage:
         title = window.names.of(run.source, "video")
         waiting = lambda: workspace.runs.place(run)  # noqa: E731
         window.show(RunPage(run, view_folder(run.out), title, finished, waiting=waiting))
+
+
+def _without(labels: Iterable[str], chosen: str) -> tuple[str, ...]:
+    return tuple(label for label in labels if label != chosen)
+
+
+def _offer(dropdown: Any, options: tuple[str, ...]) -> None:
+    """Let a dropdown offer other options; what is chosen stays where it is one of them, else it is the first."""
+    if dropdown.options != options:
+        dropdown.options = options

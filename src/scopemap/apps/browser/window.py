@@ -98,6 +98,22 @@ class BrowserWindow:
             handle.on_update(lambda event: self.do(call, handle.value, *arguments) if event.client else None)
         return handle
 
+    def on_button(self, button: Any, call: Callable[..., None], *arguments: Any) -> Any:
+        """Call as `on` does; what goes wrong is said below the button, where the person looks; return the button.
+
+        Call it where the button was just made: its sentence has the next place in the panel.
+        """
+        said = self.gui.add_markdown("", visible=False)
+
+        def called() -> None:
+            said.visible = False
+            try:
+                call(*arguments)
+            except ScopemapError as error:
+                said.content, said.visible = self._strong(_sentence(error)), True
+
+        return self.on(button, called)
+
     def do(self, call: Callable[..., None], *arguments: Any) -> None:
         """Call in the window's thread, after what is already to be done; may be called from any thread."""
         page = self._page
@@ -139,7 +155,7 @@ class BrowserWindow:
 
     def fail(self, words: str, log: str = "") -> None:
         """Show what went wrong above the page, with a log to copy."""
-        self._error.content, self._error.visible = f"**{escaped(self.names.hidden(words))}**", True
+        self._error.content, self._error.visible = self._strong(words), True
         self._log.content, self._log.visible = fenced(self.names.hidden(log)), bool(log)
 
     def theme(self, *, dark: bool) -> None:
@@ -176,6 +192,9 @@ class BrowserWindow:
         self._worker.shutdown(wait=False, cancel_futures=True)
         stop_server(self.server)
 
+    def _strong(self, words: str) -> str:
+        return f"**{escaped(self.names.hidden(words))}**"
+
     def _show(self, page: Page) -> None:
         if self._page is not None:
             self._page.close()
@@ -192,9 +211,13 @@ class BrowserWindow:
         try:
             call()
         except ScopemapError as error:
-            self.fail("; ".join([str(error), *getattr(error, "__notes__", [])]))
+            self.fail(_sentence(error))
         except Exception as error:
             self.fail(f"something unexpected went wrong: {error}", traceback.format_exc())
+
+
+def _sentence(error: ScopemapError) -> str:
+    return "; ".join([str(error), *getattr(error, "__notes__", [])])
 
 
 def typed_number(text: str) -> float:

@@ -214,6 +214,12 @@ def made_and_word(folder: Path) -> str:
     return f"{made:%Y-%m-%d %H:%M}, {LEVEL_WORDS[level_of_submap(run)]}"
 
 
+def in_time(one: Path, other: Path) -> tuple[Path, Path]:
+    """Return two finished results, the one that was made earlier first."""
+    made = [(folder / _MARK).stat().st_mtime for folder in (one, other)]
+    return (one, other) if made[0] <= made[1] else (other, one)
+
+
 def thumbnail(folder: Path) -> np.ndarray:
     """Return the picture of a frame in the middle of a finished result, (h, w, 3) uint8; a grey pixel: it has none."""
     run = Result(folder)

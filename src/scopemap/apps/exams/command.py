@@ -30,12 +30,14 @@ def compare_exams(
 ) -> None:
     """Register two examinations and show what changed.
 
-    Both must show the same place. The page shows matched views, changes, and what only one examination saw.
+    Both must show the same place. The first sentence says whether they fit. The page shows matched views, changes, and
+    what only one examination saw.
     """
     options.check_output(out / "compare.html", (".html",), overwrite)
     from scopemap.apps.exams.change_painting import change_painting
     from scopemap.apps.exams.compare_exams import compare_exams as compare
-    from scopemap.apps.exams.exams_page import PAGE, facts_of, summary, write_comparison
+    from scopemap.apps.exams.exams_page import PAGE, facts_of, write_comparison
+    from scopemap.apps.exams.wording import names_of, summary
     from scopemap.apps.view.fly_through import write_fly_through
     from scopemap.result.result import Result
 
@@ -49,6 +51,6 @@ def compare_exams(
     if as_json:
         print_json(facts_of(found, "mm" if run.scale_known else "unit"))
     elif not quiet:
-        for line in summary(found, run.scale):
+        for line in summary(found, run.scale, names_of(first.resolve().name, second.resolve().name)):
             typer.echo(line)
         typer.echo(f"look at {out / PAGE}")

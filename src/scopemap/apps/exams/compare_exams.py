@@ -1,11 +1,12 @@
 """Compares two examinations of a place: the second one's surface in the map of the first, and where they differ.
 
-Keyframes of the second are located in the map of the first. Matched features, with the depth of both, pair points of
-the two surfaces. In the view of each keyframe of the first, the similarity of the pairs in sight brings the second
-surface to the first one: drift, and a wall that is wider as a whole, are no change. Both are rendered there. Features
-alone leave the two pictures some pixels apart, so smooth optical flow warps the second one onto the first. A change is
-where shape or colour, beside what is around the place, differ by far more than they do in most places, in more than one
-view. Colours are those of the surfaces, without lamp and exposure: of them the ratio of red to green.
+Keyframes of either are located in the map of the other (`registration`). Matched features, with the depth of both, pair
+points of the two surfaces. In the view of each keyframe of the first, the similarity of the pairs in sight brings the
+second surface to the first one: drift, and a wall that is wider as a whole, are no change. Both are rendered there.
+Features alone leave the two pictures some pixels apart, so smooth optical flow warps the second one onto the first. A
+change is where shape or colour, beside what is around the place, differ by far more than they do in most places, in
+more than one view. Colours are those of the surfaces, without lamp and exposure: of them the ratio of red to green.
+Changes are judged only where the two surfaces fit (`fit`).
 """
 
 from __future__ import annotations
@@ -20,23 +21,19 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scopemap.apps.locate.locate import NOT_FOUND, PlaceMap
+from scopemap.apps.exams.examination import HIDDEN, Examination
+from scopemap.apps.exams.fit import ExamFit, fit_of
+from scopemap.apps.exams.registration import LEAST_PAIRS, Correspondences3D, Registration, register, robust_similarity
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.errors import AlignmentError, InputError
+from scopemap.engine.errors import AlignmentError
 from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.flow.estimator import FlowEstimator, pair_flow
-from scopemap.engine.geometry.align import Similarity, umeyama
+from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.local_contrast import local_mean
 from scopemap.engine.geometry.rendering import Rendering, render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.warp import pull
-from scopemap.result.result import Result
-from scopemap.runner.reread_frames import reread_frames
 
-_LEAST_PAIRS = 30  # in the view of a keyframe
-_OUTLIERS = 2.5  # pairs farther apart than so many medians are left out, so many times
-_FITS = 8
-_HIDDEN = 0.15  # of depth: farther apart the surfaces are not the same wall
 _AROUND_SHARE = 0.1  # of the picture's width: standard deviation of what is around a place
 _CONSISTENCY_PX = 1.0  # of flow there and back
 _FLOW_SHARE = 0.05  # of the picture's width: standard deviation of the Gaussian that smooths flow
@@ -50,13 +47,6 @@ _LEAST_AREA_SHARE = 0.01  # its area, of the squared median depth
 _SHOWN_VIEWS = 8  # how far apart they are: distance over depth, and angle between the views
 _SAME_VIEW = 0.8
 _APART = 0.08  # of depth, from the other surface: only one of them saw it
-
-
-class Correspondences3D(NamedTuple):
-    """Points of two surfaces that show the same place, (N, 3) mm, each in its own world."""
-
-    first: np.ndarray
-    second: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -82,16 +72,13 @@ class Change:
 class ExamComparison:
     """Two examinations in the world of the first.
 
-    S_first_second : of all pairs. residual : median distance of pairs after it, over the median depth. located : which
-    share of the keyframes of the second was found. second : its surface in the world of the first. changes : the
-    surest first. views : numbers of frames of both that show the same places. only_first,
-    only_second : shares of the surfaces' vertices that are far from the other one. compared : (V,) of the vertices of
-    the first, 0 where they were not compared, 1 where nothing changed, 2 where something did.
+    registration : of all pairs, and how well they agree. second : its surface in the world of the first. changes : the
+    surest first; none where the two do not fit. views : numbers of frames of both that show the same places.
+    only_first, only_second : shares of the surfaces' vertices that are far from the other one. compared : (V,) of the
+    vertices of the first, 0 where they were not compared, 1 where nothing changed, 2 where something did.
     """
 
-    S_first_second: Similarity
-    residual: float
-    located: float
+    registration: Registration
     second: trimesh.Trimesh
     changes: list[Change]
     views: list[tuple[int, int]]
@@ -99,38 +86,10 @@ class ExamComparison:
     only_second: float
     compared: np.ndarray
 
-
-class _Exam:
-    """A result: poses of its keyframes, of the frames that it kept a picture of, and its surface."""
-
-    def __init__(self, folder: Path) -> None:
-        self.run = Result(folder).checked()
-        if not self.run.depth.present:
-            raise InputError(f"the run {folder} kept no depth maps")
-        if not len(self.run.mesh.faces):
-            raise InputError(f"the run {folder} has no surface")
-        tracked = self.run.frames.only(self.run.frames.tracked)
-        poses = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
-        known = sorted(poses.keys() & (set(tracked["keyframe"].tolist()) or poses.keys()))
-        self.poses = {index: poses[index] for index in known}
-        self.shown = {index: poses[index] for index in self.run.pictured if index in poses} or self.poses
-        medians = [np.nanmedian(depth) for index in known if (depth := self.run.depth.read(index)) is not None]
-        self.depth_mm = float(np.median(medians))
-
-    def best_view(self, place_mm: np.ndarray) -> int:
-        """Return the number of the shown frame in whose middle a place (3,) is, near and not hidden; -1: none."""
-        camera, best = self.run.camera, (-1, 0.0)
-        for index, pose in self.shown.items():
-            point, depth_mm = transform(inverse(pose), place_mm[None])[0], self.run.depth.read(index)
-            if depth_mm is None or point[2] <= 0:
-                continue
-            x, y = camera.project(point[None])[0]
-            if 0 <= x <= camera.width - 1 and 0 <= y <= camera.height - 1:
-                off = np.hypot(x / camera.width - 0.5, y / camera.height - 0.5)
-                score = (1 - off) / point[2]
-                is_seen = abs(depth_mm[round(y), round(x)] / point[2] - 1) < 2 * _HIDDEN
-                best = max(best, (index, score), key=lambda pair: pair[1]) if is_seen else best
-        return best[0]
+    @property
+    def fit(self) -> ExamFit:
+        """Whether the two fit; changes are judged only where they do."""
+        return fit_of(self.registration.residual, self.only_first, self.only_second)
 
 
 def compare_exams(
@@ -139,28 +98,22 @@ def compare_exams(
     """Compare the results of two examinations; their main maps alone.
 
     first_source, second_source : where their inputs are now; else they are looked for. Raises `InputError` where a
-    folder holds no finished run with depth and surface, an input is gone, or the second is not found in the first.
+    folder holds no finished run with depth and surface, an input is gone, or neither is found in the other.
     """
-    one, other = _Exam(first), _Exam(second)
-    pairs, located = _correspondences(PlaceMap(first, first_source), other, second, second_source)
-    apart = f"{located} of {len(other.poses)} keyframes of {second} were found in the map of {first}"
-    if len(pairs.first) < _LEAST_PAIRS:
-        raise InputError(f"the examinations cannot be compared: {apart}")
-    try:
-        S, distance = _robust_similarity(pairs)
-    except AlignmentError as error:
-        raise InputError(f"the examinations cannot be compared: {apart}; {error}") from None
-    moved = other.run.mesh.copy()
+    one, other = Examination(first, first_source), Examination(second, second_source)
+    found = register(one, other)
+    S, moved = found.S_first_second, other.run.mesh.copy()
     moved.vertices = S.transform_points(np.asarray(moved.vertices))
-    changes, compared = _changes(one, other, S, _differences(one, other.run.mesh, pairs))
     tree = [cKDTree(np.asarray(mesh.vertices)) for mesh in (one.run.mesh, moved)]
     only = [float((tree[1 - n].query(tree[n].data)[0] > _APART * one.depth_mm).mean()) for n in (0, 1)]
-    residual = float(np.median(distance)) / one.depth_mm
+    changes, compared = list[Change](), np.zeros(len(one.run.mesh.vertices), np.uint8)
+    if fit_of(found.residual, *only) is not ExamFit.NONE:
+        changes, compared = _changes(one, other, S, _differences(one, other.run.mesh, found.pairs))
     views = _views(one, other, S)
-    return ExamComparison(S, residual, located / len(other.poses), moved, changes, views, only[0], only[1], compared)
+    return ExamComparison(found, moved, changes, views, only[0], only[1], compared)
 
 
-def _views(one: _Exam, other: _Exam, S: Similarity) -> list[tuple[int, int]]:
+def _views(one: Examination, other: Examination, S: Similarity) -> list[tuple[int, int]]:
     """Return some shown frames of the first, each with that of the second whose pose is nearest, if it is near."""
     number, poses = [*other.shown], S.transform_poses(np.array([*other.shown.values()]))
     nearest: dict[int, tuple[float, int]] = {}
@@ -171,34 +124,6 @@ def _views(one: _Exam, other: _Exam, S: Similarity) -> list[tuple[int, int]]:
         if apart[there] < nearest.get(there, (_SAME_VIEW, 0))[0]:
             nearest[there] = float(apart[there]), index
     return sorted((index, number[there]) for there, (_, index) in nearest.items())
-
-
-def _correspondences(
-    places: PlaceMap, other: _Exam, folder: Path, source: Path | None
-) -> tuple[Correspondences3D, int]:
-    """Return the pairs by the keyframes of the second that are located in the main map, and how many these are."""
-    first, second, located = [np.zeros((0, 3))], [np.zeros((0, 3))], 0
-    for frame in reread_frames(folder, set(other.poses), source):
-        found, depth_mm = places.locate(frame), other.run.depth.read(frame.index)
-        if found.status == NOT_FOUND or found.map or depth_mm is None:
-            continue
-        located += 1
-        column, row = np.rint(found.pixels).astype(int).T
-        z = np.where(frame.valid, depth_mm, np.nan)[row, column]
-        points = transform(other.poses[frame.index], frame.camera.unproject(found.pixels) * z[:, None])
-        first.append(found.points_mm[np.isfinite(z)])
-        second.append(points[np.isfinite(z)])
-    return Correspondences3D(np.concatenate(first), np.concatenate(second)), located
-
-
-def _robust_similarity(pairs: Correspondences3D) -> tuple[Similarity, np.ndarray]:
-    """Return the similarity of most pairs, and the distance (N,) of all after it."""
-    kept = np.ones(len(pairs.first), bool)
-    for _ in range(_FITS):
-        S = umeyama(pairs.second[kept], pairs.first[kept], True)
-        distance = np.linalg.norm(S.transform_points(pairs.second) - pairs.first, axis=1)
-        kept = distance <= _OUTLIERS * np.median(distance[kept])
-    return S, distance
 
 
 class _Difference(NamedTuple):
@@ -213,16 +138,16 @@ class _Difference(NamedTuple):
     depth_mm: np.ndarray
 
 
-def _differences(one: _Exam, second: trimesh.Trimesh, pairs: Correspondences3D) -> _Difference:
+def _differences(one: Examination, second: trimesh.Trimesh, pairs: Correspondences3D) -> _Difference:
     """Return how the second surface differs from the first one in the views of the first one's keyframes."""
     mesh = one.run.mesh
     views, total, flow = np.zeros(len(mesh.vertices), int), np.zeros((3, len(mesh.vertices))), DisFlow()
     for pose in one.poses.values():
         in_sight, _, _ = _pixels(one.run.camera, pose, pairs.first)
-        if len(in_sight) < _LEAST_PAIRS:
+        if len(in_sight) < LEAST_PAIRS:
             continue
         try:
-            S, _ = _robust_similarity(Correspondences3D(pairs.first[in_sight], pairs.second[in_sight]))
+            S, _ = robust_similarity(Correspondences3D(pairs.first[in_sight], pairs.second[in_sight]))
         except AlignmentError:
             continue
         aligned = second.copy()
@@ -247,7 +172,7 @@ def _compared(own: Rendering, there: Rendering) -> tuple[np.ndarray, np.ndarray]
     """Return ln of own depth over the other one (H, W), and where both show the same wall, (H, W) bool."""
     with np.errstate(invalid="ignore"):
         nearer = np.log(own.depth_mm / there.depth_mm)
-    return nearer, np.abs(nearer) < _HIDDEN
+    return nearer, np.abs(nearer) < HIDDEN
 
 
 def _matched(own: Rendering, there: Rendering, flow: FlowEstimator) -> Rendering:
@@ -287,7 +212,9 @@ def _local_difference(values: np.ndarray, known: np.ndarray, width_px: float) ->
     return np.where(known, local_mean(beside, width_px, weight), np.float32(0))
 
 
-def _changes(one: _Exam, other: _Exam, S: Similarity, found: _Difference) -> tuple[list[Change], np.ndarray]:
+def _changes(
+    one: Examination, other: Examination, S: Similarity, found: _Difference
+) -> tuple[list[Change], np.ndarray]:
     """Return the changes, surest first, and `compared` of `ExamComparison`."""
     compared = found.views >= _LEAST_VIEWS
     state = compared.astype(np.uint8)

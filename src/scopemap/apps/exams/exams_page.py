@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,8 @@ import cv2
 import numpy as np
 
 from scopemap.apps.exams.compare_exams import Change, ExamComparison
+from scopemap.apps.exams.fit import ExamFit
+from scopemap.apps.exams.wording import names_of, summary
 from scopemap.engine.errors import reporting
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.input.decoding import read_decoded
@@ -27,14 +28,14 @@ _CELL_PX = (420, 330)
 _RING = "#ffd000"
 _MOST = 12
 _STYLE = "body{font:15px/1.4 system-ui,sans-serif;margin:16px;max-width:920px}img{max-width:100%}td,th{padding:2px 9px}"
-_LEGEND = "Above 0 the wall is nearer to the camera, and redder, in the second. Sigmas say how sure a change is."
+_LEGEND = "Above 0 the wall is nearer to the camera, and redder, in {}. Sigmas say how sure a change is."
 _NO_DEVICE = "Research software, not a medical device."
 _HEADS = "<th></th><th>what</th><th>area, {0}²</th><th>nearer by, {0}</th><th>redness</th><th>sigmas</th>"
 
 
 def facts_of(found: ExamComparison, unit: str) -> dict[str, Any]:
     """Return what was found as JSON has it; unit : of lengths, "mm" or "unit"."""
-    names = ("located", "residual", "only_first", "only_second")
+    by = found.registration
     changes = [
         {
             "what": change.what,
@@ -49,9 +50,18 @@ def facts_of(found: ExamComparison, unit: str) -> dict[str, Any]:
         }
         for change in found.changes
     ]
-    S = found.S_first_second
-    similarity = {"scale": S.scale, "R": S.R.tolist(), "t": S.t.tolist()}
-    return {name: getattr(found, name) for name in names} | {"S_first_second": similarity, "changes": changes}
+    S = by.S_first_second
+    return {
+        "fit": str(found.fit),
+        "residual": by.residual,
+        "located": by.located_second,
+        "located_first": by.located_first,
+        "registered_by": "second" if by.by_second else "first",
+        "only_first": found.only_first,
+        "only_second": found.only_second,
+        "S_first_second": {"scale": S.scale, "R": S.R.tolist(), "t": S.t.tolist()},
+        "changes": None if found.fit is ExamFit.NONE else changes,
+    }
 
 
 def write_comparison(found: ExamComparison, first: Path, second: Path, out: Path) -> None:
@@ -59,39 +69,33 @@ def write_comparison(found: ExamComparison, first: Path, second: Path, out: Path
 
     Raises `InputError` where a file cannot be written.
     """
-    runs = Result(first), Result(second)
+    runs, names = (Result(first), Result(second)), names_of(first.resolve().name, second.resolve().name)
     unit = "mm" if runs[0].scale_known else "unit"
     with reporting(f"cannot write to {out}"):
         out.mkdir(parents=True, exist_ok=True)
         (out / TABLE).write_text(json.dumps(facts_of(found, unit), indent=2) + "\n", encoding="utf-8")
         found.second.export(out / "second.ply")
-        changes = [pictures_of(runs, found, change, number) for number, change in enumerate(found.changes[:_MOST], 1)]
+        changes = [
+            pictures_of(runs, names, found, change, number) for number, change in enumerate(found.changes[:_MOST], 1)
+        ]
         picture_grid(changes, _CELL_PX).save(out / CHANGES)
-        views = [pictures_of_view(runs, view) for view in found.views]
+        views = [pictures_of_view(runs, names, view) for view in found.views]
         picture_grid(views, _CELL_PX).save(out / VIEWS)
     rows = "".join(_row(change, number, unit) for number, change in enumerate(found.changes, 1))
     head = f"<tr>{_HEADS.format(unit)}</tr>"
-    changed = f"<table>{head}{rows}</table><p>{_LEGEND}</p><img src={CHANGES} alt='Changes'>" if rows else ""
-    names, lines = (html.escape(folder.name) for folder in (first, second)), summary(found, runs[0].scale)
-    head = "<!doctype html><meta charset=utf-8><title>{0} and {1}</title><h1>{0} (first) and {1} (second)</h1>"
+    one, other = (html.escape(name) for name in names)
+    legend = f"<p>{_LEGEND.format(other)}</p>"
+    changed = f"<table>{head}{rows}</table>{legend}<img src={CHANGES} alt='Changes'>" if rows else ""
+    judged, *lines = (html.escape(line) for line in summary(found, runs[0].scale, names))
     parts = [
-        head.format(*names),
+        f"<!doctype html><meta charset=utf-8><title>{one} and {other}</title><h1>{one} and {other}</h1>",
         f"<style>{_STYLE}</style>",
-        *(f"<p>{html.escape(line)}</p>" for line in lines),
+        f"<p><strong>{judged}</strong></p>",
+        *(f"<p>{line}</p>" for line in lines),
         changed,
     ]
     parts += [f"<h2>The same places</h2><img src={VIEWS} alt='Matched views'>", f"<p><strong>{_NO_DEVICE}</strong></p>"]
     write_at_once(out / PAGE, "\n".join(parts))
-
-
-def summary(found: ExamComparison, scale: str) -> Iterator[str]:
-    """Yield what was found, a sentence a line; scale : what the first one's sizes rest on."""
-    apart = f"matched points are {found.residual:.1%} of the depth apart (median)"
-    yield f"{found.located:.0%} of the second's keyframes were found in the first; {apart}."
-    yield f"Far from the other surface: {found.only_first:.0%} of the first, {found.only_second:.0%} of the second."
-    count = len(found.changes)
-    yield f"{count or 'No'} place{'s' * (count != 1)} changed by more than the surfaces differ elsewhere."
-    yield f"Sizes are the first's: {scale}."
 
 
 def _row(change: Change, number: int, unit: str) -> str:
@@ -99,21 +103,22 @@ def _row(change: Change, number: int, unit: str) -> str:
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in (*cells, f"{change.sigmas:.0f}")) + "</tr>"
 
 
-def pictures_of_view(runs: tuple[Result, Result], view: tuple[int, int]) -> dict[str, np.ndarray]:
+def pictures_of_view(
+    runs: tuple[Result, Result], names: tuple[str, str], view: tuple[int, int]
+) -> dict[str, np.ndarray]:
     """Return the small pictures of two frames of both, (h, w, 3) uint8, by what they are."""
-    one, other = view
-    return {f"first, frame {one}": _picture(runs[0], one), f"second, frame {other}": _picture(runs[1], other)}
+    return {f"{name}, frame {index}": _picture(run, index) for run, name, index in zip(runs, names, view, strict=True)}
 
 
 def pictures_of(
-    runs: tuple[Result, Result], found: ExamComparison, change: Change, number: int
+    runs: tuple[Result, Result], names: tuple[str, str], found: ExamComparison, change: Change, number: int
 ) -> dict[str, np.ndarray]:
     """Return the small pictures of both that show a change, with a ring around it, by what they are."""
-    places = change.place_mm, found.S_first_second.inverse().transform_points(change.place_mm)
-    names = (f"{number}: {change.what}\nfirst, frame", "\nsecond, frame")
+    places = change.place_mm, found.registration.S_first_second.inverse().transform_points(change.place_mm)
+    heads = (f"{number}: {change.what}\n{names[0]}, frame", f"\n{names[1]}, frame")
     return {
-        f"{name} {index}": _ringed(run, index, place)
-        for run, name, index, place in zip(runs, names, change.frames, places, strict=True)
+        f"{head} {index}": _ringed(run, index, place)
+        for run, head, index, place in zip(runs, heads, change.frames, places, strict=True)
     }
 
 
