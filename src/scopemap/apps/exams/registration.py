@@ -1,7 +1,7 @@
 """Brings the second of two examinations to the first: keyframes of either are located in the map of the other.
 
-Either way gives pairs of points. The way whose pairs agree better is kept: on a laparoscopy they were 29 % of the depth
-apart one way, 10 % the other way.
+Either way gives pairs of points. The way whose pairs agree better is kept: on a laparoscopy they were 32 % of the depth
+apart one way, 11 % the other way.
 """
 
 from __future__ import annotations
