@@ -7,8 +7,8 @@ from enum import StrEnum
 from scopemap.apps.exams.examination import HIDDEN
 
 GOOD_RESIDUAL = 0.05
-"""Median distance of matched points, of the median depth. Half of the 10 % at which the right way of phantom 72 and of a
-laparoscopy lie, where a third to a half of both surfaces is far from the other; 2026-11."""
+"""Median distance of matched points, of the median depth. A choice: half of the 10 % of phantom 72 and a laparoscopy,
+where 32 to 60 % of the surfaces are far from the other; 2026-11."""
 
 MOST_RESIDUAL = HIDDEN
 """As far apart two surfaces are not the same wall. Right: 10 % (phantom 72), 11 % (a laparoscopy, the better way);
