@@ -292,6 +292,16 @@ def test_a_lesion_is_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureF
         assert shown.nodes["/page/measured/0/words"].text.startswith("polyp 1: ")
 
 
+def test_from_a_frame_dragging_turns_about_what_it_sees(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        shown.press("Look from here")
+        camera = shown.window.server.initial_camera
+        ahead = np.linalg.norm(np.subtract(camera.look_at, camera.position))
+    assert ahead == pytest.approx(np.nanmedian(Result(folder).depth.read(0)), rel=1e-3)
+
+
 def test_a_share_that_may_be_far_too_large_is_said_with_its_caution(tmp_path: Path) -> None:
     found = coverage(draw_run(tmp_path))
     assert CAUTION not in unseen_words(found)

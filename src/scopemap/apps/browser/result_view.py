@@ -184,7 +184,10 @@ class ResultView:
         if (pose := self.pose) is None:
             self.note("This frame has no pose in this submap: nothing can be seen from it.")
             return
-        ahead = max(0.2 * self.surface.size_mm, 1e-3)
+        # Dragging turns about the target: nearer than the tissue, it would swing the tissue out of sight.
+        depth_mm = self.run.depth.read(self.index)
+        seen = np.array([]) if depth_mm is None else depth_mm[np.isfinite(depth_mm)]
+        ahead = float(np.median(seen)) if seen.size else max(0.2 * self.surface.size_mm, 1e-3)
         self._see_with(self.vertical_fov, self.whole.camera.width / self.whole.camera.height)
         look_from(self.window, pose[:3, 3], pose[:3, 3] + ahead * pose[:3, 2], -pose[:3, 1])
 
