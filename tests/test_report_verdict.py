@@ -187,7 +187,9 @@ def test_what_makes_a_whole_run_doubtful(facts: dict[str, Any], words: str) -> N
 def test_tissue_that_moves_in_few_frames_and_a_usual_adjustment_are_no_doubt() -> None:
     assert verdict(run_of([0] * 60, **notices(moving(29), adjusted(16, 2.9)))).word == "good"
     at_rest = Notice("camera-at-rest-stated")
-    assert verdict(run_of([0] * 60, **notices(moving(60), at_rest))).word == "good"
+    rested = verdict(run_of([0] * 60, **notices(moving(60), at_rest)))
+    assert rested.word == "good"
+    assert not any(reason.next_step for reason in rested.reasons if reason.code == "tissue-moves")
     confirmed = Notice("depth-triangulated", {"triangulated": 4, "keyframes": 6})
     assert verdict(run_of([0] * 60, **notices(adjusted(100, 5.9), confirmed))).word == "good"
 

@@ -97,9 +97,12 @@ def segments(evidence: Evidence, level: Level) -> str:
 def next_step(code: str, evidence: Evidence) -> str:
     """Return what to do about a notice of the run; where tissue moves and segments differ, which of them are good.
 
-    "" where there is nothing to do: segments that are all alike give no choice.
+    "" where there is nothing to do: segments that are all alike give no choice, and of a camera at rest each frame has
+    a surface.
     """
     step = WORDINGS[code].next_step
+    if step == STILL_PART and "camera-at-rest-stated" in evidence.codes:
+        return ""
     if step != STILL_PART or evidence.segment_count < 2:
         return step
     good = _good_parts(evidence)
