@@ -27,7 +27,7 @@ from scopemap.apps.browser.workspace import Workspace
 from scopemap.apps.coverage.coverage import BLIND, CAUTION, coverage
 from scopemap.engine.notices import Notice
 from scopemap.report.measured_by_hand import read_measurements
-from scopemap.report.page import write_report
+from scopemap.report.page import PAGE, page_to_send, write_report
 from scopemap.result.result import Result
 from scopemap.result.summary import summary_lines
 from scopemap.result.wording import facts_of_notices
@@ -364,7 +364,7 @@ def test_report_and_surface_come_in_one_click(tmp_path: Path) -> None:
             shown.press(label)
             shown.until(lambda name=name: name in shown.sent)  # type: ignore[misc]
         sent = shown.sent
-        assert sent["video_report.html"] == page
+        assert sent["video_report.html"] == page_to_send(folder / PAGE)
         assert len(trimesh.load(io.BytesIO(sent["video.stl"]), file_type="stl").faces) == len(tube().faces)
         with zipfile.ZipFile(io.BytesIO(sent["video.zip"])) as archive:
             assert set(archive.namelist()) == {"slicer/surface.ply", "slicer/path.mrk.json"}
