@@ -93,8 +93,19 @@ def _beside_a_command(window: BrowserWindow, view: Path, result: Path | None, *,
 
 def serve(window: BrowserWindow, *, browser: bool, quiet: bool, ends: Callable[[], bool] = lambda: False) -> None:
     """Run a window until Ctrl-C, or until it `ends`."""
-    if threading.current_thread() is threading.main_thread():
+
+    def stop(number: int, frame: object) -> None:
+        # A KeyboardInterrupt in the middle of a call would leave viser locked; a second Ctrl-C raises it all the same.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        window.stop()
+
+    is_main = threading.current_thread() is threading.main_thread()
+    # A job in the background of a shell ignores Ctrl-C, and goes on.
+    heeds = is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if is_main:
         signal.signal(signal.SIGTERM, lambda number, frame: window.stop())
+    if heeds:
+        signal.signal(signal.SIGINT, stop)
     try:
         # Whoever has read the address may press Ctrl-C at once.
         if not quiet:
@@ -103,7 +114,10 @@ def serve(window: BrowserWindow, *, browser: bool, quiet: bool, ends: Callable[[
             webbrowser.open(window.url)
         window.run(ends)
     except KeyboardInterrupt:
-        if not quiet:
-            typer.echo("ended", err=True)
+        pass
     finally:
         window.close()
+        if heeds:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+    if not quiet:
+        typer.echo("ended", err=True)
