@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from drawn_run import draw_run
-from window_without_browser import element, elements, press, settle
+from window_without_browser import element, elements, press, settle, start_page
 
 from scopemap.apps.browser.start_page import StartPage
 from scopemap.apps.browser.window import BrowserWindow
@@ -17,13 +17,8 @@ from scopemap.apps.browser.workspace import Workspace
 
 @pytest.fixture
 def opened(tmp_path: Path) -> Iterator[tuple[BrowserWindow, Workspace]]:
-    with Workspace(tmp_path) as workspace:
-        window = BrowserWindow()
-        window.always(workspace.runs.tick)
-        window.show(StartPage(workspace))
-        settle(window)
-        yield window, workspace
-        window.close()
+    with start_page(tmp_path) as found:
+        yield found
 
 
 def test_the_result_to_compare_with_is_another_one(

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 from drawn_run import IN_RESULT, draw_run
-from window_without_browser import element, elements, press, settle, until, words
+from window_without_browser import element, elements, press, settle, start_page, until, words
 
 from scopemap.apps.browser import command
 from scopemap.apps.browser.input_page import InputPage
@@ -44,13 +44,8 @@ SIZE_SO_FAR = re.compile(r"The surface so far: ([\d,]+) points")
 
 @pytest.fixture
 def opened(tmp_path: Path) -> Iterator[tuple[BrowserWindow, Workspace]]:
-    with Workspace(tmp_path) as workspace:
-        window = BrowserWindow()
-        window.always(workspace.runs.tick)
-        window.show(StartPage(workspace))
-        settle(window)
-        yield window, workspace
-        window.close()
+    with start_page(tmp_path) as found:
+        yield found
 
 
 def test_a_video_that_cannot_be_read_is_a_sentence(opened: tuple[BrowserWindow, Workspace]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from drawn_run import FRAMES, IN_RESULT, draw_run
 from front_door import call
-from test_report_browser import ARGUMENTS, CHROMIUM, DESKTOP, Opened, playwright
+from test_report_browser import CHROMIUM, DESKTOP, Opened, chromium
 
 from scopemap.apps.measure.measure import measure
 from scopemap.engine.errors import InputError
@@ -27,10 +27,8 @@ _ENDS = ("value", "low", "high")
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
+    with chromium() as started:
         yield started
-        started.close()
 
 
 def measured_in_both(opened: Opened, folder: Path, number: int) -> tuple[str, dict[str, list[float]]]:

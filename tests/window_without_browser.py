@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,9 +14,23 @@ import viser
 from viser import _messages as messages
 from websockets.sync.client import connect
 
+from scopemap.apps.browser.start_page import StartPage
 from scopemap.apps.browser.window import BrowserWindow
+from scopemap.apps.browser.workspace import Workspace
 
 PATIENCE_S = 120.0
+
+
+@contextmanager
+def start_page(folder: Path) -> Iterator[tuple[BrowserWindow, Workspace]]:
+    """Where a window shows the start page of a folder."""
+    with Workspace(folder) as workspace:
+        window = BrowserWindow()
+        window.always(workspace.runs.tick)
+        window.show(StartPage(workspace))
+        settle(window)
+        yield window, workspace
+        window.close()
 
 
 def until(window: BrowserWindow, is_so: Callable[[], object], patience_s: float = PATIENCE_S) -> None:

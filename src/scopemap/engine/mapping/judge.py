@@ -231,7 +231,7 @@ class ShapeTest(NamedTuple):
         return self.outcome == "not determined" and not is_clearly_less(self.error_px, self.other_px)
 
     def refuses(self, sigma_px: float) -> bool:
-        """Whether all keyframes stay as tracked in the end; sigma_px : robust, where larger than a rigid scene's."""
+        """Whether all keyframes stay as tracked; sigma_px : of the reprojection errors; small ones keep the poses."""
         return self.is_contradicted and sigma_px > RIGID_SIGMA_PX
 
     @property
