@@ -1,4 +1,4 @@
-"""One picture per run: a frame, the surface seen from there, its confidence, and the surface from outside.
+"""One picture per run: a frame, the surface from there with and without texture, its confidence, and from outside.
 
     python docs/surface_pictures.py RUN ... --out FOLDER [--frame N]
 
@@ -16,8 +16,8 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.agreement import compare_with_frame
-from scopemap.engine.geometry.rendering import Rendering
+from scopemap.engine.fusion.agreement import lit_like
+from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     MeshView,
@@ -34,15 +34,22 @@ from scopemap.runner.reread_frames import open_truth
 MOST_BYTES = 200_000
 
 
-def draw_surface(run: Result, frame: Frame, pose: np.ndarray, rendering: Rendering, file: Path) -> None:
-    """Draw a frame, the surface from there, its confidence (blue 0, yellow 1), and the surface with the path outside.
+def draw_surface(run: Result, frame: Frame, pose: np.ndarray, depth_mm: np.ndarray, file: Path) -> None:
+    """Draw a frame, the surface from there by vertex colours and by texture, its confidence, and the path outside.
 
-    pose : (4, 4) of the frame, world mm. rendering : of the mesh from there, in the frame's light.
+    Confidence is blue at 0, yellow at 1. pose : (4, 4) of the frame, world mm. depth_mm : (H, W) of the frame.
     """
     mesh, camera, positions_mm = run.mesh, frame.camera, run.frames["T_world_camera"][run.frames.tracked, :3, 3]
     view, outside = MeshView(pose, camera), outside_views(mesh, pose, positions_mm)["from outside"]
-    rendered = on_white(rendering)
-    pictures = {"frame": frame.rgb, "surface": rendered}
+
+    def seen(surface: trimesh.Trimesh) -> np.ndarray:
+        rendering = render_mesh(surface, camera, pose)
+        lit = lit_like(rendering, camera, frame.rgb, depth_mm) if run.config.fusion.without_light else rendering
+        return on_white(lit)
+
+    pictures = {"frame": frame.rgb, "one colour per vertex": seen(mesh)}
+    if run.textured is not None:
+        pictures["texture"] = seen(run.textured)
     if "confidence" in mesh.vertex_attributes:
         levels = np.round(255 * np.clip(mesh.vertex_attributes["confidence"].reshape(-1, 1), 0, 1)).astype(np.uint8)
         colours = cv2.applyColorMap(levels, cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
@@ -64,9 +71,7 @@ def draw_run(folder: Path, file: Path, number: int | None = None) -> None:
     depth_mm, pose = run.depth.read(frame.index), row["T_world_camera"]
     if depth_mm is None:
         raise SystemExit(f"{folder} kept no depth of frame {frame.index}")
-    albedo = run.config.fusion.without_light
-    _, rendering = compare_with_frame(run.mesh, frame.camera, pose, frame.rgb, depth_mm, albedo=albedo)
-    draw_surface(run, frame, pose, rendering, file)
+    draw_surface(run, frame, pose, depth_mm, file)
     if file.stat().st_size > MOST_BYTES:
         raise SystemExit(f"{file} has {file.stat().st_size} bytes, over {MOST_BYTES}")
 

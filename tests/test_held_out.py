@@ -28,7 +28,6 @@ from scopemap.engine.fusion.agreement import (
     FrameAgreement,
     agreement_figures,
     compare_rendering,
-    compare_with_frame,
     surface_views,
     vertex_sigmas,
 )
@@ -58,12 +57,12 @@ def _depth(depth_mm: float = 50.0) -> np.ndarray:
 
 
 def _compared(mesh: trimesh.Trimesh, rgb: np.ndarray, depth_mm: np.ndarray) -> FrameAgreement:
-    return compare_with_frame(mesh, CAMERA, np.eye(4), rgb, depth_mm)[0]
+    return compare_rendering(render_mesh(mesh, CAMERA, np.eye(4)), rgb, depth_mm)
 
 
 def test_figures_of_a_wall_are_those_in_closed_form() -> None:
     wall = _wall()
-    rgb = compare_with_frame(wall, CAMERA, np.eye(4), BLACK, _depth())[1].rgb
+    rgb = render_mesh(wall, CAMERA, np.eye(4)).rgb
     same = _compared(wall, rgb, _depth())
     assert same.coverage == 1.0
     assert same.ssim == pytest.approx(1.0)

@@ -22,7 +22,8 @@ from scopemap.engine.cameras.camera import source_pixel
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.agreement import FrameAgreement, agreement_figures, compare_with_frame
+from scopemap.engine.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, lit_like
+from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.odometry import Step
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.sequence import Sequence
@@ -141,9 +142,11 @@ def test_surface_is_compared_with_the_video_in_the_light_of_the_lamp(run: _Run) 
     for step in run.steps:
         depth_mm, pose = depth.read(step.frame.index), trajectory.T_world_camera[step.frame.index]
         if step.frame.index != LOST and depth_mm is not None:
-            seen = (step.frame.camera, pose, step.frame.rgb, np.where(step.frame.valid, depth_mm, np.nan))
+            camera, rgb, known_mm = step.frame.camera, step.frame.rgb, np.where(step.frame.valid, depth_mm, np.nan)
+            unlit = render_mesh(run.result.mesh, camera, pose)
             for lit, found in agreements.items():
-                found.append(compare_with_frame(run.result.mesh, *seen, albedo=lit)[0])
+                view = lit_like(unlit, camera, rgb, known_mm) if lit else unlit
+                found.append(compare_rendering(view, rgb, known_mm))
     told = run.result.provenance["surface"]
     # The store's JPEG changes little.
     lit, unlit = (agreement_figures(agreements[lit])["ssim"] for lit in (True, False))

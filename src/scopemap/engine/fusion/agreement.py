@@ -39,26 +39,6 @@ class FrameAgreement(NamedTuple):
     lpips: float = float("nan")
 
 
-def compare_with_frame(
-    mesh: trimesh.Trimesh,
-    camera: PinholeCamera,
-    T_world_camera: np.ndarray,
-    rgb: np.ndarray,
-    depth_mm: np.ndarray,
-    *,
-    albedo: bool = False,
-) -> tuple[FrameAgreement, Rendering]:
-    """Return the agreement of a mesh, world mm, vertex colours, with a frame, and the rendering of the mesh there.
-
-    T_world_camera : (4, 4). rgb : (H, W, 3) uint8. depth_mm : (H, W), NaN = unknown or not usable.
-    albedo : whether the vertex colours are those of the tissue: see `lit_like`.
-    """
-    rendering = render_mesh(mesh, camera, T_world_camera)
-    if albedo:
-        rendering = lit_like(rendering, camera, rgb, depth_mm)
-    return compare_rendering(rendering, rgb, depth_mm), rendering
-
-
 def lit_like(rendering: Rendering, camera: PinholeCamera, rgb: np.ndarray, depth_mm: np.ndarray) -> Rendering:
     """Return the rendering of a mesh in the colours of the tissue as the lamp shows it, exposed as a frame is.
 
@@ -75,7 +55,10 @@ def lit_like(rendering: Rendering, camera: PinholeCamera, rgb: np.ndarray, depth
 def compare_rendering(
     rendering: Rendering, rgb: np.ndarray, depth_mm: np.ndarray, perceptual: PerceptualDistance | None = None
 ) -> FrameAgreement:
-    """Return the agreement of a rendering with a frame, as in `compare_with_frame`; lpips by `perceptual`, if given."""
+    """Return the agreement of a rendering of a mesh with the frame at whose pose it was rendered.
+
+    rgb : (H, W, 3) uint8. depth_mm : (H, W), NaN = unknown or not usable. lpips is measured by `perceptual`, if given.
+    """
     known = depth_mm > 0
     seen = known & np.isfinite(rendering.depth_mm)
     error = np.abs(np.log(rendering.depth_mm[seen] / depth_mm[seen]))
