@@ -11,6 +11,7 @@ import trimesh
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import FusionSettings
+from scopemap.engine.depth.under_highlights import depth_under_highlights
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.agreement import surface_agreement, surface_views, vertex_sigmas
@@ -104,9 +105,15 @@ class SegmentFinishing:
             self._free_space = FreeSpace(self._final.frames(None, among=some))
 
     def corrected(self) -> Iterator[Frame]:
-        """Yield the final frames, those that were stored: pose and depth corrected, triangulated, carved."""
+        """Yield the final frames, those that were stored: pose and depth corrected, triangulated, carved.
+
+        Under highlights depth is that of what is around them, unless it was measured.
+        """
         triangulated = None if self._depths is None else self._depths.depth
-        return self._final.frames(triangulated, self._free_space.without)
+        is_measured = self._estimators.anchor.is_measured
+        for frame in self._final.frames(triangulated, self._free_space.without):
+            depth_mm = np.asarray(frame.depth_mm)
+            yield frame if is_measured else replace(frame, depth_mm=depth_under_highlights(depth_mm, frame.highlights))
 
     def chosen(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Yield the final frames that show tissue anew; note where tissue moves in all, and some for `check`."""

@@ -53,6 +53,7 @@ IDEAS = (
     "tracking.tracker._PATIENCE=0",  # a keyframe waits for a clear picture
     "tracking.tracker._MIN_KEYFRAME_MOTION=0.0",  # and for motion
     "tracking.relocalisation._CLOSE_UP_RANGE=0.0",  # a close-up is told from other losses
+    "depth.under_highlights._LARGEST=0.0",  # depth under highlights is that around them
     "fusion.new_views._LEAST_NEW=0.0",  # frames that show nothing anew are not fused
 )
 """Constants of the engine that turn off an idea without a setting: what it does."""

@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.config import FusionSettings
+from scopemap.engine.depth.under_highlights import small_highlights
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.albedo import AlbedoPainter
 from scopemap.engine.fusion.frame_store import FrameStore, median_depth_of
@@ -49,15 +50,11 @@ _VOXELS_PER_TRUNCATION = 5  # see above
 _MOST_VOXELS_PER_PIXEL = 4
 # At this depth a voxel is still larger than a pixel, and a narrowing tube is seen for most of its length.
 _VOXELS_PER_MAX_DEPTH = 200  # by hand
-# Weight of small highlights, where depth is interpolated.
-_MASKED_WEIGHT = 0.1  # by hand
-# Weight of its colour, the one around it: it counts where no frame saw the tissue. Width of what is around over the
-# picture's, and the step of the pixels looked at.
+# Weight of a small highlight's colour, the one around it: it counts where no frame saw the tissue. Width of what is
+# around over the picture's, and the step of the pixels looked at.
 _MASKED_COLOUR = 0.01  # by hand
 _SURROUNDINGS = 1 / 12  # by hand
 _EVERY_PX = 4  # by hand, for time
-# Share of the picture up to which a highlight is that small.
-_LARGEST_MASKED = 0.02  # by hand
 _ANY_DEPTH_MM = 60.0  # guard: of a volume whose parameters are not known yet
 # No endoscope resolves less; memory would be spent on noise.
 _MIN_VOXEL_MM = 0.01  # by hand
@@ -126,8 +123,8 @@ class TsdfVolume:
         """Fuse the valid pixels of a frame up to the largest depth; a frame without any changes nothing.
 
         Unless weights are off, frames count by image quality (`frame.quality`), pixels whose depth is less certain than
-        the frame's median pixel (`frame.depth_sigma_mm`) count less, and small highlights within the picture weigh a
-        tenth, in the colour of what is around them.
+        the frame's median pixel (`frame.depth_sigma_mm`) count less. Small highlights within the picture count
+        (their depth is that around them: `depth/under_highlights.py`), in the colour of what is around them.
 
         Raises `ValueError` for a frame without depth or pose, or with a pose that is not finite or too far away.
         """
@@ -144,14 +141,14 @@ class TsdfVolume:
         grid = Grid(parameters.voxel_mm, parameters.truncation_mm, step, *shares)
         masked = np.zeros_like(frame.valid)
         if settings.weighted and frame.highlights is not None:
-            masked = _small_regions(frame.highlights)
+            masked = small_highlights(frame.highlights)
         with np.errstate(invalid="ignore"):
             usable = (frame.valid | masked) & (depth_mm > 0) & (depth_mm <= parameters.max_depth_mm)
         least_incidence = _MIN_INCIDENCE if settings.weighted else 0.0
         inverse_depth = np.divide(1.0, depth_mm, out=np.full(depth_mm.shape, np.nan, np.float32), where=usable)
         surface = measure_surface(inverse_depth, pinhole, step, least_incidence, parameters.max_depth_mm)
         trust = depth_trust(np.where(usable, depth_mm, np.nan), frame.depth_sigma_mm, _DEPTH_SIGMA)
-        weight = surface.weight * np.where(masked, np.float32(_MASKED_WEIGHT), np.minimum(trust, np.float32(1.0)))
+        weight = surface.weight * np.minimum(trust, np.float32(1.0))
         weight = weight * np.float32(frame.quality) if settings.weighted else (weight > 0).astype(np.float32)
         surface = surface._replace(weight=weight if frame.weight is None else weight * frame.weight)
         if self._painter is not None:
@@ -195,17 +192,6 @@ class TsdfVolume:
                 "leave out lost frames or use a larger voxel"
             )
         return depth_mm, T_world_camera
-
-
-def _small_regions(highlights: np.ndarray) -> np.ndarray:
-    """Return the highlights, (H, W) bool, that are small and do not touch the image's border."""
-    _, regions, stats, _ = cv2.connectedComponentsWithStats(highlights.astype(np.uint8))
-    small = stats[:, cv2.CC_STAT_AREA] <= _LARGEST_MASKED * highlights.size
-    small[0] = False
-    for border in (regions[0], regions[-1], regions[:, 0], regions[:, -1]):
-        small[np.unique(border)] = False
-    found: np.ndarray = small[regions]
-    return found
 
 
 def _paint_masked(picture: np.ndarray, masked: np.ndarray) -> None:
