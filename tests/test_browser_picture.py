@@ -84,6 +84,25 @@ def test_points_on_the_picture_are_measured_in_its_frame(tmp_path: Path) -> None
         assert shown.nodes[MODEL].visible
 
 
+def test_a_lesion_is_outlined_on_the_picture(tmp_path: Path) -> None:
+    folder = draw_run(tmp_path, scale=KNOWN)
+    page = ResultPage(folder)
+    corners = [(52.0, 26.0), (64.0, 26.0), (64.0, 38.0), (52.0, 38.0)]
+    with shown_window() as shown:
+        shown.show(page)
+        shown.choose("Slider", "Frame", 4)
+        shown.choose("Checkbox", "On the video's picture", True)
+        shown.until(lambda: PICTURE in shown.nodes)
+        shown.choose("ButtonGroup", "Measure", "Lesion")
+        for corner in corners:
+            click_on_picture(shown, page, corner, np.array([3.0, -2.0, -1.0]))
+        shown.press("Measure the lesion")
+        shown.until(lambda: len(read_measurements(folder)) == 1)
+    (kept,) = read_measurements(folder)
+    assert (kept["kind"], kept["frame"]) == ("lesion", 4)
+    np.testing.assert_allclose(kept["points"], corners, atol=0.05)
+
+
 def test_the_picture_follows_the_frame_and_says_where_there_is_none(tmp_path: Path) -> None:
     folder = run_of_large_frames(tmp_path)
     with shown_window() as shown:

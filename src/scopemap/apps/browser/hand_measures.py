@@ -11,7 +11,7 @@ import numpy as np
 from scopemap.apps.browser.seen_by import Sight, corners_in, frames_that_saw, pose_of
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
 from scopemap.apps.measure.hand_measure import HandMeasure, folder_in_whole, rounded
-from scopemap.apps.measure.measure import measure
+from scopemap.apps.measure.measure import check_reference, measure
 from scopemap.engine.errors import InputError
 from scopemap.result.result import Result
 
@@ -33,8 +33,9 @@ class Reference:
 
 
 def reference_as_kept(surface: ShownSurface, reference: Reference) -> HandMeasure:
-    """Return a reference as it is kept; raises `InputError` where no frame saw both of its ends."""
+    """Return a reference as it is kept; raises `InputError` where no frame saw both of its ends, or it is too short."""
     sight = frame_of_reference(surface, reference)
+    check_reference(sight.pixels)
     world = np.array([surface.position(pick) for pick in reference.picks])
     folder, pixels = folder_in_whole(surface.run), rounded(sight.pixels)
     return HandMeasure(folder, sight.frame, pixels, None, reference.length_mm, [], world, "reference")

@@ -107,7 +107,9 @@ class MeasurePart:
 
         def then(found: tuple[HandMeasure, np.ndarray]) -> None:
             one, line = found
-            self._picks = []
+            # The ends of a distance stay: of known length, it becomes the reference.
+            if self.mode != "Distance":
+                self._picks = []
             self._view.note(", ".join(f"{found.what}: {short(found)}" for found in one.found))
             self._show()
             self._measured.add(one, line)

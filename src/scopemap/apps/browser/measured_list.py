@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from scopemap.apps.browser.window import escaped, fenced
 from scopemap.apps.measure.hand_measure import (
     HandMeasure,
     add_measurement,
+    as_csv,
     folder_in_whole,
     kept_measures,
     remove_measurement,
@@ -53,7 +56,8 @@ class MeasuredList:
         self._outer = gui.add_folder(None)
         with self._outer:
             self._place = gui.add_folder(None)
-        self._remove = view.window.on(gui.add_button("Remove the last", color="gray"), self._remove_last)
+        self._table = gui.add_button("Download as a table (CSV)", color="gray")
+        self._table.on_click(lambda event: view.window.do(self._send, event.client))
 
     def add(self, one: HandMeasure, line: np.ndarray) -> None:
         """Show and keep a measurement, with its line (M, 3) on the surface."""
@@ -83,7 +87,7 @@ class MeasuredList:
         self._place.remove()
         with self._outer:
             self._place = gui.add_folder(None)
-        self._outer.visible = self._remove.visible = bool(self._all)
+        self._outer.visible = self._table.visible = bool(self._all)
         with self._place:
             if self._all:
                 gui.add_markdown(f"Measured, and kept in {escaped(MEASUREMENTS)} for the report:")
@@ -91,7 +95,14 @@ class MeasuredList:
                 gui.add_markdown(f"**{number}.** {measured_words(listed.one)}{self._note(listed)}")
                 with gui.add_folder(f"Command of {number}", expand_by_default=False):
                     gui.add_markdown(fenced(broken(listed.one.command(self._view.folder_words))))
+                remove = gui.add_button(f"Remove {number}", color="gray")
+                self._view.window.on(remove, self._remove, listed)
         self._draw()
+
+    def _send(self, client: Any) -> None:
+        """Send what is listed as a table to the browser that asked for it."""
+        content = as_csv([listed.one for listed in self._all]).encode()
+        client.send_file_download(Path(MEASUREMENTS).with_suffix(".csv").name, content, save_immediately=True)
 
     def _is_here(self, listed: _Listed) -> bool:
         """Whether it is on the surface that is shown: each segment of the video has one of its own."""
@@ -121,8 +132,8 @@ class MeasuredList:
             words = ": ".join(filter(None, (one.name, with_interval(one.found[0]))))
             draw_marks(view.window.scene, name, one.world, size_mm, words, colour, listed.line)
 
-    def _remove_last(self) -> None:
-        gone = self._all.pop()
+    def _remove(self, gone: _Listed) -> None:
+        self._all = [listed for listed in self._all if listed.one is not gone.one]
         self.show(self._reference)
         remove_measurement(self._view.whole.folder, gone.one)
         self._view.note(f"Removed: {short(gone.one.found[0])}.")

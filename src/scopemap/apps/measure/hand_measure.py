@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import shlex
 from collections.abc import Sequence
@@ -150,6 +152,20 @@ def remove_reference(folder: Path, of: str) -> None:
     kept = read_measurements(folder)
     if len(left := _without_reference(kept, of)) < len(kept):
         _write(folder, left)
+
+
+def as_csv(kept: Sequence[HandMeasure]) -> str:
+    """Return what was measured as a table, a row for each figure, of three digits; references have none."""
+    text = io.StringIO(newline="")
+    table = csv.writer(text)
+    table.writerow(("number", "name", "folder", "frame", "what", "value", "low", "high", "unit", "pixels"))
+    for number, one in enumerate((one for one in kept if one.kind != "reference"), start=1):
+        for found in one.found:
+            known = (found.value, found.low, found.high)
+            figures = [f"{float(f'{value:.3g}'):.15g}" if np.isfinite(value) else "" for value in known]
+            where = (one.name, one.folder, one.frame)
+            table.writerow((number, *where, found.what, *figures, found.unit, pixels_in_words(one.pixels)))
+    return text.getvalue()
 
 
 def findings_of(kept: Sequence[HandMeasure]) -> list[SurfaceFinding]:

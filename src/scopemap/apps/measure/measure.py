@@ -24,6 +24,8 @@ from scopemap.result.result import Result
 WIDE = 1.5
 """An interval is wide where its ends differ by more than this factor (by hand: about a quarter to either side)."""
 _OF_POINTS = "the depth and the place of the single points"
+_LEAST_REFERENCE_PX = 10
+"""A shorter reference errs by more than a pixel at each end allows (by hand)."""
 _REFERENCE_SHARE = 0.3
 _MOST_SIGMA = 0.05
 """Share of the depth's standard deviation at a reference that does not cancel in lengths beside it, and its most.
@@ -151,9 +153,7 @@ def known_scale(run: Result, known: Known | None) -> KnownScale:
             )
         scale = LogChanges.of_scale(errors["scale"])
         return KnownScale(1.0, scale, scale.times(by_focal), "mm", run.scale)
-    far_px, least_px = float(np.linalg.norm(known.pixels[1] - known.pixels[0])), errors["reference_px"]
-    if far_px < least_px:
-        raise InputError(f"the reference is {far_px:.1f} px long: {least_px} px are needed")
+    check_reference(known.pixels)
     picked = _picked(run, measured_mesh(run, known.frame), known.frame, _pose(run, known.frame), known.pixels)
     length = _straight(np.stack([point.position for point in picked.points]))
     changes = _changes(run, picked, _straight).to_power(-1)
@@ -166,6 +166,12 @@ def known_scale(run: Result, known: Known | None) -> KnownScale:
     of_views.shared[0] = 0  # the depth of one frame is not that of many
     from_views = of_views.to_power(-1).times(by_focal)
     return KnownScale(length / (known.length_mm or 1.0), changes, from_views, unit, words)
+
+
+def check_reference(pixels: np.ndarray) -> None:
+    """Raise `InputError` where a reference between two pixels (2, 2) of a frame is too short to measure by."""
+    if (far_px := float(np.linalg.norm(pixels[1] - pixels[0]))) < _LEAST_REFERENCE_PX:
+        raise InputError(f"the reference is {far_px:.1f} px long: {_LEAST_REFERENCE_PX} px are needed")
 
 
 def _pose(run: Result, frame: int) -> np.ndarray:
