@@ -1,13 +1,15 @@
-"""The report shows what was kept in the window: a lesion by its name, and the reference, which it goes on with."""
+"""The report shows what was kept in the window: a lesion by its name, and the reference."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from drawn_run import draw_run
 from test_browser_measures import picked
 from test_report_browser import Opened, browser, pytestmark  # noqa: F401
+from test_report_links import shown_at
 
 from scopemap.apps.browser.hand_measures import Reference, reference_as_kept
 from scopemap.apps.browser.lesion_part import lesion_by_hand
@@ -25,14 +27,23 @@ def test_a_lesion_and_the_reference_are_in_the_report(browser: Any, tmp_path: Pa
     reference = Reference((first, second), 5.0)
     add_measurement(folder, reference_as_kept(surface, reference))
     corners = picked(surface, (52.0, 26.0), (64.0, 26.0), (64.0, 38.0), (52.0, 38.0))
-    add_measurement(folder, lesion_by_hand(surface, 4, corners, reference, "polyp at the fold"))
+    lesion = lesion_by_hand(surface, 4, corners, reference, "polyp at the fold")
+    add_measurement(folder, lesion)
     opened = Opened(browser, folder / "report.html")
-    known, lesion = opened.page.locator("#measures li").all_inner_texts()
-    assert known.startswith("Reference, 5 mm long, in frame ")
-    assert lesion.startswith("polyp at the fold, frame 4: largest diameter: ")
-    assert "--lesion" in lesion
     assert opened.text("#advice").endswith("Sizes are in mm by your reference (5 mm).")
-    # Without a reference it would ask for one first.
-    opened.page.locator("#pick-distance").click()
-    assert opened.page.locator("#pick-distance").get_attribute("aria-pressed") == "true"
-    assert opened.page.input_value("#reference-mm") == "5"
+    rows = [text.split("\t") for text in opened.page.locator("#measured tbody tr").all_inner_texts()]
+    assert rows[0][1:] == ["length", "5 mm, as stated", ""]
+    assert rows[1][:2] == ["2. polyp at the fold, frame 4", "largest diameter"]
+    found = lesion.found[0]
+    assert rows[1][2] == f"{found.value:.3g} mm"
+    assert rows[1][3] == f"{found.low:.3g} to {found.high:.3g} mm, wide mainly because of {found.why}"
+    assert opened.page.locator("#measured-command-list").text_content() == lesion.command(".")
+    # Chosen, it is shown in its frame.
+    plain = opened.picture("#scene")
+    opened.page.locator("#measured button").nth(1).click()
+    opened.wait("shown", "4")
+    assert np.abs(opened.picture("#scene") - plain).max() > 100
+    video = opened.picture("#video")
+    x, y = np.round(shown_at(video, np.array([52.0, 32.0]))).astype(int)
+    assert np.ptp(video[y, x - 5 : x + 6].max(-1)) > 60  # the outline's left side, white between black
+    assert opened.complaints == []

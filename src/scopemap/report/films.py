@@ -9,11 +9,10 @@ import av
 import numpy as np
 
 from scopemap.engine.errors import InputError, reporting
-from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.mesh_figures import ESTIMATE_COLOUR, MeshView, draw_path, mesh_picture, view_of, zoomed
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet
-from scopemap.report.shown_mesh import simplified, textured_surface
+from scopemap.report.shown_mesh import MOST_FACES, simplified, textured_surface
 from scopemap.result.result import Result
 
 _FRAMES = 180

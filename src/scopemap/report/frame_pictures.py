@@ -110,6 +110,13 @@ def shrunk(image: np.ndarray, longest_px: int, interpolation: int = cv2.INTER_AR
     return cv2.resize(image, size, interpolation=interpolation)
 
 
+def thinned(values: np.ndarray, widest_px: int) -> np.ndarray:
+    """Return every n-th value of a map (H, W), at most `widest_px` in a row."""
+    width = min(values.shape[1], widest_px)
+    size = (width, max(1, round(values.shape[0] * width / values.shape[1])))
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST))
+
+
 def _encoded(ending: str, image: np.ndarray) -> bytes:
     if ending == ".jpg":
         return cv2.imencode(ending, image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()

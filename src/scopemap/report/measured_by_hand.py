@@ -1,4 +1,4 @@
-"""What was measured by hand, in the report or the window, as measurements.json keeps it beside the result."""
+"""What was measured by hand in the window, as measurements.json keeps it beside the result."""
 
 from __future__ import annotations
 

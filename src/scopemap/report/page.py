@@ -16,10 +16,9 @@ import numpy as np
 from scopemap.engine.errors import reporting
 from scopemap.report.frame_pictures import FOLDER as PICTURES
 from scopemap.report.measured_by_hand import MEASUREMENTS, checked_measurements
-from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.page_data import by_hand_data, page_data, shown_meshes
 from scopemap.report.pale_parts import LEAST_COLOUR, PALE, SURE_CONFIDENCE, WORDS
-from scopemap.report.shown_mesh import base64_of
+from scopemap.report.shown_mesh import MOST_FACES, base64_of
 from scopemap.report.summary_picture import summary_picture
 from scopemap.result.checksums import SUMS, write_checksums
 from scopemap.result.json_numbers import without_nan
@@ -28,8 +27,7 @@ from scopemap.result.result import Result
 PAGE = "report.html"
 PICTURE = "summary.png"
 _SCRIPTS = (
-    "matrices", "surface_view", "frame_panels", "curves", "words", "atlas", "measuring", "measure_by_hand", "page",
-    "gestures",
+    "matrices", "surface_view", "frame_panels", "curves", "words", "atlas", "places", "measured", "page", "gestures",
 )  # fmt: skip
 _DATA = re.compile(r'(<script type="application/json" id="data">)(.*?)(</script>)', re.DOTALL)
 _LINK = re.compile(r"<a data-file>([^<]*)</a>")

@@ -16,10 +16,17 @@ from pydantic import BaseModel, ValidationError
 from scopemap.engine.errors import ScopemapError
 from scopemap.engine.geometry.align import align_trajectories
 from scopemap.input.trajectory.trajectory import Trajectory
+from scopemap.report.frame_pictures import thinned
 from scopemap.report.measured_by_hand import advice_by_reference, read_measurements
-from scopemap.report.measured_surface import FACES_OF_OTHERS, MOST_FACES, measure_errors, measured_depth
 from scopemap.report.shown_maps import MapOnPage, opening_row, shown_map_numbers, shown_maps
-from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, shape_data, simplified, textured_surface
+from scopemap.report.shown_mesh import (
+    FACES_OF_OTHERS,
+    SeenFrame,
+    base64_of,
+    mesh_data,
+    simplified,
+    textured_surface,
+)
 from scopemap.report.video_parts import video_parts
 from scopemap.result.evidence import notices_of, scale_source
 from scopemap.result.frame_table import NOT_USED
@@ -37,12 +44,16 @@ COVERAGE = "coverage"
 _MOST_BYTES = 7_500_000
 """Of pictures, before base64, which makes them a third longer."""
 _LOOKED_AT = 25
+_DEPTH_WIDTH_PX = 160
 _CURVES = {"inliers": "inlier_share", "agreement": "correlation", "scale": "depth_scale", "moving": "moving_share"}
 
 
 @dataclass(frozen=True)
 class _Picture:
-    """A frame with a picture: its row, files' contents (depth: of `measured_depth`), and depth (h, w), mm, or None."""
+    """A frame with a picture: its row, its files' contents, and its depth (h, w), mm, or None.
+
+    depth : a PNG, red and green the upper and lower byte of the depth in the run's unit, 0 = unknown; empty: none.
+    """
 
     row: int
     jpg: bytes
@@ -85,9 +96,6 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
         "depth_range": [near_mm, far_mm],
         "pictures": [_picture_data(p) for p in pictures],
         "depth_unit_mm": float(np.float32(run.depth.scale_mm)),
-        "sigma_shares": run.depth.sigma_shares.astype(np.float64).tolist(),
-        # Runs that share a page have fewer triangles than `measure` measures on.
-        "measuring": share >= 1,
         "coverage": _coverage(run),
         "maps": _maps(run, maps, meshes, pictures),
         "losses": [
@@ -189,13 +197,20 @@ def _pictures(run: Result) -> list[_Picture]:
     for index in run.pictured:
         picture, mask = run.picture_file(index), run.mask_file(index)
         if index in used and mask.is_file():
-            coded, depth, depth_mm = measured_depth(run, index), b"", None
-            if coded is not None:
-                depth = cv2.imencode(".png", coded[..., ::-1])[1].tobytes()
-                units = 256.0 * coded[..., 0] + coded[..., 1]
-                depth_mm = np.where(units > 0, units * run.depth.scale_mm, np.nan).astype(np.float32)
+            depth, depth_mm = _depth_picture(run, index)
             found.append(_Picture(used[index], picture.read_bytes(), mask.read_bytes(), depth, depth_mm))
     return found
+
+
+def _depth_picture(run: Result, index: int) -> tuple[bytes, np.ndarray | None]:
+    """Return a frame's depth as `_Picture` has it, every n-th pixel, at most 160 in a row."""
+    depth_mm = run.depth.read(index)
+    if depth_mm is None:
+        return b"", None
+    depth_mm = thinned(depth_mm, _DEPTH_WIDTH_PX)
+    units = np.nan_to_num(np.round(depth_mm / run.depth.scale_mm)).astype(np.uint16)
+    coded = np.dstack([units >> 8, units & 255, np.zeros_like(units)]).astype(np.uint8)
+    return cv2.imencode(".png", coded[..., ::-1])[1].tobytes(), depth_mm
 
 
 def _within_budget(pictures: list[_Picture], most_bytes: float) -> list[_Picture]:
@@ -235,9 +250,7 @@ def _maps(
         looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
         seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
         textured = textured_surface(one.result, one.segment, mesh)
-        data = mesh_data(mesh, seen, run.camera, textured) | {"errors": measure_errors(one.result)}
-        if len(mesh.faces) > (most := MOST_FACES if number == 0 else FACES_OF_OTHERS):
-            data["measured"] = shape_data(simplified(mesh, most))
+        data = mesh_data(mesh, seen, run.camera, textured)
         facts = {"frames": int((in_map == number).sum()), "all_faces": len(one.mesh.faces)}
         found.append(data | facts | {"turn": turn.get(number, number), "inliers": inliers.get(number, "")})
     return found

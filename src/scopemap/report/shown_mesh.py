@@ -17,11 +17,14 @@ from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.result.result import Result
 
+MOST_FACES = 100_000
+"""Of the result's main surface: what browsers turn without jerks (by hand)."""
+FACES_OF_OTHERS = 20_000
 _SAME_SURFACE = 0.1
 _CELLS_PER_FACE = 2.5  # faces of a surface that crosses a grid, times a cell's area, over its area
 _SHIFT = 4  # bits of a pixel
 _BLUR_PX = 3
-LARGEST_LEVEL = 65535
+_LARGEST_LEVEL = 65535
 """Of a position, in 16 bits."""
 
 
@@ -142,7 +145,7 @@ def mesh_data(
     seen = times_seen(mesh, frames, camera)
     return {
         "vertices": len(mesh.vertices),
-        **shape_data(mesh),
+        **_shape_data(mesh),
         "normals": base64_of(np.round(127 * np.asarray(mesh.vertex_normals)), "i1"),
         "colours": base64_of(vertex_colours(mesh)[:, :3], "u1"),
         "confidence": base64_of(np.round(255 * np.clip(confidence.ravel(), 0, 1)), "u1"),
@@ -156,19 +159,14 @@ def mesh_data(
 def _texture_data(textured: trimesh.Trimesh) -> dict[str, str]:
     visual: Any = textured.visual
     from_above = np.clip(visual.uv * [1, -1] + [0, 1], 0, 1)
-    places = np.round(LARGEST_LEVEL * from_above)[np.asarray(textured.faces)]
+    places = np.round(_LARGEST_LEVEL * from_above)[np.asarray(textured.faces)]
     return {"jpg": b64encode(texture_jpeg(textured)).decode(), "places": base64_of(places, "u2")}
 
 
-def shape_data(mesh: trimesh.Trimesh) -> dict[str, Any]:
-    """Return the part of `mesh_data` that is measured on: positions and faces."""
-    low, spread, levels = levels_of(mesh)
-    shape: dict[str, Any] = {"low": low.tolist(), "spread": spread.tolist(), "high": (low + spread).tolist()}
-    return shape | {"positions": base64_of(levels, "u2"), "faces": base64_of(mesh.faces, "u4")}
-
-
-def levels_of(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lowest corner (3,) of a mesh, its size (3,), and its vertices (V, 3) as levels, 65535 of the size."""
+def _shape_data(mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """Return positions, as levels between the lowest and the highest corner, and faces."""
     low, high = (np.zeros(3), np.ones(3)) if not len(mesh.vertices) else np.asarray(mesh.bounds)
     spread = np.maximum(high - low, 1e-9)
-    return low, spread, np.round((np.asarray(mesh.vertices) - low) / spread * LARGEST_LEVEL)
+    levels = np.round((np.asarray(mesh.vertices) - low) / spread * _LARGEST_LEVEL)
+    shape: dict[str, Any] = {"low": low.tolist(), "spread": spread.tolist(), "high": (low + spread).tolist()}
+    return shape | {"positions": base64_of(levels, "u2"), "faces": base64_of(mesh.faces, "u4")}

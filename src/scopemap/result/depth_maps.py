@@ -109,27 +109,14 @@ class DepthReader:
             return None
         return np.where(image > 0, image * np.float32(self.scale_mm), np.float32(np.nan))
 
-    def read_coded(self, index: int) -> np.ndarray | None:
-        """Return what is stored, (H, W, 3) uint8: upper and lower byte of the depth's units, level of its deviation."""
-        units, levels = (read_decoded(folder / f"{index:06d}.png") for folder in (self._folder, self._sigma_folder))
-        if not self.present or units is None:
+    def read_sigma(self, index: int) -> np.ndarray | None:
+        """Return the standard deviation of `read`, to 1.5 %, in the same form; None where none was kept for it."""
+        depth_mm, levels = self.read(index), read_decoded(self._sigma_folder / f"{index:06d}.png")
+        if depth_mm is None or levels is None or levels.shape != depth_mm.shape:
             return None
-        levels = np.zeros(units.shape, np.uint8) if levels is None or levels.shape != units.shape else levels
-        return np.dstack([units >> 8, units & 255, levels]).astype(np.uint8)
-
-    @property
-    def sigma_shares(self) -> np.ndarray:
-        """The share of the depth that each level of the standard deviation stands for, (256,) float32; NaN for 0."""
         shares = np.asarray(_LEAST_SIGMA * _SIGMA_STEP ** (np.arange(256, dtype=np.float32) - 1), np.float32)
         shares[0] = np.nan
-        return shares
-
-    def read_sigma(self, index: int) -> np.ndarray | None:
-        """Return the standard deviation of `read`, to 1.5 %, in the same form; None where none was kept."""
-        depth_mm, levels = self.read(index), read_decoded(self._sigma_folder / f"{index:06d}.png")
-        if depth_mm is None or levels is None:
-            return None
-        return np.asarray(self.sigma_shares[levels] * depth_mm, np.float32)
+        return np.asarray(shares[levels] * depth_mm, np.float32)
 
 
 def _unit_for(largest_mm: float) -> float:

@@ -59,7 +59,7 @@ def measure(
     """Measure distances, areas or a lesion, with 95 % intervals.
 
     If the scale of the run is unknown, give a reference: two pixels or a mask, and its length. Without --points and
-    --lesion the command shows what was measured by hand, in the window or the report.
+    --lesion the command shows what was measured by hand in the window.
     """
     if points and lesion:
         raise typer.BadParameter("give either --points or --lesion")

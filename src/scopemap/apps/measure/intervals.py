@@ -3,8 +3,7 @@
 A source moves a figure when it stands at the lower and at the upper end of its own 95 % interval. Sources are
 independent, so what raises ln of the figure adds as squares above it, and what lowers it below it (propagation of
 uncertainty by differences: JCGM 100:2008, 5.1.2, kept apart for both signs, since a depth error lengthens a short
-distance whichever way it goes). Sources that two figures of a frame share cancel in their ratio. The report's page does
-the same, line by line (report/assets/measuring.js).
+distance whichever way it goes). Sources that two figures of a frame share cancel in their ratio.
 """
 
 from __future__ import annotations

@@ -15,10 +15,16 @@ import numpy as np
 import trimesh
 
 from scopemap.apps.measure.intervals import SIGMAS, LogChanges
+from scopemap.apps.measure.measured_surface import (
+    DEPTH_ERROR,
+    PIXEL_ERROR_PX,
+    focal_and_scale_errors,
+    measured_depth,
+    measured_mesh,
+)
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
-from scopemap.report.measured_surface import measure_errors, measured_depth, measured_mesh
 from scopemap.result.result import Result
 
 WIDE = 1.5
@@ -143,15 +149,15 @@ class KnownScale:
 
 def known_scale(run: Result, known: Known | None) -> KnownScale:
     """Return the scale that a run knows, or that of a reference. Raises `InputError` where neither gives one."""
-    errors = measure_errors(run)
-    by_focal = LogChanges(np.array([[0, 0], _focal_changes(errors["focal"]), [0, 0]]))
+    focal_error, scale_error = focal_and_scale_errors(run)
+    by_focal = LogChanges(np.array([[0, 0], _focal_changes(focal_error), [0, 0]]))
     if known is None:
         if not run.scale_known:
             raise InputError(
                 f"{run.path}: {run.scale}; give two points as a reference; lengths are then relative to their "
                 "distance, or in mm if that is given"
             )
-        scale = LogChanges.of_scale(errors["scale"])
+        scale = LogChanges.of_scale(scale_error)
         return KnownScale(1.0, scale, scale.times(by_focal), "mm", run.scale)
     check_reference(known.pixels)
     picked = _picked(run, measured_mesh(run, known.frame), known.frame, _pose(run, known.frame), known.pixels)
@@ -212,15 +218,13 @@ def _nearest_surface(run: Result, mesh: trimesh.Trimesh, pose: np.ndarray, pixel
 
 def _depth_errors(run: Result, frame: int, pixels: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
     """Return relative standard deviations: the run's own, or what surface and frame differ by where that is more."""
-    errors, coded = np.full(len(pixels), np.nan), measured_depth(run, frame)
-    if coded is not None:
-        shares = np.array([coded.shape[1] / run.camera.width, coded.shape[0] / run.camera.height])
-        column, row = np.floor((pixels + 0.5) * shares).astype(int).T
-        upper, lower, level = coded[row, column].astype(int).T
-        units = np.where(upper + lower > 0, 256 * upper + lower, np.nan).astype(np.float32)
-        own = units * np.float32(run.depth.scale_mm)
-        errors = np.fmax(np.abs(own - depth_mm), run.depth.sigma_shares[level] * own) / depth_mm
-    return np.where(np.isfinite(errors), errors, measure_errors(run)["depth"])
+    errors, kept = np.full(len(pixels), np.nan), measured_depth(run, frame)
+    if kept is not None:
+        height, width = kept[0].shape
+        column, row = np.floor((pixels + 0.5) * [width / run.camera.width, height / run.camera.height]).astype(int).T
+        own_mm, sigma_mm = (values[row, column] for values in kept)
+        errors = np.fmax(np.abs(own_mm - depth_mm), sigma_mm) / depth_mm
+    return np.where(np.isfinite(errors), errors, DEPTH_ERROR)
 
 
 def _focal_changes(sigma: float) -> tuple[float, float]:
@@ -233,18 +237,18 @@ def _changes(run: Result, picked: _Picked, figure: Callable[[np.ndarray], np.nda
 
     Half of the variance of a depth is that of the whole frame, half its own.
     """
-    errors, count = measure_errors(run), len(picked.pixels)
+    focal_error, count = focal_and_scale_errors(run)[0], len(picked.pixels)
     ends = SIGMAS * np.array([-1.0, 1.0])
     # Of each source both ends: what it does to ln depth (S, 2, N), pixels (S, 2, N, 2) and ln of the focal length.
     log_depth, pixels = np.zeros((3 * count + 2, 2, count)), np.zeros((3 * count + 2, 2, count, 2))
     log_focal = np.zeros((3 * count + 2, 2))
     half = picked.depth_error / np.sqrt(2)
     log_depth[0] = ends[:, None] * half
-    log_focal[1] = np.log1p(ends * errors["focal"])
+    log_focal[1] = np.log1p(ends * focal_error)
     for n in range(count):
         log_depth[2 + 3 * n, :, n] = ends * half[n]
         for axis in range(2):
-            pixels[3 + axis + 3 * n, :, n, axis] = ends * errors["pixel_px"]
+            pixels[3 + axis + 3 * n, :, n, axis] = ends * PIXEL_ERROR_PX
     rays = run.camera.unproject(picked.pixels + pixels)
     rays[..., :2] /= np.exp(log_focal)[..., None, None]
     moved = figure(rays * (picked.depth_mm * np.exp(log_depth))[..., None])

@@ -21,10 +21,9 @@ from scopemap.engine.geometry.centreline import Centreline
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import se3
 from scopemap.report.films import write_film
-from scopemap.report.measured_surface import MOST_FACES
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet, rgb_of
-from scopemap.report.shown_mesh import simplified, textured_surface
+from scopemap.report.shown_mesh import MOST_FACES, simplified, textured_surface
 from scopemap.result.result import Result
 from scopemap.runner.reread_frames import reread_frames
 

@@ -71,7 +71,7 @@ function start() {
   element("cut").addEventListener("change", redraw);
   element("mask").addEventListener("change", () => setRow(row));
   listenToScene(element("scene"));
-  listenToHand();
+  listenToPlaces();
   new ResizeObserver(() => run && (drawStrip(element("strip"), run), curves.forEach((curve) => curve.draw(row)), redraw())).observe(document.body);
   const wish = matchMedia("(prefers-color-scheme: dark)");
   setTheme(wish.matches);

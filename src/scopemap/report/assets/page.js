@@ -87,8 +87,8 @@ function drawScene() {
   view.pale = data.pale;
   const near = Math.max(0.004 * radius, distance - 2 * radius);
   view.draw(run.maps[shown], from, {
-    near, far: distance + 3 * radius, fieldOfView: from.fieldOfView, lines: [...pathLines(), ...handLines()],
-    frustum: [...(corners && !from.through ? frustumLines(pose, corners) : []), ...spotLines()], corners: from.through ? null : corners,
+    near, far: distance + 3 * radius, fieldOfView: from.fieldOfView, lines: [...pathLines(), ...measuredLines()],
+    frustum: [...(corners && !from.through ? frustumLines(pose, corners) : []), ...markedLines()], corners: from.through ? null : corners,
   });
   root.dataset.frustum = pose ? pose.t.map((value) => value.toFixed(4)).join(" ") : "";
 }
@@ -128,7 +128,6 @@ async function setRow(next) {
 
 function showMap(number) {
   shown = number;
-  hand.picks = [];
   turn = { yaw: -0.7, pitch: -0.4, distance: 1, shift: [0, 0, 0] };
   put("submap", run.maps.length > 1 ? run.titles[number].name + (number && !isSegment(run, number) ? ": relative pose unknown" : "") : "");
   document.querySelectorAll("#submap-list button").forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.map) === number)));
@@ -224,14 +223,11 @@ function writeCoverage() {
     const where = spot.clock === null ? "all round" : `${Math.round(spot.clock) || 12} o'clock`;
     button.type = "button";
     button.textContent = `${n + 1}. ${digits(spot.area)} ${found.unit}² at ${Math.round(spot.along)} ${lumen ? found.unit : "degrees"}, ${where}: second ${spot.time_s.toFixed(1)}`;
-    button.addEventListener("click", () => ((run.spot = spot.position_mm), setRow(run.indices.indexOf(spot.frame)), element("surface").scrollIntoView({ block: "nearest" })));
+    button.addEventListener("click", () => (mark(spot.position_mm, 0), setRow(run.indices.indexOf(spot.frame)), element("surface").scrollIntoView({ block: "nearest" })));
     item.append(button);
     return item;
   }));
 }
-
-// The blind spot that was chosen, a cross in front of the surface of the result.
-const spotLines = () => (run.spot && shown === 0 ? crossAt(run.spot, 0.08 * run.balls[0].radius, colour("--hand")) : []);
 
 function open(number) {
   run = prepared(data.runs[number]);
@@ -256,7 +252,8 @@ function open(number) {
   drawStrip(element("strip"), run);
   openAtlas(run, setRow);
   row = run.opens_at;
-  openMeasures();
+  writeMeasured();
+  setRow(row);
 }
 
 function setTheme(dark) {
