@@ -17,9 +17,10 @@ from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.measure.hand_measure import kept_measures
 from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.notices import Level
+from scopemap.report.facts import report_facts
 from scopemap.report.measured_by_hand import read_measurements
 from scopemap.report.page import write_report
-from scopemap.report.page_data import page_data, shown_meshes
+from scopemap.report.page_data import page_data
 from scopemap.result.result import Result
 from scopemap.result.surface_segments import SurfaceSegment, save_segments
 
@@ -59,7 +60,10 @@ def in_two_segments(folder: Path, levels: tuple[Level, Level] = ("doubtful", "do
 
 def test_window_and_report_open_at_the_main_segment_and_the_list_goes_to_others(tmp_path: Path) -> None:
     folder = in_two_segments(draw_run(tmp_path), ("doubtful", "good"), main=1)
-    assert page_data(Result(folder), shown_meshes(Result(folder), 1000))["opens_at"] == HALF
+    facts = report_facts(Result(folder), 1000)
+    assert page_data(facts)["opens_at"] == HALF
+    # The third surface is that of another segment, and no submap's.
+    assert (len(facts.meshes), set(facts.submap_meshes)) == (3, {0, 1})
     with shown_window() as shown:
         shown.show(ResultPage(folder))
         part, slider = shown.element("Dropdown", "Go to part"), shown.element("Slider", "Frame")

@@ -14,6 +14,7 @@ from tiny_phantom import only_images, write_tiny
 from scopemap.engine.config import Config
 from scopemap.engine.errors import SettingsError
 from scopemap.input.opening import open_sequence
+from scopemap.report.facts import report_facts
 from scopemap.report.page_data import page_data
 from scopemap.result.input_part import part_of_input
 from scopemap.result.result import Result
@@ -45,7 +46,7 @@ def test_a_part_is_said_and_repeated(
     run = Result(first)
     assert run.config.input.frames == frames
     assert run.provenance["selection"] == {"frames": frames, "of": 14}
-    assert page_data(run, [run.mesh])["used_part"] == part
+    assert page_data(report_facts(run))["used_part"] == part
     assert "used_part" in (first / "report.html").read_text(encoding="utf-8")
     assert any(f"Chosen: {part}." in reason.text for reason in verdict(run).reasons)
     call("run", video, "--out", again, "--config", first / "config.toml", "--quiet")

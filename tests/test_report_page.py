@@ -15,10 +15,11 @@ import pytest
 import trimesh
 from drawn_run import CAMERA, FRAMES, IN_FIRST_MAP, IN_RESULT, LOST, changed, draw_run, drawn_result, pose_of, tube
 
+from scopemap.report.facts import report_facts
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.notebook import in_one_line
 from scopemap.report.page import page_html, write_comparison, write_report
-from scopemap.report.page_data import page_data, shown_meshes
+from scopemap.report.page_data import page_data
 from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
 from scopemap.result.result import Result
 from scopemap.result.summary import frames_per_s, time_words
@@ -130,10 +131,10 @@ def test_a_long_run_stays_small(tmp_path: Path) -> None:
     run = Result(draw_run(tmp_path / "run"))
     for index in range(FRAMES):  # the heaviest pictures that there are
         run.picture_file(index).write_bytes(Result(tmp_path).picture_file(0).read_bytes())
-    share = page_data(run, shown_meshes(run, 1000), share=0.05)
+    share = page_data(report_facts(run, 1000), share=0.05)
     assert 0 < len(share["pictures"]) < FRAMES
     assert len(json.dumps(share["pictures"])) < 0.05 * 12e6
-    assert len(page_data(run, shown_meshes(run, 1000), share=1e-6)["pictures"]) == 1
+    assert len(page_data(report_facts(run, 1000), share=1e-6)["pictures"]) == 1
 
 
 def test_a_fine_mesh_is_simplified_and_keeps_its_colours() -> None:
@@ -180,7 +181,7 @@ def test_truth_is_shown_where_it_is_known(tmp_path: Path) -> None:
     # C3VD's form: one pose a line, column by column.
     (truth / "pose.txt").write_text("\n".join(" ".join(f"{v:.9f}" for v in row.T.ravel()) for row in rows))
     run = Result(draw_run(tmp_path / "run", name=str(truth)))
-    found = page_data(run, shown_meshes(run, 1000))["truth"]
+    found = page_data(report_facts(run, 1000))["truth"]
     assert found is not None
     assert numbers(found["positions"], "f4").size == 3 * IN_RESULT
     assert 0.001 < found["error_share"] < 0.2
@@ -237,7 +238,7 @@ def test_prompt_and_report_tell_one_speed(folder: Path) -> None:
     assert frames_per_s(result) == 24 / 12
     assert time_words(result) == "20.0 s, 2.0 frames/s"
     run = Result(folder)
-    assert page_data(run, shown_meshes(run, 1000))["frames_per_s"] == frames_per_s(run)
+    assert page_data(report_facts(run, 1000))["frames_per_s"] == frames_per_s(run)
     result.provenance["resumed_after_frame"] = int(result.frames["index"][11])
     assert frames_per_s(result) == 1.0
     assert frames_per_s(changed(result, provenance={})) is None

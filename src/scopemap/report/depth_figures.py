@@ -33,6 +33,11 @@ def colour_depth(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndar
     return colour_share((far_mm - depth_mm) / (far_mm - near_mm))
 
 
+def colour_depth_in_logs(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndarray:
+    """Return (H, W, 3) uint8 sRGB of depth (H, W) mm over its logarithm: near red, far blue (turbo), NaN black."""
+    return colour_share(np.log(far_mm / depth_mm) / np.log(far_mm / near_mm))
+
+
 def colour_share(share: np.ndarray) -> np.ndarray:
     """Return (H, W, 3) uint8 sRGB of shares (H, W): 0 and below blue, 1 and above red (turbo), NaN black."""
     known = np.isfinite(share)
@@ -64,7 +69,7 @@ class DepthPreviews:
         mm, or multiples of the nearest depth where the scale is unknown.
         """
         scale_mm = DepthReader(self._folder.parent).scale_mm
-        bgr_by_unit = _logarithmic(scale_mm * np.arange(1 << 16).clip(1), range_mm)[:, ::-1].copy()
+        bgr_by_unit = colour_depth_in_logs(scale_mm * np.arange(1 << 16).clip(1)[None], *range_mm)[0, :, ::-1].copy()
         bgr_by_unit[0] = 0
         legend_of = cache(lambda width: _depth_legend(width, range_mm, scale_known)[..., ::-1])
 
@@ -80,18 +85,11 @@ class DepthPreviews:
             list(pool.map(write, sorted((self._folder.parent / "depth").glob("*.png"))))
 
 
-def _logarithmic(depth_mm: np.ndarray, range_mm: tuple[float, float]) -> np.ndarray:
-    """Return the colours (N, 3) uint8 of depths (N,), mm, in the previews."""
-    near_mm, far_mm = range_mm
-    share = np.clip(np.log(far_mm / depth_mm) / np.log(far_mm / near_mm), 0, 1)
-    return cv2.applyColorMap(np.round(255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1].copy()
-
-
 def _depth_legend(width: int, range_mm: tuple[float, float], scale_known: bool) -> np.ndarray:
     """Return what the colours of the previews mean, (h, width, 3) uint8."""
     shown_mm = np.geomspace(*range_mm, max(2, min(_MOST_NUMBERS, (width - _LAST_PX) // _STEP_PX)))
     unit_mm = 1.0 if scale_known else range_mm[0]
-    colours = (f"#{bytes(rgb).hex()}" for rgb in _logarithmic(shown_mm, range_mm))
+    colours = (f"#{bytes(rgb).hex()}" for rgb in colour_depth_in_logs(shown_mm[None], *range_mm)[0])
     words = dict(zip([f"{mm / unit_mm:.3g}" for mm in shown_mm], colours, strict=True)) | {"unknown": "#000000"}
     words["no tissue"] = f"#{bytes([MASKED_GREY] * 3).hex()}"
     sheet = Sheet(width, _LEGEND_PX)

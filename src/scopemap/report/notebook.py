@@ -6,12 +6,10 @@ import html
 from base64 import b64encode
 from io import BytesIO
 
-from scopemap.report.page_data import shown_meshes
+from scopemap.report.facts import report_facts
 from scopemap.report.summary_picture import summary_picture
 from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
-
-_SHOWN_FACES = 100_000
 
 
 def in_one_line(result: Result) -> str:
@@ -23,6 +21,6 @@ def in_one_line(result: Result) -> str:
 def as_html(result: Result) -> str:
     """Return the summary picture."""
     file, words = BytesIO(), html.escape(in_one_line(result))
-    summary_picture(result, shown_meshes(result, _SHOWN_FACES)).save(file, "JPEG", quality=88)
+    summary_picture(report_facts(result)).save(file, "JPEG", quality=88)
     picture = b64encode(file.getvalue()).decode()
     return f'<p>{words}</p><img alt="{words}" src="data:image/jpeg;base64,{picture}" style="max-width: 100%">'

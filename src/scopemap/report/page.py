@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 
 from scopemap.engine.errors import reporting
+from scopemap.report.facts import report_facts
 from scopemap.report.frame_pictures import FOLDER as PICTURES
 from scopemap.report.measured_by_hand import MEASUREMENTS, checked_measurements
-from scopemap.report.page_data import by_hand_data, page_data, shown_meshes
+from scopemap.report.page_data import by_hand_data, page_data
 from scopemap.report.pale_parts import LEAST_COLOUR, PALE, SURE_CONFIDENCE, WORDS
 from scopemap.report.shown_mesh import MOST_FACES, base64_of
 from scopemap.report.summary_picture import summary_picture
@@ -44,12 +45,12 @@ def write_report(folder: Path | str) -> list[Path]:
     Raises `InputError` where it holds no finished run, or cannot be written.
     """
     run = Result(folder).checked()
-    meshes = shown_meshes(run, MOST_FACES)
+    facts = report_facts(run)
     page, picture = Path(folder) / PAGE, Path(folder) / PICTURE
     with reporting(f"cannot write {page}"):
-        page.write_text(page_html([page_data(run, meshes)]), encoding="utf-8")
+        page.write_text(page_html([page_data(facts)]), encoding="utf-8")
     with reporting(f"cannot write {picture}"):
-        summary_picture(run, meshes).save(picture, compress_level=1)
+        summary_picture(facts).save(picture, compress_level=1)
     if (Path(folder) / SUMS).is_file():
         write_checksums(Path(folder), only=(PAGE, PICTURE, PICTURES))
     return [page, picture]
@@ -78,7 +79,7 @@ def write_comparison(folders: Sequence[Path], names: Sequence[str], file: Path) 
     share = 1 / len(folders)
     runs = [Result(folder).checked() for folder in folders]
     data = [
-        page_data(run, shown_meshes(run, int(share * MOST_FACES)), name=name, share=share)
+        page_data(report_facts(run, int(share * MOST_FACES)), name=name, share=share)
         for run, name in zip(runs, names, strict=True)
     ]
     with reporting(f"cannot write {file}"):

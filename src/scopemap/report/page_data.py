@@ -4,83 +4,47 @@ from __future__ import annotations
 
 import tomllib
 from base64 import b64encode
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import trimesh
 from pydantic import BaseModel, ValidationError
 
 from scopemap.engine.errors import ScopemapError
 from scopemap.engine.geometry.align import align_trajectories
 from scopemap.input.trajectory.trajectory import Trajectory
-from scopemap.report.frame_pictures import thinned
+from scopemap.report.facts import PicturedFrame, ReportFacts
 from scopemap.report.measured_by_hand import advice_by_reference, read_measurements
-from scopemap.report.shown_maps import MapOnPage, opening_row, shown_map_numbers, shown_maps
-from scopemap.report.shown_mesh import (
-    FACES_OF_OTHERS,
-    SeenFrame,
-    base64_of,
-    mesh_data,
-    simplified,
-    textured_surface,
-)
+from scopemap.report.shown_maps import MapOnPage, opening_row, shown_map_numbers
+from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, textured_surface
 from scopemap.report.video_parts import video_parts
 from scopemap.result.evidence import notices_of, scale_source
-from scopemap.result.frame_table import NOT_USED
 from scopemap.result.input_part import part_of_input
 from scopemap.result.losses import losses
 from scopemap.result.reference import read_reference
 from scopemap.result.result import Result
 from scopemap.result.run_input import PLACES, places_of_input
-from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
 from scopemap.result.summary import frames_per_s
 from scopemap.result.verdict import gives_reason, verdict
 from scopemap.result.wording import in_words
 
 COVERAGE = "coverage"
-_MOST_BYTES = 7_500_000
-"""Of pictures, before base64, which makes them a third longer."""
+_MOST_BYTES = 10_000_000
+"""Of pictures, in base64."""
 _LOOKED_AT = 25
-_DEPTH_WIDTH_PX = 160
 _CURVES = {"inliers": "inlier_share", "agreement": "correlation", "scale": "depth_scale", "moving": "moving_share"}
 
 
-@dataclass(frozen=True)
-class _Picture:
-    """A frame with a picture: its row, its files' contents, and its depth (h, w), mm, or None.
-
-    depth : a PNG, red and green the upper and lower byte of the depth in the run's unit, 0 = unknown; empty: none.
-    """
-
-    row: int
-    jpg: bytes
-    mask: bytes
-    depth: bytes
-    depth_mm: np.ndarray | None
-
-
-def shown_meshes(run: Result, most_faces: int) -> list[trimesh.Trimesh]:
-    """Return the meshes of `shown_maps`, the result's first, with most faces.
-
-    Others are simplified.
-    """
-    maps = shown_maps(run)
-    most = [most_faces] + [min(most_faces, FACES_OF_OTHERS)] * (len(maps) - 1)
-    return [simplified(one.mesh, faces) for one, faces in zip(maps, most, strict=True)]
-
-
-def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", share: float = 1.0) -> dict[str, Any]:
+def page_data(facts: ReportFacts, *, name: str = "", share: float = 1.0) -> dict[str, Any]:
     """Return what the page shows of a run.
 
-    meshes : from `shown_meshes`. name : by default that of the input. share : of the page's size that is the run's.
+    name : by default that of the input. share : of the page's size that is the run's.
     """
-    camera, pictures = run.camera, _within_budget(_pictures(run), share * _MOST_BYTES)
-    near_mm, far_mm = _depth_range([p.depth_mm for p in pictures if p.depth_mm is not None])
+    run, maps = facts.run, facts.maps
+    pictures = _within_budget([_picture_data(facts, frame) for frame in facts.frames], share * _MOST_BYTES)
     source = str(run.provenance.get("input", ""))
-    maps = shown_maps(run)
     return {
         "name": name or Path(source).name or source,
         "input": source,
@@ -90,14 +54,14 @@ def page_data(run: Result, meshes: list[trimesh.Trimesh], *, name: str = "", sha
         "scale_source": scale_source(run.provenance),
         "notes": [in_words(one) for one in notices_of(run.provenance) if not gives_reason(one.code)],
         "frames_per_s": frames_per_s(run),
-        "camera": {key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+        "camera": {key: getattr(run.camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "frames": _frames(run, maps),
         "opens_at": opening_row(run),
-        "depth_range": [near_mm, far_mm],
-        "pictures": [_picture_data(p) for p in pictures],
+        "depth_range": facts.depth_range_mm,
+        "pictures": pictures,
         "depth_unit_mm": float(np.float32(run.depth.scale_mm)),
         "coverage": _coverage(run),
-        "maps": _maps(run, maps, meshes, pictures),
+        "maps": _maps(facts, {one["row"] for one in pictures}),
         "losses": [
             {"row": loss.first, "when": loss.when, "frames": loss.frames, "cause": loss.cause, "advice": loss.advice}
             for loss in losses(run.frames)
@@ -191,68 +155,42 @@ def _pose_of(submap: Result) -> dict[int, np.ndarray]:
     return dict(zip(frames["index"].tolist(), frames["T_world_camera"], strict=True))
 
 
-def _pictures(run: Result) -> list[_Picture]:
-    rows = np.flatnonzero(run.frames.submap != NOT_USED)
-    used, found = dict(zip(run.frames["index"][rows].tolist(), rows.tolist(), strict=True)), []
-    for index in run.pictured:
-        picture, mask = run.picture_file(index), run.mask_file(index)
-        if index in used and mask.is_file():
-            depth, depth_mm = _depth_picture(run, index)
-            found.append(_Picture(used[index], picture.read_bytes(), mask.read_bytes(), depth, depth_mm))
-    return found
-
-
-def _depth_picture(run: Result, index: int) -> tuple[bytes, np.ndarray | None]:
-    """Return a frame's depth as `_Picture` has it, every n-th pixel, at most 160 in a row."""
-    depth_mm = run.depth.read(index)
-    if depth_mm is None:
-        return b"", None
-    depth_mm = thinned(depth_mm, _DEPTH_WIDTH_PX)
-    units = np.nan_to_num(np.round(depth_mm / run.depth.scale_mm)).astype(np.uint16)
-    coded = np.dstack([units >> 8, units & 255, np.zeros_like(units)]).astype(np.uint8)
-    return cv2.imencode(".png", coded[..., ::-1])[1].tobytes(), depth_mm
-
-
-def _within_budget(pictures: list[_Picture], most_bytes: float) -> list[_Picture]:
+def _within_budget(pictures: list[dict[str, Any]], most_bytes: float) -> list[dict[str, Any]]:
     """Leave every second picture out until the others fit on the page."""
-    sizes = [len(p.jpg) + len(p.mask) + len(p.depth) for p in pictures]
+    sizes = [sum(len(part) for part in one.values() if isinstance(part, str)) for one in pictures]
     while len(pictures) > 1 and sum(sizes) > most_bytes:
         pictures, sizes = pictures[::2], sizes[::2]
     return pictures
 
 
-def _depth_range(depths_mm: list[np.ndarray]) -> tuple[float, float]:
-    """Return the 1st and 99th percentile of all depths, mm, one range for the whole run."""
-    known = [depth_mm[np.isfinite(depth_mm)][::7] for depth_mm in depths_mm]
-    some = np.concatenate([*known, np.empty(0, np.float32)])
-    if not some.size:
-        return 1.0, 100.0
-    near_mm, far_mm = (float(value) for value in np.percentile(some, [1, 99]))
-    return round(near_mm, 3), round(max(far_mm, 1.2 * near_mm), 3)
+def _picture_data(facts: ReportFacts, frame: PicturedFrame) -> dict[str, Any]:
+    """Return a frame's files; depth: red and green are the upper and lower byte of the run's unit, 0 = unknown."""
+    files = {"jpg": frame.jpg, "mask": frame.mask, "depth": b""}
+    if frame.depth_mm is not None:
+        units = np.nan_to_num(np.round(frame.depth_mm / facts.run.depth.scale_mm)).astype(np.uint16)
+        coded = np.dstack([np.zeros_like(units), units & 255, units >> 8]).astype(np.uint8)
+        files["depth"] = cv2.imencode(".png", coded)[1].tobytes()
+    return {"row": frame.row} | {name: b64encode(content).decode() for name, content in files.items()}
 
 
-def _picture_data(picture: _Picture) -> dict[str, Any]:
-    files = {"jpg": picture.jpg, "mask": picture.mask, "depth": picture.depth}
-    return {"row": picture.row} | {name: b64encode(content).decode() for name, content in files.items()}
+def _maps(facts: ReportFacts, rows: set[int]) -> list[dict[str, Any]]:
+    """Return the meshes of the maps, the result first, each with its place in time and what is said of its inliers.
 
-
-def _maps(
-    run: Result, maps: list[MapOnPage], meshes: list[trimesh.Trimesh], pictures: list[_Picture]
-) -> list[dict[str, Any]]:
-    """Return the meshes of the maps, the result first, each with its place in time and what is said of its inliers."""
-    found, submaps = [], submaps_in_time(run.frames)
-    turn, worst = {one.number: k for k, one in enumerate(submaps)}, most_doubtful(submaps)
-    inliers = {one.number: one.inliers + ", most doubtful" * (one is worst) for one in submaps}
-    in_map, indices = shown_map_numbers(run, maps), run.frames["index"].tolist()
-    for number, (one, mesh) in enumerate(zip(maps, meshes, strict=False)):
+    rows : of the frames whose pictures are on the page.
+    """
+    run, found = facts.run, []
+    turn = {one.number: k for k, one in enumerate(facts.submaps)}
+    in_map = shown_map_numbers(run, facts.maps)
+    for number, (one, mesh) in enumerate(zip(facts.maps, facts.meshes, strict=True)):
         pose_of = _pose_of(one.result)
-        looking = [p for p in pictures if in_map[p.row] == number and p.depth_mm is not None]
-        looking = looking[:: max(1, -(-len(looking) // _LOOKED_AT))]
-        seen = [SeenFrame(pose_of[indices[p.row]], p.depth_mm) for p in looking if p.depth_mm is not None]
+        looking = [(f.index, f.depth_mm) for f in facts.frames if f.row in rows and in_map[f.row] == number]
+        known = [(index, depth_mm) for index, depth_mm in looking if depth_mm is not None]
+        known = known[:: max(1, -(-len(known) // _LOOKED_AT))]
+        seen = [SeenFrame(pose_of[index], depth_mm) for index, depth_mm in known]
         textured = textured_surface(one.result, one.segment, mesh)
         data = mesh_data(mesh, seen, run.camera, textured)
-        facts = {"frames": int((in_map == number).sum()), "all_faces": len(one.mesh.faces)}
-        found.append(data | facts | {"turn": turn.get(number, number), "inliers": inliers.get(number, "")})
+        counts = {"frames": int((in_map == number).sum()), "all_faces": len(one.mesh.faces)}
+        found.append(data | counts | {"turn": turn.get(number, number), "inliers": facts.inliers.get(number, "")})
     return found
 
 

@@ -5,7 +5,6 @@ the submaps side by side where there are several.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -14,8 +13,9 @@ from PIL import Image
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.rendering import render_mesh, vertex_colours
-from scopemap.input.decoding import read_decoded
-from scopemap.report.depth_figures import MASKED_GREY
+from scopemap.input.decoding import decoded
+from scopemap.report.depth_figures import MASKED_GREY, colour_depth_in_logs
+from scopemap.report.facts import PicturedFrame, ReportFacts
 from scopemap.report.frame_pictures import WHOLLY_USABLE
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
@@ -31,8 +31,7 @@ from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import SOFT, Sheet, rgb_of
 from scopemap.report.shown_mesh import textured_surface
 from scopemap.result.result import Result
-from scopemap.result.submap_summaries import most_doubtful, submaps_in_time
-from scopemap.result.verdict import Verdict, verdict
+from scopemap.result.verdict import Verdict
 
 _CELL_PX = 384
 _GAP_PX = 12
@@ -44,22 +43,18 @@ _COLUMNS = 4
 _LEAST_REASONS = 2
 NOT_A_DEVICE = "Research software, not a medical device."
 TONES = {"good": "#17794a", "doubtful": "#a35a00", "bad": "#b3261e"}
-_UNKNOWN = 32
 
 
-def summary_picture(run: Result, meshes: Sequence[trimesh.Trimesh]) -> Image.Image:
-    """Return the summary of a run as a picture.
-
-    meshes : of its maps, the result's first, world mm, or some with fewer faces; maps beyond them are not drawn.
-    """
-    frames = _spread(run)
-    seen = [] if run.path is None else [_frames_row(run, frames), _depth_row(run, frames)]
-    main = textured_surface(run, run.main_segment, meshes[0]) or meshes[0]
-    rows = [*seen, _mesh_row(run, main), *_submap_rows(run, meshes)]
+def summary_picture(facts: ReportFacts) -> Image.Image:
+    """Return the summary of a run as a picture."""
+    run, frames = facts.run, _spread(facts)
+    main = textured_surface(run, run.main_segment, facts.meshes[0]) or facts.meshes[0]
+    seen = [_frames_row(run, frames), _depth_row(facts, frames)]
+    rows = [*seen, _mesh_row(run, main), *_submap_rows(facts)]
     rows = [row for row in rows if row]
     heights = [max(picture.shape[0] for picture in row.values()) + _LABEL_PX for row in rows]
     width = _COLUMNS * (_CELL_PX + _GAP_PX) + _GAP_PX
-    found = verdict(run)
+    found = facts.verdict
     lines = _head_lines(found)
     top = _HEAD_PX + _LINE_PX * max(len(lines), _LEAST_REASONS + 1)
     sheet = Sheet(width, top + sum(heights) + _GAP_PX)
@@ -90,19 +85,19 @@ def _write_head(sheet: Sheet, found: Verdict, lines: list[str]) -> None:
         sheet.text((330, 42 + _LINE_PX * place), line, 14, SOFT)
 
 
-def _spread(run: Result) -> list[int]:
-    """Return the numbers of at most four frames of the result, spread over it, that have a picture."""
-    inside = set(run.frames["index"][run.frames.tracked].tolist())
-    known = [index for index in run.pictured if index in inside]
-    return sorted({known[round(place)] for place in np.linspace(0, len(known) - 1, _COLUMNS)}) if known else []
+def _spread(facts: ReportFacts) -> list[PicturedFrame]:
+    """Return at most four frames of the result, spread over it, that have a picture."""
+    known = [frame for frame in facts.frames if facts.run.frames.tracked[frame.row]]
+    return [known[round(n)] for n in np.linspace(0, len(known) - 1, min(len(known), _COLUMNS))] if known else []
 
 
-def _frames_row(run: Result, frames: list[int]) -> dict[str, np.ndarray]:
-    pictures = {f"frame {index}": read_decoded(run.picture_file(index), cv2.IMREAD_COLOR) for index in frames}
-    shown = {title: _fitted(picture[..., ::-1]) for title, picture in pictures.items() if picture is not None}
-    for title, index in zip(pictures, frames, strict=True):
-        if title in shown:
-            _scale_frame(run, index, shown[title])
+def _frames_row(run: Result, frames: list[PicturedFrame]) -> dict[str, np.ndarray]:
+    shown = {}
+    for frame in frames:
+        if (picture := decoded(frame.jpg, cv2.IMREAD_COLOR)) is not None:
+            title = f"frame {frame.index}"
+            shown[title] = _fitted(picture[..., ::-1])
+            _scale_frame(run, frame.index, shown[title])
     return shown
 
 
@@ -119,41 +114,28 @@ def _scale_at_median(picture: np.ndarray, camera: PinholeCamera, depth_mm: np.nd
         draw_scale_bar(picture, camera.fx / median_mm * _CELL_PX / camera.width, f" at {median_mm:.3g} mm")
 
 
-def _depth_row(run: Result, frames: list[int]) -> dict[str, np.ndarray]:
+def _depth_row(facts: ReportFacts, frames: list[PicturedFrame]) -> dict[str, np.ndarray]:
     """Return the depths in turbo, red near, blue far, of one range."""
-    kept = [index for index in frames if run.depth.has(index)]
-    depths = [depth for index in kept if (depth := run.depth.read(index)) is not None]
-    known = np.concatenate([np.empty(0, np.float32), *(depth[np.isfinite(depth)] for depth in depths)])
-    if not known.size:
-        return {}
-    near, far = np.log(np.percentile(known, [1, 99]))
-    ends = ("near", f"{np.exp(far - near):.3g} times as far")
-    if run.scale_known:
-        ends = (f"{np.exp(near):.3g} mm", f"{np.exp(far):.3g} mm")
-    titles = [f"depth: red {ends[0]}, blue {ends[1]}"] + [" " * place for place in range(1, len(depths))]
-    pictures = [
-        _without_masked(run, index, _turbo(depth, near, far)) for index, depth in zip(kept, depths, strict=True)
-    ]
-    shown = {title: _fitted(picture) for title, picture in zip(titles, pictures, strict=True)}
-    for picture, index in zip(shown.values(), kept, strict=True):
-        _scale_frame(run, index, picture)
+    run, (near_mm, far_mm) = facts.run, facts.depth_range_mm
+    ends = (f"{near_mm:.3g} mm", f"{far_mm:.3g} mm")
+    if not run.scale_known:
+        ends = ("near", f"{far_mm / near_mm:.3g} times as far")
+    shown: dict[str, np.ndarray] = {}
+    for frame in frames:
+        if (depth_mm := run.depth.read(frame.index)) is not None:
+            title = " " * len(shown) or f"depth: red {ends[0]}, blue {ends[1]}"
+            shown[title] = _fitted(_without_masked(frame, colour_depth_in_logs(depth_mm, near_mm, far_mm)))
+            _scale_frame(run, frame.index, shown[title])
     return shown
 
 
-def _without_masked(run: Result, index: int, picture: np.ndarray) -> np.ndarray:
+def _without_masked(frame: PicturedFrame, picture: np.ndarray) -> np.ndarray:
     """Return a picture (H, W, 3) uint8 of a frame's depth, grey where its mask says that there is no tissue."""
-    mask = read_decoded(run.mask_file(index))
+    mask = decoded(frame.mask)
     if mask is not None:
         mask = cv2.resize(mask, picture.shape[1::-1], interpolation=cv2.INTER_NEAREST)
         picture[mask != WHOLLY_USABLE] = MASKED_GREY
     return picture
-
-
-def _turbo(depth_mm: np.ndarray, near: float, far: float) -> np.ndarray:
-    with np.errstate(invalid="ignore"):
-        level = np.clip(255 * (1 - (np.log(depth_mm) - near) / max(far - near, 1e-6)), 0, 255)
-    coloured = cv2.applyColorMap(np.nan_to_num(level).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
-    return np.where(np.isnan(depth_mm)[..., None], np.uint8(_UNKNOWN), coloured)
 
 
 def _mesh_row(run: Result, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
@@ -189,19 +171,17 @@ def _with_path(mesh: trimesh.Trimesh, view: MeshView, path_mm: np.ndarray, scale
     return shown
 
 
-def _submap_rows(run: Result, meshes: Sequence[trimesh.Trimesh]) -> list[dict[str, np.ndarray]]:
+def _submap_rows(facts: ReportFacts) -> list[dict[str, np.ndarray]]:
     """Return the submaps of a run that has several, in order of time, in rows: each from outside with its path."""
-    submaps = submaps_in_time(run.frames)
-    if len(submaps) < 2:
-        return []
-    worst, shown = most_doubtful(submaps), {}
-    for submap in submaps:
-        if submap.number < len(meshes) and len((mesh := meshes[submap.number]).faces):
+    run, shown = facts.run, {}
+    for submap in facts.submaps if len(facts.submaps) > 1 else []:
+        mesh = facts.submap_meshes.get(submap.number)
+        if mesh is not None and len(mesh.faces):
             frames = run.submaps[submap.number].frames
             poses = frames["T_world_camera"][frames.tracked]
             view = outside_views(mesh, poses[0], poses[:, :3, 3])["from outside"]
             title = f"{submap.name}: frames {submap.first} to {submap.last}"
-            title = ", ".join(filter(None, (title, submap.inliers, "most doubtful" * (submap is worst))))
+            title = ", ".join(filter(None, (title, facts.inliers[submap.number])))
             shown[title] = _with_path(_opened(mesh, view), view, poses[:, :3, 3], run.scale_known)
     titles = list(shown)
     return [{t: shown[t] for t in titles[row : row + _COLUMNS]} for row in range(0, len(titles), _COLUMNS)]
