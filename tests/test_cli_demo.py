@@ -64,7 +64,7 @@ def test_the_command(demo: Demonstration, monkeypatch: pytest.MonkeyPatch, capsy
     summary = json.loads(said.out)
     assert said.err == ""
     assert summary["tracked"] == COUNT
-    assert [Path(file).name for file in summary["pictures"]] == ["trajectory.png", "mesh.png", "depth.png"]
+    assert [Path(file).name for file in summary["pictures"]] == ["trajectory.png", "depth.png"]
     for file in summary["pictures"]:
         picture = cv2.imread(file)
         assert min(picture.shape[:2]) > 300

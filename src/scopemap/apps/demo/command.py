@@ -60,6 +60,6 @@ def _lines(figures: dict[str, float], out: Path, seconds: float) -> list[str]:
     return [line.format(**figures) for line in lines] + [
         f"video: {clip / 'colon.mp4'}; its camera: {clip / 'camera.yaml'}; its true poses: {clip / 'pose.txt'}",
         f"mesh: {run / 'mesh.ply'} and mesh.glb; trajectory: {run / 'trajectory.tum'}",
-        f"report: {run / 'report.html'}, to be looked at in a browser",
-        f"pictures: {pictures / 'trajectory.png'} (estimate green, truth red), mesh.png, depth.png",
+        f"report: {run / 'report.html'}, to be looked at in a browser; summary.png beside it shows the surface",
+        f"pictures: {pictures / 'trajectory.png'} (estimate green, truth red), depth.png",
     ]

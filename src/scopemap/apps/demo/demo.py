@@ -2,7 +2,7 @@
 
     OUT/clip      colon.mp4, its camera.yaml, and its true poses, pose.txt
     OUT/run       what `scopemap run` would write
-    OUT/pictures  trajectory.png, mesh.png, depth.png
+    OUT/pictures  trajectory.png, depth.png
 
 Needs no network access and no weights but those of the package. `scopemap_bench/scripts/demo_clip.py` renders the clip.
 """
@@ -24,9 +24,8 @@ from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence
 from scopemap.report.depth_figures import draw_depths
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.report.mesh_figures import draw_trajectories, inside_view, mesh_picture, outside_views
+from scopemap.report.mesh_figures import draw_trajectories
 from scopemap.report.page import write_report
-from scopemap.report.sheet import picture_grid
 from scopemap.result.result import Result
 from scopemap.result.result_folder import check_result_folder
 from scopemap.result.trajectories import read_trajectory
@@ -120,17 +119,13 @@ def measure(demo: Demonstration) -> dict[str, float]:
 
 
 def draw(demo: Demonstration, folder: Path) -> list[Path]:
-    """Draw trajectory.png (estimate green, truth red), mesh.png and depth.png into `folder`; return the files."""
-    drawings = [folder / name for name in ("trajectory.png", "mesh.png", "depth.png")]
+    """Draw trajectory.png (estimate green, truth red) and depth.png into `folder`; return the files."""
+    drawings = [folder / name for name in ("trajectory.png", "depth.png")]
     matched = demo.matched
     estimate_mm = np.where(matched.tracked[:, None], matched.aligned[:, :3, 3], np.nan)
     draw_trajectories(estimate_mm, matched.reference[:, :3, 3], drawings[0])
-    mesh = demo.result.mesh.copy()
-    mesh.vertices = matched.similarity.transform_points(np.asarray(mesh.vertices))
-    views = {"from the camera": inside_view(matched.reference[0]), **outside_views(mesh, matched.reference[0])}
-    picture_grid([{title: mesh_picture(mesh, view) for title, view in views.items()}], (400, 400)).save(drawings[1])
     shown = [frame for frame, _ in demo.sequence if frame.index in demo.raw_mm]
     kinds = {"raw depth": demo.raw_mm, "refined depth": demo.refined_mm}
     depths = {kind: [depth_mm[frame.index] for frame in shown] for kind, depth_mm in kinds.items()}
-    draw_depths([frame.rgb for frame in shown], depths, drawings[2])
+    draw_depths([frame.rgb for frame in shown], depths, drawings[1])
     return drawings
