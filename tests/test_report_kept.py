@@ -32,8 +32,9 @@ def test_a_lesion_and_the_reference_are_in_the_report(browser: Any, tmp_path: Pa
     opened = Opened(browser, folder / "report.html")
     assert opened.text("#advice").endswith("Sizes are in mm by your reference (5 mm).")
     rows = [text.split("\t") for text in opened.page.locator("#measured tbody tr").all_inner_texts()]
+    assert rows[0][0].startswith("Reference, frame ")
     assert rows[0][1:] == ["length", "5 mm, as stated", ""]
-    assert rows[1][:2] == ["2. polyp at the fold, frame 4", "largest diameter"]
+    assert rows[1][:2] == ["1. polyp at the fold, frame 4", "largest diameter"]
     found = lesion.found[0]
     assert rows[1][2] == f"{found.value:.3g} mm"
     assert rows[1][3] == f"{found.low:.3g} to {found.high:.3g} mm, wide mainly because of {found.why}"

@@ -21,10 +21,16 @@ function figuresOf(one) {
 
 const titleOf = (one) => one.name || { reference: "Reference", lesion: "Lesion" }[one.kind] || (one.points.length > 2 ? "Area" : "Distance");
 
-function tableRows(one, number) {
+// The number that the window and its CSV give a measurement, "1. "; a reference has none.
+function numberOf(one) {
+  const number = run.measurements.filter(({ kind }) => kind !== "reference").indexOf(one) + 1;
+  return number ? `${number}. ` : "";
+}
+
+function tableRows(one) {
   const figures = figuresOf(one), button = document.createElement("button"), head = document.createElement("th");
   button.type = "button";
-  button.textContent = `${number + 1}. ${titleOf(one)}, frame ${one.frame}`;
+  button.textContent = `${numberOf(one)}${titleOf(one)}, frame ${one.frame}`;
   button.disabled = rowOf(one) < 0; // measured before the result was made again
   button.addEventListener("click", () => (setRow(rowOf(one)), element("surface").scrollIntoView({ block: "nearest" })));
   Object.assign(head, { scope: "rowgroup", rowSpan: figures.length });
