@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from drawn_run import IN_RESULT, draw_run, tube
 from shown_window import shown_window
 from test_browser_result_page import click
 
-from scopemap.apps.browser.files_part import mm_per_unit, surface_words
+from scopemap.apps.browser.files_part import surface_words
 from scopemap.apps.browser.result_page import ResultPage
-from scopemap.apps.measure.hand_measure import kept_measures
 from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.notices import Level
 from scopemap.report.facts import report_facts
@@ -99,18 +100,27 @@ def test_the_files_say_which_part_they_show_and_how_their_numbers_become_mm(tmp_
         shown.press("Use as reference")
         ends = np.array(read_measurements(folder)[0]["world"])
         factor = 5 / np.linalg.norm(ends[1] - ends[0])
-        assert f"by your reference, times {factor:.3g} its numbers are mm in STL and 3D Slicer, m in GLB." in (
-            shown.words
-        )
+        frame = read_measurements(folder)[0]["frame"]
+        assert (
+            "Its numbers are mm in STL and 3D Slicer, m in GLB: those of the result times "
+            f"{factor:.3g}, by your reference of 5 mm in frame {frame}."
+        ) in shown.words
+        shown.press("Surface for printing (STL)")
+        shown.until(lambda: shown.sent)
+        (stl,) = shown.sent.values()
+        printed = trimesh.load(io.BytesIO(stl), file_type="stl")
+        np.testing.assert_allclose(printed.bounds, Result(folder).mesh.bounds * factor, rtol=1e-4)
         # The files hold the main surface: a reference on another one does not count.
         other = Result(folder)
         other.provenance["main_segment"] = 1
-        assert mm_per_unit(Result(folder), kept_measures(folder)) == pytest.approx(factor)
-        assert mm_per_unit(other, kept_measures(folder)) is None
+        assert (
+            f"Its numbers are no mm: your reference of 5 mm in frame {frame} holds only for the part from {times}."
+            in (surface_words(other))
+        )
         shown.press("Forget the reference")
         assert "its numbers are no mm" in shown.words
     known = Result(draw_run(tmp_path / "known", scale={"known": True, "source": "a ruler", "measured": True}))
-    assert surface_words(known, []) == (
+    assert surface_words(known) == (
         "The surface is that of the whole result. Its numbers are mm in STL and 3D Slicer, m in GLB."
     )
 

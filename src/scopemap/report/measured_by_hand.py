@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from scopemap.result.result import Result
+
 MEASUREMENTS = "measurements.json"
 _SIZES = re.compile(r"Sizes .*$")
 """What a verdict's advice says of sizes: its end."""
@@ -37,6 +39,11 @@ class _ByHand(BaseModel):
     found: list[_Value]
     command: str
     world: list[tuple[float, float, float]]
+
+
+def folder_in_whole(run: Result) -> str:
+    """Return where a submap is in the whole result: "maps/1", or "." for the result itself."""
+    return f"maps/{run.folder.resolve().name}" if run.is_submap else "."
 
 
 def checked_measurements(text: bytes) -> list[dict[str, Any]]:

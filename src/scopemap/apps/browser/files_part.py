@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from scopemap.apps.browser.result_view import ResultView
-from scopemap.apps.browser.window import escaped
+from scopemap.apps.browser.window import BrowserWindow, escaped
 from scopemap.apps.export.formats import FORMATS, export_run
-from scopemap.apps.measure.hand_measure import HandMeasure, folder_in_whole, kept_measures
+from scopemap.apps.export.reference_scale import holds_for, reference_scale
 from scopemap.report.page import PAGE, PICTURE, page_to_send
 from scopemap.result.result import Result
 
@@ -61,7 +59,7 @@ class FilesPart:
 
     def _say_which(self) -> None:
         view = self._view
-        self._which.content = escaped(surface_words(view.run, kept_measures(view.whole.folder)))
+        self._which.content = escaped(surface_words(view.run))
 
     def _on_press(self, label: str, call: Callable[[Any], None]) -> None:
         """Make a button whose press calls with the browser that it came from."""
@@ -91,39 +89,34 @@ class FilesPart:
 
     def _name(self, file: Path) -> str:
         """Return the name of a file that is sent: that of the video, and what it is."""
-        source = Path(str(self._view.whole.provenance.get("input", "")))
-        video = Path(self._view.window.names.of(source, "video")).stem or "result"
+        video = video_name(self._view.window, self._view.whole)
         ending = file.suffix if file.is_file() else ".zip"
         return f"{video}{ending}" if file.stem.split("_")[0] in _SURFACES.values() else f"{video}_{file.stem}{ending}"
 
 
-def surface_words(run: Result, kept: Sequence[HandMeasure]) -> str:
+def video_name(window: BrowserWindow, run: Result) -> str:
+    """Return the name of a result's video, without its ending, for names of files that are sent."""
+    source = Path(str(run.provenance.get("input", "")))
+    return Path(window.names.of(source, "video")).stem or "result"
+
+
+def surface_words(run: Result) -> str:
     """Return which part of the video the surface in the files is, and what its numbers are, as sentences.
 
-    run : the result or the submap that is exported. kept : what was measured by hand in the whole result.
+    run : the result or the submap that is exported.
     """
     segments, main = run.segments, run.main_segment
     part = f"the part from {segments[main].words}" if len(segments) > 1 else "the whole result"
-    which = f"The surface is that of {part}."
+    which, units = f"The surface is that of {part}.", "Its numbers are mm in STL and 3D Slicer, m in GLB"
     if run.scale_known:
-        return f"{which} Its numbers are mm in STL and 3D Slicer, m in GLB."
-    if (factor := mm_per_unit(run, kept)) is None:
+        return f"{which} {units}."
+    known = reference_scale(run)
+    if known is None:
         return f"{which} Its scale is unknown: its numbers are no mm."
-    return (
-        f"{which} Its scale is unknown: by your reference, times {factor:.3g} its numbers are mm in STL and 3D Slicer, "
-        "m in GLB."
-    )
-
-
-def mm_per_unit(run: Result, kept: Sequence[HandMeasure]) -> float | None:
-    """Return by which factor numbers of a result's main surface become mm, by a reference on it; None: by none."""
-    for one in kept:
-        is_here = one.kind == "reference" and one.folder == folder_in_whole(run)
-        if not is_here or one.reference_mm is None or run.segment_at(one.frame) != run.main_segment:
-            continue
-        length = float(np.linalg.norm(one.world[1] - one.world[0]))
-        return one.reference_mm / length if length > 0 else None
-    return None
+    if holds_for(known, run, main):
+        return f"{which} {units}: those of the result times {known.factor:.3g}, by your {known.words}."
+    elsewhere = f"your {known.words} holds only for the part from {segments[known.segment].words}"
+    return f"{which} Its numbers are no mm: {elsewhere}."
 
 
 def sent_bytes(file: Path) -> bytes:

@@ -10,9 +10,10 @@ import numpy as np
 
 from scopemap.apps.browser.seen_by import Sight, corners_in, frames_that_saw, pose_of
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
-from scopemap.apps.measure.hand_measure import HandMeasure, folder_in_whole, rounded
+from scopemap.apps.measure.hand_measure import HandMeasure, rounded
 from scopemap.apps.measure.measure import check_reference, measure
 from scopemap.engine.errors import InputError
+from scopemap.report.measured_by_hand import folder_in_whole
 from scopemap.result.result import Result
 
 _MOST_TRIED = 4

@@ -11,8 +11,9 @@ from scopemap.apps.browser.marks import draw_marks
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.seen_by import corners_in
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
-from scopemap.apps.measure.hand_measure import HandMeasure, folder_in_whole, rounded
+from scopemap.apps.measure.hand_measure import HandMeasure, rounded
 from scopemap.apps.measure.lesion import measure_lesion
+from scopemap.report.measured_by_hand import folder_in_whole
 
 _OUTLINE = "/page/lesion"
 _FEWEST = 3

@@ -25,13 +25,12 @@ from scopemap.apps.measure.hand_measure import (
     HandMeasure,
     add_measurement,
     as_csv,
-    folder_in_whole,
     kept_measures,
     remove_measurement,
     remove_reference,
 )
 from scopemap.apps.measure.measure import Measure
-from scopemap.report.measured_by_hand import MEASUREMENTS
+from scopemap.report.measured_by_hand import MEASUREMENTS, folder_in_whole
 
 _KEPT = "/page/measured"
 _SHORT = {"mm": "mm", "mm2": "mm²", "times the reference": "x", "times the reference's square": "x²"}

@@ -11,6 +11,7 @@ from scopemap.apps.export.dicom_stl import write_dicom_stl
 from scopemap.apps.export.image_layouts import write_colmap, write_endogslam, write_endonerf, write_nerfstudio
 from scopemap.apps.export.mcap_bag import write_mcap
 from scopemap.apps.export.points import write_gaussians, write_points
+from scopemap.apps.export.reference_scale import in_mm
 from scopemap.apps.export.surfaces import Axes, write_glb, write_slicer, write_surface, write_surfaces
 from scopemap.apps.export.trajectories import lines_in_words, write_euroc_file, write_kitti_file, write_kitti_folder
 from scopemap.engine.errors import InputError, SettingsError
@@ -25,7 +26,8 @@ class ExportFormat:
     """A format: how it is written, its possible units and axes, the default first, and the ending of its file.
 
     Without an ending it is a folder, or, where `write_file` is there, that file if the name is a file's. `is_text`:
-    programs recognise it by its content, so that any ending will do that is not of another format.
+    programs recognise it by its content, so that any ending will do that is not of another format. `of_frames`: it
+    holds all frames, whichever segment they are in, not the main surface.
     """
 
     write: Write
@@ -34,38 +36,43 @@ class ExportFormat:
     ending: str = ""
     is_text: bool = False
     write_file: Write | None = None
+    of_frames: bool = False
 
 
 # Files of poses without numbers, in a folder of their format.
 _UNNUMBERED = {"kitti": "poses.txt", "endogslam": "pose.txt"}
 _ANY_AXES: tuple[Axes, ...] = ("lps", "ras", "opencv", "gltf")
 FORMATS: dict[str, ExportFormat] = {
-    "nerfstudio": ExportFormat(lambda run, out, unit, axes: write_nerfstudio(run, out), ("m",)),
-    "colmap": ExportFormat(lambda run, out, unit, axes: write_colmap(run, out, unit), ("mm", "m")),
-    "endogslam": ExportFormat(lambda run, out, unit, axes: write_endogslam(run, out), ("mm",)),
-    "endonerf": ExportFormat(lambda run, out, unit, axes: write_endonerf(run, out), ("mm",)),
+    "nerfstudio": ExportFormat(lambda run, out, unit, axes: write_nerfstudio(run, out), ("m",), of_frames=True),
+    "colmap": ExportFormat(lambda run, out, unit, axes: write_colmap(run, out, unit), ("mm", "m"), of_frames=True),
+    "endogslam": ExportFormat(lambda run, out, unit, axes: write_endogslam(run, out), ("mm",), of_frames=True),
+    "endonerf": ExportFormat(lambda run, out, unit, axes: write_endonerf(run, out), ("mm",), of_frames=True),
     "tum": ExportFormat(
         lambda run, out, unit, axes: write_tum(out, run.tracked.trajectory, unit=unit, comment=run.scale),
         ("m", "mm"),
         ending=".txt",
         is_text=True,
+        of_frames=True,
     ),
     "kitti": ExportFormat(
         lambda run, out, unit, axes: write_kitti_folder(run, out, unit),
         ("m", "mm"),
         is_text=True,
         write_file=lambda run, out, unit, axes: write_kitti_file(run, out, unit),
+        of_frames=True,
     ),
-    "euroc": ExportFormat(lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv", is_text=True),
+    "euroc": ExportFormat(
+        lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv", is_text=True, of_frames=True
+    ),
     "ply": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".ply"),
-    "surfaces": ExportFormat(write_surfaces, ("mm", "m"), _ANY_AXES),
+    "surfaces": ExportFormat(write_surfaces, ("mm", "m"), _ANY_AXES, of_frames=True),
     "obj": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".obj"),
     "stl": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".stl"),
     "glb": ExportFormat(lambda run, out, unit, axes: write_glb(run, out), ("m",), ("gltf",), ".glb"),
     "slicer": ExportFormat(lambda run, out, unit, axes: write_slicer(run, out), ("mm",), ("lps",)),
     "pointcloud": ExportFormat(lambda run, out, unit, axes: write_points(run, out, unit), ("mm", "m"), ending=".ply"),
     "gaussians": ExportFormat(lambda run, out, unit, axes: write_gaussians(run, out, unit), ("mm", "m"), ending=".ply"),
-    "mcap": ExportFormat(lambda run, out, unit, axes: write_mcap(run, out), ("m",), ending=".mcap"),
+    "mcap": ExportFormat(lambda run, out, unit, axes: write_mcap(run, out), ("m",), ending=".mcap", of_frames=True),
     "dicom": ExportFormat(write_dicom_stl, ("mm", "m"), ("lps",), ".dcm"),
 }
 _NO_TEXT = {form.ending for form in FORMATS.values() if form.ending and not form.is_text}
@@ -88,8 +95,9 @@ def export_run(
     """Write the run in `folder` as the format with this name, and return what is known of its scale, in words.
 
     unit, axes : None for the format's own. source : where the run's input is now; else it is looked for. Frames that
-    are lost or in another submap are left out. Raises `SettingsError` for units and axes that the format does not have,
-    `InputError` where `out` is there already, cannot be written, or the run lacks what the format needs.
+    are lost or in another submap are left out. Lengths are in mm by the reference that was set by hand, where one is
+    kept and gives the scale of what is written (`in_mm`). Raises `SettingsError` for units and axes that the format
+    does not have, `InputError` where `out` is there already, cannot be written, or the run lacks what it needs.
     """
     form = FORMATS[name]
     for option, given, possible in (("units", unit, form.units), ("axes", axes, form.axes)):
@@ -98,7 +106,8 @@ def export_run(
     form = _named(form, name, out)
     if out.is_file() or (out.is_dir() and (form.ending or any(out.iterdir()))):
         raise InputError(f"{out} exists; give another name with --out")
-    run = Result(folder, source).checked(with_poses=True)
+    whole = Result(folder, source).checked(with_poses=True)
+    run = in_mm(whole, None if form.of_frames else whole.main_segment)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         # An export that fails or is stopped leaves nothing.

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
+from scopemap.apps.export.reference_scale import in_mm
 from scopemap.apps.export.slicer_markups import markup, write_markups
 from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.mesh_files import ply_bytes, save_mesh, texture_jpeg
@@ -79,15 +80,18 @@ def _write_textured_obj(textured: trimesh.Trimesh, file: Path, about: list[str])
 def write_surfaces(run: Result, folder: Path, unit: Unit, axes: Axes) -> None:
     """Write the surface that fits each tracked frame, as `000000.ply`, ..., named by the frame's number.
 
-    Raises `InputError` where the run has no surface, or one that fits all frames.
+    The files of the segment that has a reference are in mm by it, and each file says what its scale is. Raises
+    `InputError` where the run has no surface, or one that fits all frames.
     """
     if len(run.segments) < 2:
         raise InputError(f"{run.path}: one surface fits all frames; export it as ply")
     folder.mkdir(parents=True, exist_ok=True)
-    about = _about(run, unit, axes)
+    as_kept = Result(run.folder)
+    by_segment = {one.segment: in_mm(as_kept, one.segment) for one in run.segments}
     for index in run.tracked.trajectory.indices.tolist():
-        shown = _converted(run.mesh_at(index), unit, axes)
-        (folder / f"{index:06d}.ply").write_bytes(ply_bytes(shown, about))
+        shown = by_segment[run.segment_at(index)]
+        content = ply_bytes(_converted(shown.mesh, unit, axes), _about(shown, unit, axes))
+        (folder / f"{index:06d}.ply").write_bytes(content)
 
 
 def stl_bytes(run: Result, unit: Unit, axes: Axes) -> bytes:

@@ -122,8 +122,8 @@ def measure(
 def _show_kept(run: Path, pictures: Path | None, export: Path | None, as_json: bool) -> None:
     """Show what was measured by hand on a run or a submap, and export it."""
     from scopemap.apps.measure.findings import FINDING_ENDINGS, write_findings
-    from scopemap.apps.measure.hand_measure import findings_of, folder_in_whole, kept_measures
-    from scopemap.report.measured_by_hand import MEASUREMENTS
+    from scopemap.apps.measure.hand_measure import findings_of, kept_measures
+    from scopemap.report.measured_by_hand import MEASUREMENTS, folder_in_whole
     from scopemap.result.result import Result
 
     if pictures is not None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from scopemap.apps.export.reference_scale import holds_for, in_mm, reference_scale
 from scopemap.apps.export.slicer_markups import markup, write_markups
 from scopemap.apps.measure.dicom_report import write_dicom_report
 from scopemap.apps.measure.surface_finding import SurfaceFinding
@@ -17,10 +19,14 @@ FINDING_ENDINGS = (".json", ".dcm")
 def write_findings(run: Path, findings: list[SurfaceFinding], scale: str, file: Path) -> None:
     """Write findings on the surface of a run as markups (.json), or as a DICOM report (.dcm), which needs highdicom.
 
-    scale : what their sizes rest on. Raises `InputError` where the file cannot be written, `SettingsError` where
-    highdicom is not installed.
+    scale : what their sizes rest on. Points are where the exported surface has them: in mm by the reference that was
+    set by hand, where it gives the scale of that. Raises `InputError` where the file cannot be written,
+    `SettingsError` where highdicom is not installed.
     """
-    exported = Result(run).checked(with_poses=True)
+    whole = Result(run).checked(with_poses=True)
+    exported, known = in_mm(whole, whole.main_segment), reference_scale(whole)
+    if known is not None and holds_for(known, whole, whole.main_segment):
+        findings = [replace(one, points_mm=one.points_mm * known.factor) for one in findings]
     about = f"sizes: {scale}" + (f"; points, as the surface: {exported.scale}" if scale != exported.scale else "")
     with reporting(f"cannot write {file}"):
         file.parent.mkdir(parents=True, exist_ok=True)

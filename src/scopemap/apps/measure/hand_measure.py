@@ -18,7 +18,6 @@ from scopemap.apps.measure.surface_finding import SurfaceFinding
 from scopemap.report.measured_by_hand import checked_measurements, read_measurements
 from scopemap.report.page import keep_measurements
 from scopemap.result.json_numbers import without_nan
-from scopemap.result.result import Result
 
 Kind = Literal["measure", "lesion", "reference"]
 _NUMBERS = ("value", "low", "high")
@@ -117,11 +116,6 @@ def rounded(pixels: np.ndarray) -> np.ndarray:
 def pixels_in_words(pixels: np.ndarray) -> str:
     """Return pixels as the options of `measure` take them, "x,y x,y"."""
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in np.asarray(pixels).tolist())
-
-
-def folder_in_whole(run: Result) -> str:
-    """Return where a submap is in the whole result: "maps/1", or "." for the result itself."""
-    return f"maps/{run.folder.resolve().name}" if run.is_submap else "."
 
 
 def kept_measures(folder: Path) -> list[HandMeasure]:
