@@ -20,13 +20,15 @@ import pytest
 import trimesh
 from drawn_run import FRAMES, IN_RESULT, changed, draw_run, tube
 from front_door import call, refused
+from shown_window import shown_window
 from window_without_browser import element, elements, press, until, words
 
 from scopemap.apps.browser.compare_page import ComparePage
 from scopemap.apps.browser.surface_pair import distance_to_see
 from scopemap.apps.browser.two_results import apart_of, compare_results, is_alone, is_same_input
 from scopemap.apps.browser.window import BrowserWindow
-from scopemap.apps.exams.compare_exams import Change, ExamComparison
+from scopemap.apps.exams.change import Change
+from scopemap.apps.exams.compare_exams import ExamComparison
 from scopemap.apps.exams.registration import Correspondences3D, Registration
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.align import Similarity
@@ -205,7 +207,7 @@ def test_the_changes_of_two_examinations_are_flown_to(tmp_path: Path, monkeypatc
     place = np.array([0.0, 10.0, 40.0])
     compared = 1 + (np.linalg.norm(tube().vertices - place, axis=1) < 4).astype(np.uint8)
     change = Change("shape", place, 12.34, 1.5, 0.0, 21.0, 5, (6, 8))
-    found = ExamComparison(registered(0.01), tube(), [change], [(0, 1), (9, 10)], 0.1, 0.2, compared)
+    found = ExamComparison(registered(0.01), tube(), [change], [(0, 1), (9, 10)], 0.1, 0.2, (compared, compared))
     monkeypatch.setattr("scopemap.apps.exams.compare_exams.compare_exams", lambda *folders: found)
     with opened(ComparePage(first, second)) as window:
         until(window, lambda: "One over the other" in words(window))
@@ -214,11 +216,11 @@ def test_the_changes_of_two_examinations_are_flown_to(tmp_path: Path, monkeypatc
         assert "changed" in element(window, "Colours").options[0]
         nodes, camera = window.scene._handle_from_node_name, window.server.initial_camera
         before = np.array(camera.position)
-        press(window, "1: shape, 12.3 units²")
+        press(window, "1: shape, 12.3 units², in a alone")
         assert np.asarray(camera.look_at) == pytest.approx(place)
         assert np.linalg.norm(np.array(camera.position) - before) > 1
         assert np.asarray(nodes["/page/first/change"].position) == pytest.approx(place)
-        assert "1.50 units nearer to the camera in b" in words(window)
+        assert "1.50 units nearer to the camera in b; 21 sigmas, in 5 views of a" in words(window)
         labels = [getattr(one, "label", "") for one in elements(window)]
         assert {"1: shape, a, frame 6", "b, frame 8"} <= set(labels)
         press(window, "The same place", "frames 9 and 10")
@@ -229,10 +231,31 @@ def test_the_changes_of_two_examinations_are_flown_to(tmp_path: Path, monkeypatc
         assert [nodes[f"/page/{side}/name"].text for side in ("first", "second")] == ["a", "b"]
 
 
+def test_the_comparison_is_downloaded_as_one_file_of_both_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = draw_run(tmp_path / "a", name="before.mp4"), draw_run(tmp_path / "b", name="after.mp4")
+    change = Change("shape", np.array([0.0, 10.0, 40.0]), 12.34, 1.5, 0.0, 21.0, 5, (6, 8), "both")
+    compared = np.ones(len(tube().vertices), np.uint8)
+    found = ExamComparison(registered(0.01), tube(), [change], [(0, 1)], 0.1, 0.2, (compared, compared))
+    monkeypatch.setattr("scopemap.apps.exams.compare_exams.compare_exams", lambda *folders: found)
+    for anonymous, name in ((False, "before_and_after.html"), (True, "video 1_and_video 2.html")):
+        with shown_window(anonymous=anonymous) as shown:
+            shown.show(ComparePage(first, second))
+            shown.until(lambda: "Download the comparison" in shown.labels())
+            shown.press("Download the comparison")
+            ((sent, page),) = shown.sent.items()
+        assert sent == name
+        assert page.count(b"<img src='data:image/jpeg;base64,") == page.count(b"<img") == 2
+        assert b"<td>shape</td><td>12.34</td><td>1.50</td><td>0.00</td><td>21</td><td>both</td>" in page
+        assert (b"<title>a and b</title>" in page) == (not anonymous)
+        assert str(tmp_path).encode() not in page
+
+
 def test_of_two_that_do_not_fit_no_change_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = draw_run(tmp_path / "a"), draw_run(tmp_path / "b", name="another.mp4")
     compared = np.zeros(len(tube().vertices), np.uint8)
-    found = ExamComparison(registered(0.286), tube(), [], [(0, 1)], 0.88, 0.63, compared)
+    found = ExamComparison(registered(0.286), tube(), [], [(0, 1)], 0.88, 0.63, (compared, compared))
     asked: list[tuple[Path, ...]] = []
     monkeypatch.setattr(
         "scopemap.apps.exams.compare_exams.compare_exams", lambda *folders: (asked.append(folders), found)[1]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
+from base64 import b64decode
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -13,6 +16,7 @@ from front_door import call, refused
 from plane_scene import CAMERA, EVERYWHERE, PLANE_MM, pose, see
 
 from scopemap.apps.exams import registration
+from scopemap.apps.exams.change import Change, changes_of_both
 from scopemap.apps.exams.compare_exams import ExamComparison, compare_exams
 from scopemap.apps.exams.examination import Examination
 from scopemap.apps.exams.exams_page import facts_of
@@ -109,9 +113,14 @@ def test_a_spot_and_a_bump_are_the_changes(found: ExamComparison) -> None:
 def test_the_vertices_say_where_it_changed(runs: tuple[Path, Path], found: ExamComparison) -> None:
     xy = np.asarray(Result(runs[0]).mesh.vertices)[:, :2]
     apart = np.min([np.linalg.norm(xy - middle, axis=1) for middle in (SPOT_MM, BUMP_MM)], axis=0)
-    assert (found.compared[apart < 0.4 * RADIUS_MM] == 2).all()
-    assert (found.compared[apart > 2 * RADIUS_MM] < 2).all()
-    assert set(np.unique(found.compared)) == {0, 1, 2}
+    of_first, of_second = found.compared
+    assert (of_first[apart < 0.4 * RADIUS_MM] == 2).all()
+    assert (of_first[apart > 2 * RADIUS_MM] < 2).all()
+    assert set(np.unique(of_first)) == {0, 1, 2}
+    xy = np.asarray(found.second.vertices)[:, :2]
+    apart = np.min([np.linalg.norm(xy - middle, axis=1) for middle in (SPOT_MM, BUMP_MM)], axis=0)
+    assert (of_second[apart < 0.4 * RADIUS_MM] == 2).all()
+    assert (of_second[apart > 2 * RADIUS_MM] < 2).all()
 
 
 def test_what_only_one_saw(found: ExamComparison) -> None:
@@ -144,8 +153,16 @@ def test_the_command_writes_a_page(runs: tuple[Path, Path], tmp_path: Path, capf
     assert page.count("<tr>") == 3
     assert "Above 0 the wall is nearer to the camera, and redder, in second." in page
     assert page.index("<strong>They fit: ") < page.index("Found in first")
-    for name in ("changes.png", "views.png", "second.ply"):
-        assert (tmp_path / "out" / name).stat().st_size > 1000
+    assert "In the views of both: 2; in those of first alone: 0, of second alone: 0." in said
+    assert [change["seen_in"] for change in facts["changes"]] == ["both", "both"]
+    # One file: it needs nothing beside it.
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["changes.json", "compare.html", "second.ply"]
+    sources = re.findall(r"src='([^']*)'", page)
+    assert len(sources) == page.count("<img") == 2
+    for source in sources:
+        kind, content = source.split(",")
+        assert kind == "data:image/jpeg;base64"
+        assert cv2.imdecode(np.frombuffer(b64decode(content), np.uint8), cv2.IMREAD_COLOR).shape[0] > 100
     assert "exists" in refused(capfd, "compare-exams", *runs, "--out", tmp_path / "out")
     assert "no finished run" in refused(capfd, "compare-exams", runs[0], tmp_path, "--out", tmp_path / "b")
 
@@ -156,6 +173,47 @@ def test_the_order_does_not_decide_whether_they_fit(runs: tuple[Path, Path], fou
     assert other.residual == pytest.approx(one.residual)
     assert (other.by_second, other.located_first) == (not one.by_second, one.located_second)
     assert back.fit is found.fit is ExamFit.GOOD
+    # Nor what changed: the same places, of the same kind, seen from the other side.
+    S = one.S_first_second
+    assert {change.seen_in for change in [*found.changes, *back.changes]} == {"both"}
+    assert len(found.changes) == len(back.changes) == 2
+    for change, same in zip(found.changes, back.changes, strict=True):
+        assert same.what == change.what
+        # Each is on its own surface, and the bump's rises.
+        assert np.linalg.norm((S.transform_points(same.place_mm) - change.place_mm)[:2]) < 1.0
+        assert same.area_mm2 * S.scale**2 == pytest.approx(change.area_mm2, rel=0.02)
+        assert same.rise_mm * S.scale == pytest.approx(-change.rise_mm, rel=0.02)
+        assert same.redness == pytest.approx(-change.redness, rel=0.02)
+        assert same.frames == change.frames[::-1]
+
+
+def test_a_change_that_one_side_saw_is_listed_as_its_own() -> None:
+    def seen(x: float, what: str, sigmas: float, side: str = "first") -> Change:
+        return Change(what, np.array([x, 0.0, 0.0]), np.pi, 0.3, 0.1, sigmas, 4, (1, 2), side)  # type: ignore[arg-type]
+
+    of_first = [seen(0, "shape", 9), seen(10, "colour", 40), seen(20, "shape", 12)]
+    of_second = [seen(12.2, "shape", 10, "second"), seen(22.5, "shape", 50, "second")]
+    found = changes_of_both(of_first, of_second, 0.0)
+    # Circles of 1 mm that rise by 0.3: the second touches, the third does not.
+    assert [(change.seen_in, change.what, change.sigmas) for change in found] == [
+        ("both", "shape and colour", 40),
+        ("second", "shape", 50),
+        ("first", "shape", 12),
+        ("first", "shape", 9),
+    ]
+    assert (found[0].place_mm[0], found[0].views) == (10, 8)
+    # Nor are surfaces apart that lie as far from each other everywhere.
+    assert sum(change.seen_in == "both" for change in changes_of_both(of_first, of_second, 0.6)) == 2
+    turned = changes_of_both(of_second, of_first, 0.0)
+    assert [(change.seen_in, change.what) for change in turned] == [(change.seen_in, change.what) for change in found]
+
+
+def test_what_the_views_of_the_second_show_is_told_in_the_world_of_the_first() -> None:
+    S = Similarity(2.0, so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.0, 0.0, 5.0]))
+    change = Change("shape", np.array([1.0, 0.0, 0.0]), 3.0, 0.5, 0.2, 9.0, 4, (7, 8)).of_second(S)
+    assert change.place_mm == pytest.approx([0, 2, 5])
+    assert (change.area_mm2, change.rise_mm, change.redness) == (12.0, -1.0, -0.2)
+    assert (change.frames, change.seen_in) == ((8, 7), "second")
 
 
 def test_the_way_whose_points_agree_better_is_kept(
@@ -181,7 +239,7 @@ def test_the_way_whose_points_agree_better_is_kept(
     none = compare_exams(*runs)
     assert none.registration.residual > MOST_RESIDUAL
     assert none.fit is ExamFit.NONE
-    assert (none.changes, none.compared.any()) == ([], False)
+    assert (none.changes, [side.any() for side in none.compared]) == ([], [False, False])
     assert facts_of(none, "mm")["changes"] is None
     said = list(summary(none, "guessed", ("a", "b")))
     assert said[0].startswith("They do not fit: matched points are ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -111,6 +112,13 @@ class Sheet:
         """Write the sheet as the kind of image that the name says. Raises `OSError` where it cannot be written."""
         # PNG has no quality, and ignores it.
         Image.fromarray(self.rgb).save(file, quality=_JPEG_QUALITY)
+
+    @property
+    def jpeg(self) -> bytes:
+        """The sheet as JPEG, for a page that needs no other file."""
+        content = io.BytesIO()
+        Image.fromarray(self.rgb).save(content, "JPEG", quality=_JPEG_QUALITY)
+        return content.getvalue()
 
 
 @dataclass(frozen=True)

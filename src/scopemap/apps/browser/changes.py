@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
+from scopemap.apps.browser.files_part import video_name
 from scopemap.apps.browser.legends import words_html
 from scopemap.apps.browser.scene import draw_path, look_from
 from scopemap.apps.browser.surface_pair import SurfacePair
 from scopemap.apps.browser.window import escaped
+from scopemap.apps.exams.change import Change
 from scopemap.apps.exams.change_painting import COMPARED
-from scopemap.apps.exams.compare_exams import Change, ExamComparison
-from scopemap.apps.exams.exams_page import pictures_of, pictures_of_view
+from scopemap.apps.exams.compare_exams import ExamComparison
+from scopemap.apps.exams.exams_page import comparison_page, pictures_of, pictures_of_view
 from scopemap.apps.exams.fit import ExamFit
-from scopemap.apps.exams.wording import summary
+from scopemap.apps.exams.wording import seen_words, summary
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.sheet import rgb_of
 from scopemap.result.result import Result
@@ -51,15 +53,13 @@ class ShownChanges:
         window, gui, found, first = self._window, self._window.gui, self._found, self._runs[0]
         judged, *lines = (escaped(line) for line in summary(found, first.scale, self._names))
         gui.add_markdown("\n".join([f"**{judged}**\n", *(f"- {line}" for line in lines)]))
-        mesh = trimesh.Trimesh(
-            first.mesh.vertices, first.mesh.faces, vertex_colors=vertex_colours(first.mesh), process=False
-        )
-        mesh.vertex_attributes[_COMPARED] = found.compared.astype(float)
-        self._pair = SurfacePair(window, (mesh, found.second), self._poses, self._names)
+        surfaces = [_compared(*one) for one in zip((first.mesh, found.second), found.compared, strict=True)]
+        self._pair = SurfacePair(window, surfaces, self._poses, self._names)
         draw_path(window.scene, f"{self._pair.nodes[0]}/path", self._poses[:, :3, 3])
         unit = "mm" if first.scale_known else "units"
         for number, change in enumerate(found.changes[:_MOST], 1):
-            label = f"{number}: {change.what}, {change.area_mm2:.1f} {unit}²"
+            seen = "" if change.seen_in == "both" else f", in {seen_words(change, self._names)} alone"
+            label = f"{number}: {change.what}, {change.area_mm2:.1f} {unit}²{seen}"
             window.on(gui.add_button(label), self._fly, number, change)
         if found.views:
             names = [f"frames {one} and {other}" for one, other in found.views]
@@ -71,6 +71,9 @@ class ShownChanges:
             window.on(gui.add_dropdown("Colours", (_CHANGED, _PICTURE)), self._colour)
         self._legend = gui.add_html("")
         window.on(gui.add_checkbox("One over the other", initial_value=False), self._pair.place)
+        button = gui.add_button("Download the comparison")
+        button.on_click(lambda event: window.do(self._send, event.client))
+        gui.add_markdown("It is one file to keep, print or send, with the table and the pictures.")
         if not window.anonymous:
             command = shlex.join(["scopemap", "compare-exams", *map(str, self._folders), "--out", "comparison"])
             gui.add_markdown(f"The same as a page:\n```\n{command}\n```")
@@ -80,8 +83,8 @@ class ShownChanges:
         colours = [np.asarray(vertex_colours(surface)[:, :3]) for surface in self._pair.shown]
         if chosen == _CHANGED:
             table = np.array([rgb_of(colour) for colour in COMPARED.values()], np.uint8)
-            compared: Any = self._pair.shown[0].vertex_attributes[_COMPARED]
-            colours[0] = table[np.round(compared).astype(int)]
+            compared: list[Any] = [surface.vertex_attributes[_COMPARED] for surface in self._pair.shown]
+            colours = [table[np.round(of).astype(int)] for of in compared]
         self._pair.draw(colours)
         self._legend.content = words_html(COMPARED) if chosen == _CHANGED else ""
 
@@ -97,13 +100,28 @@ class ShownChanges:
         look_from(self._window, pose[:3, 3], place, -pose[:3, 1])
         nearer = f"{abs(change.rise_mm):.2f} {'mm' if self._runs[0].scale_known else 'units'}"
         nearer += f" {'nearer to' if change.rise_mm > 0 else 'farther from'} the camera in {escaped(self._names[1])}"
-        words = f"**{number}: {change.what}**, {nearer}; {change.sigmas:.0f} sigmas, in {change.views} views"
+        words = f"**{number}: {change.what}**, {nearer}; {change.sigmas:.0f} sigmas, in {change.views} views of "
+        words += escaped(seen_words(change, self._names))
         self._show(words, pictures_of(self._runs, self._names, self._found, change, number))
 
     def _show_view(self, chosen: str, names: list[str]) -> None:
         self._show(f"**{chosen}**", pictures_of_view(self._runs, self._names, self._found.views[names.index(chosen)]))
 
+    def _send(self, client: Any) -> None:
+        """Send the page of the comparison to a browser, under the names of both videos."""
+        page = comparison_page(self._found, self._runs, self._names).encode("utf-8")
+        one, other = (video_name(self._window, run) for run in self._runs)
+        if client is not None:
+            client.send_file_download(f"{one}_and_{other}.html", page, save_immediately=True)
+
     def _show(self, words: str, pictures: dict[str, np.ndarray]) -> None:
         self._words.content = words
         for handle, (name, picture) in zip(self._pictures, pictures.items(), strict=True):
             handle.image, handle.label, handle.visible = picture, ", ".join(name.split("\n")).removeprefix(", "), True
+
+
+def _compared(mesh: trimesh.Trimesh, compared: np.ndarray) -> trimesh.Trimesh:
+    """Return a surface with what was compared of its vertices."""
+    shown = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=vertex_colours(mesh), process=False)
+    shown.vertex_attributes[_COMPARED] = compared.astype(float)
+    return shown

@@ -1,4 +1,4 @@
-"""The surface of the first of two examinations in colours that say what changed, for films."""
+"""The surface of the first of two examinations in colours that say what changed in its views, for films."""
 
 from __future__ import annotations
 
@@ -20,4 +20,4 @@ COMPARED = {"not compared": OUTSIDE, "as it was": "#2a9d8f", "changed": "#9b2226
 def change_painting(first: Path, found: ExamComparison) -> Painting:
     """Return the surface of the first of two examinations by where the second differs from it."""
     colours = np.array([rgb_of(colour) for colour in COMPARED.values()], np.uint8)
-    return Painting(painted(Result(first).mesh, colours[found.compared]), COMPARED)
+    return Painting(painted(Result(first).mesh, colours[found.compared[0]]), COMPARED)

@@ -1,9 +1,9 @@
 """Compares two examinations of a place: the second one's surface in the map of the first, and where they differ.
 
 Keyframes of either are located in the map of the other (`registration`). Matched features, with the depth of both, pair
-points of the two surfaces. In the view of each keyframe of the first, the similarity of the pairs in sight brings the
-second surface to the first one: drift, and a wall that is wider as a whole, are no change. Both are rendered there.
-Features alone leave the two pictures some pixels apart, so smooth optical flow warps the second one onto the first. A
+points of the two surfaces. In the view of each keyframe of either, the similarity of the pairs in sight brings the
+other surface to its own one: drift, and a wall that is wider as a whole, are no change. Both are rendered there.
+Features alone leave the two pictures some pixels apart, so smooth optical flow warps the other one onto the own. A
 change is where shape or colour, beside what is around the place, differ by far more than they do in most places, in
 more than one view. Colours are those of the surfaces, without lamp and exposure: of them the ratio of red to green.
 Changes are judged only where the two surfaces fit (`fit`).
@@ -21,6 +21,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from scopemap.apps.exams.change import Change, changes_of_both
 from scopemap.apps.exams.examination import HIDDEN, Examination
 from scopemap.apps.exams.fit import ExamFit, fit_of
 from scopemap.apps.exams.registration import LEAST_PAIRS, Correspondences3D, Registration, register, robust_similarity
@@ -50,32 +51,14 @@ _APART = 0.08  # of depth, from the other surface: only one of them saw it
 
 
 @dataclass(frozen=True)
-class Change:
-    """A place that is not as it was.
-
-    what : "shape", "colour", or "shape and colour". place_mm : (3,), world of the first. area : square mm of the first.
-    rise_mm : by how much the second surface is nearer to the camera. redness : change of ln of red over green. views :
-    keyframes of the first that show it, at most. frames : numbers of the frames of both that show it best, -1: none.
-    """
-
-    what: str
-    place_mm: np.ndarray
-    area_mm2: float
-    rise_mm: float
-    redness: float
-    sigmas: float
-    views: int
-    frames: tuple[int, int]
-
-
-@dataclass(frozen=True)
 class ExamComparison:
     """Two examinations in the world of the first.
 
-    registration : of all pairs, and how well they agree. second : its surface in the world of the first. changes : the
-    surest first; none where the two do not fit. views : numbers of frames of both that show the same places.
-    only_first, only_second : shares of the surfaces' vertices that are far from the other one. compared : (V,) of the
-    vertices of the first, 0 where they were not compared, 1 where nothing changed, 2 where something did.
+    registration : of all pairs, and how well they agree. second : its surface in the world of the first. changes : what
+    the views of both show, then the surest; none where the two do not fit. views : numbers of frames of both that show
+    the same places. only_first, only_second : shares of the surfaces' vertices that are far from the other one.
+    compared : of the vertices of each surface in its own views, (V,) uint8: 0 where they were not compared, 1 where
+    nothing changed, 2 where something did.
     """
 
     registration: Registration
@@ -84,7 +67,7 @@ class ExamComparison:
     views: list[tuple[int, int]]
     only_first: float
     only_second: float
-    compared: np.ndarray
+    compared: tuple[np.ndarray, np.ndarray]
 
     @property
     def fit(self) -> ExamFit:
@@ -106,11 +89,15 @@ def compare_exams(
     moved.vertices = S.transform_points(np.asarray(moved.vertices))
     tree = [cKDTree(np.asarray(mesh.vertices)) for mesh in (one.run.mesh, moved)]
     only = [float((tree[1 - n].query(tree[n].data)[0] > _APART * one.depth_mm).mean()) for n in (0, 1)]
-    changes, compared = list[Change](), np.zeros(len(one.run.mesh.vertices), np.uint8)
+    changes, compared = list[Change](), [np.zeros(len(exam.run.mesh.vertices), np.uint8) for exam in (one, other)]
     if fit_of(found.residual, *only) is not ExamFit.NONE:
-        changes, compared = _changes(one, other, S, _differences(one, other.run.mesh, found.pairs))
+        back = Correspondences3D(found.pairs.second, found.pairs.first)
+        of_first, compared[0] = _changes(one, other, S, _differences(one, other.run.mesh, found.pairs))
+        of_second, compared[1] = _changes(other, one, S.inverse(), _differences(other, one.run.mesh, back))
+        in_first = [change.of_second(S) for change in of_second]
+        changes = changes_of_both(of_first, in_first, found.residual * one.depth_mm)
     views = _views(one, other, S)
-    return ExamComparison(found, moved, changes, views, only[0], only[1], compared)
+    return ExamComparison(found, moved, changes, views, only[0], only[1], (compared[0], compared[1]))
 
 
 def _views(one: Examination, other: Examination, S: Similarity) -> list[tuple[int, int]]:
@@ -215,7 +202,7 @@ def _local_difference(values: np.ndarray, known: np.ndarray, width_px: float) ->
 def _changes(
     one: Examination, other: Examination, S: Similarity, found: _Difference
 ) -> tuple[list[Change], np.ndarray]:
-    """Return the changes, surest first, and `compared` of `ExamComparison`."""
+    """Return the changes in the views of one, in its world, and which of its vertices were compared."""
     compared = found.views >= _LEAST_VIEWS
     state = compared.astype(np.uint8)
     sigmas = np.full((2, len(compared)), np.nan, np.float32)
@@ -246,4 +233,4 @@ def _changes(
         means = float((found.nearer * found.depth_mm)[peak]), float(found.redness[peak])
         facts = float(area[own].sum()), *means, float(sure[peak]), int(found.views[own].max())
         changes.append(Change(what, place, *facts, frames))
-    return sorted(changes, key=lambda change: -change.sigmas), state
+    return changes, state

@@ -1,18 +1,20 @@
-"""The page of two examinations: their matched views side by side, and the places that changed."""
+"""The page of two examinations, one file: their matched views side by side, and the places that changed."""
 
 from __future__ import annotations
 
 import html
 import json
+from base64 import b64encode
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from scopemap.apps.exams.compare_exams import Change, ExamComparison
+from scopemap.apps.exams.change import Change
+from scopemap.apps.exams.compare_exams import ExamComparison
 from scopemap.apps.exams.fit import ExamFit
-from scopemap.apps.exams.wording import names_of, summary
+from scopemap.apps.exams.wording import names_of, seen_words, summary
 from scopemap.engine.errors import reporting
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.input.decoding import read_decoded
@@ -22,15 +24,16 @@ from scopemap.result.result import Result
 
 PAGE = "compare.html"
 TABLE = "changes.json"
-CHANGES = "changes.png"
-VIEWS = "views.png"
 _CELL_PX = (420, 330)
 _RING = "#ffd000"
 _MOST = 12
 _STYLE = "body{font:15px/1.4 system-ui,sans-serif;margin:16px;max-width:920px}img{max-width:100%}td,th{padding:2px 9px}"
 _LEGEND = "Above 0 the wall is nearer to the camera, and redder, in {}. Sigmas say how sure a change is."
 _NO_DEVICE = "Research software, not a medical device."
-_HEADS = "<th></th><th>what</th><th>area, {0}²</th><th>nearer by, {0}</th><th>redness</th><th>sigmas</th>"
+_HEADS = (
+    "<th></th><th>what</th><th>area, {0}²</th><th>nearer by, {0}</th><th>redness</th><th>sigmas</th>"
+    "<th>in the views of</th>"
+)
 
 
 def facts_of(found: ExamComparison, unit: str) -> dict[str, Any]:
@@ -44,6 +47,7 @@ def facts_of(found: ExamComparison, unit: str) -> dict[str, Any]:
             f"area_{unit}2": change.area_mm2,
             f"rise_{unit}": change.rise_mm,
             "redness": change.redness,
+            "seen_in": change.seen_in,
             "views": change.views,
             "frame_first": change.frames[0],
             "frame_second": change.frames[1],
@@ -65,42 +69,51 @@ def facts_of(found: ExamComparison, unit: str) -> dict[str, Any]:
 
 
 def write_comparison(found: ExamComparison, first: Path, second: Path, out: Path) -> None:
-    """Write OUT/compare.html with its pictures, changes.json, and second.ply, the second surface in the first's world.
+    """Write OUT/compare.html, changes.json, and second.ply, the second surface in the first's world.
 
     Raises `InputError` where a file cannot be written.
     """
     runs, names = (Result(first), Result(second)), names_of(first.resolve().name, second.resolve().name)
-    unit = "mm" if runs[0].scale_known else "unit"
     with reporting(f"cannot write to {out}"):
         out.mkdir(parents=True, exist_ok=True)
-        (out / TABLE).write_text(json.dumps(facts_of(found, unit), indent=2) + "\n", encoding="utf-8")
+        facts = facts_of(found, "mm" if runs[0].scale_known else "unit")
+        (out / TABLE).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
         found.second.export(out / "second.ply")
-        changes = [
-            pictures_of(runs, names, found, change, number) for number, change in enumerate(found.changes[:_MOST], 1)
-        ]
-        picture_grid(changes, _CELL_PX).save(out / CHANGES)
-        views = [pictures_of_view(runs, names, view) for view in found.views]
-        picture_grid(views, _CELL_PX).save(out / VIEWS)
-    rows = "".join(_row(change, number, unit) for number, change in enumerate(found.changes, 1))
-    head = f"<tr>{_HEADS.format(unit)}</tr>"
+    write_at_once(out / PAGE, comparison_page(found, runs, names))
+
+
+def comparison_page(found: ExamComparison, runs: tuple[Result, Result], names: tuple[str, str]) -> str:
+    """Return the page of two examinations, which needs no other file; names : of both, as by `names_of`."""
+    unit = "mm" if runs[0].scale_known else "unit"
+    numbered = list(enumerate(found.changes, 1))
+    rows = "".join(_row(change, number, names) for number, change in numbered)
     one, other = (html.escape(name) for name in names)
-    legend = f"<p>{_LEGEND.format(other)}</p>"
-    changed = f"<table>{head}{rows}</table>{legend}<img src={CHANGES} alt='Changes'>" if rows else ""
     judged, *lines = (html.escape(line) for line in summary(found, runs[0].scale, names))
     parts = [
         f"<!doctype html><meta charset=utf-8><title>{one} and {other}</title><h1>{one} and {other}</h1>",
         f"<style>{_STYLE}</style>",
         f"<p><strong>{judged}</strong></p>",
         *(f"<p>{line}</p>" for line in lines),
-        changed,
     ]
-    parts += [f"<h2>The same places</h2><img src={VIEWS} alt='Matched views'>", f"<p><strong>{_NO_DEVICE}</strong></p>"]
-    write_at_once(out / PAGE, "\n".join(parts))
+    if rows:
+        shown = [pictures_of(runs, names, found, change, number) for number, change in numbered[:_MOST]]
+        table = f"<table><tr>{_HEADS.format(unit)}</tr>{rows}</table>"
+        parts += [table, f"<p>{_LEGEND.format(other)}</p>", _picture_html(shown, "Changes")]
+    views = [pictures_of_view(runs, names, view) for view in found.views]
+    parts += ["<h2>The same places</h2>", _picture_html(views, "Matched views")]
+    return "\n".join([*parts, f"<p><strong>{_NO_DEVICE}</strong></p>"])
 
 
-def _row(change: Change, number: int, unit: str) -> str:
+def _picture_html(rows: list[dict[str, np.ndarray]], what: str) -> str:
+    """Return rows of pictures as one picture inside a page."""
+    content = b64encode(picture_grid(rows, _CELL_PX).jpeg).decode()
+    return f"<img src='data:image/jpeg;base64,{content}' alt='{what}'>"
+
+
+def _row(change: Change, number: int, names: tuple[str, str]) -> str:
     cells = (number, change.what, *(f"{x:.2f}" for x in (change.area_mm2, change.rise_mm, change.redness)))
-    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in (*cells, f"{change.sigmas:.0f}")) + "</tr>"
+    cells += (f"{change.sigmas:.0f}", html.escape(seen_words(change, names)))
+    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
 def pictures_of_view(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from scopemap.apps.exams.fit import ExamFit, judgement
 
 if TYPE_CHECKING:
+    from scopemap.apps.exams.change import Change
     from scopemap.apps.exams.compare_exams import ExamComparison
 
 _UNNAMED = "the first", "the second"
@@ -16,6 +17,11 @@ _UNNAMED = "the first", "the second"
 def names_of(first: str, second: str) -> tuple[str, str]:
     """Return what texts call two results: their names, where these tell them apart."""
     return (first, second) if first != second else _UNNAMED
+
+
+def seen_words(change: Change, names: tuple[str, str]) -> str:
+    """Return whose views show a change: "both", or the name of one examination."""
+    return {"both": "both", "first": names[0], "second": names[1]}[change.seen_in]
 
 
 def summary(found: ExamComparison, scale: str, names: tuple[str, str]) -> Iterator[str]:
@@ -34,4 +40,7 @@ def summary(found: ExamComparison, scale: str, names: tuple[str, str]) -> Iterat
         yield "Changed places are not judged."
     else:
         yield f"{count or 'No'} place{'s' * (count != 1)} changed by more than the surfaces differ elsewhere."
+    if count:
+        sides = [sum(change.seen_in == side for change in found.changes) for side in ("both", "first", "second")]
+        yield f"In the views of both: {sides[0]}; in those of {first} alone: {sides[1]}, of {second} alone: {sides[2]}."
     yield f"Sizes are those of {first}: {scale}."
