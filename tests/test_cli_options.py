@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from scopemap.engine.errors import SettingsError
+from scopemap.report.run_state import RunState
 from scopemap.terminal import progress
 from scopemap.terminal.options import (
     parse_box,
@@ -107,3 +108,39 @@ def test_progress_comes_now_and_then_and_preparing_takes_no_time_of_the_rest(
         f"frame 1{of}: lost: too dark",
         f"frame 21{of}: {left}lost: too dark",
     ]
+
+
+def test_each_phase_after_tracking_says_about_how_long_the_rest_takes(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: clock.now)
+    state = RunState(None)
+    for _ in range(101):
+        state.add(_step())  # type: ignore[arg-type]
+        clock.now += 1.0
+    assert state.time_left == ""  # their number is unknown
+    clock.now -= 1.0
+    # Tracking took 100 s and the rest takes about as long.
+    assert state.words("adjusting keyframes", 0, 0) == "adjusting keyframes: about 101 s left"
+    clock.now += 20
+    assert state.time_left == "about 81 s left, "
+    clock.now += 20  # longer than its share
+    assert state.time_left == "at least 76 s left, "
+    assert state.words("fusing", 1, 100) == "fusing frame 1 of 100: about 76 s left"
+    clock.now += 10  # now by its own pace: 20 s, and half as much for what follows
+    assert state.words("fusing", 50, 100) == "fusing frame 50 of 100: about 20 s left"
+    state.words("fusing", 100, 100)
+    for phase in ("texturing", "writing", "writing the report"):
+        assert "s left" in state.words(phase, 0, 0)
+        clock.now += 1000
+        assert state.time_left.startswith("at least ")
+    # Nothing is known of a run that begins again.
+    state.words("tracking again, lens b", 0, 0)
+    assert state.words("preparing", 0, 0) == "preparing"
+    with run_progress(3, silent=False) as (observers, tell):
+        for _ in range(3):
+            observers[0](_step())  # type: ignore[arg-type]
+            clock.now += 30
+        tell("texturing", 0, 0)
+    assert capfd.readouterr().err.splitlines()[-1] == "texturing: about 22 s left"

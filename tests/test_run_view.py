@@ -5,23 +5,38 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from shown_window import shown_window
 from tiny_phantom import FRAMES, SIZE, only_images, with_true_depth, write_tiny
 
+from scopemap.apps.browser.run_page import RunPage
 from scopemap.engine.config import Config
 from scopemap.engine.frame import Frame
 from scopemap.engine.odometry import Step
 from scopemap.input.opening import open_sequence
 from scopemap.result.result import Result
 from scopemap.result.result_folder import UNFINISHED
-from scopemap.result.run_view import RunProgressState, SeenMap, look, read_map, read_pictures, read_state, view_folder
+from scopemap.result.run_view import (
+    RunProgressState,
+    SeenMap,
+    look,
+    read_map,
+    read_pictures,
+    read_state,
+    view_folder,
+    write_state,
+)
 from scopemap.runner import watched
 from scopemap.runner.observers import RunStopped
 from scopemap.runner.reconstruct import reconstruct
@@ -217,3 +232,32 @@ def test_a_run_in_a_terminal_can_be_watched_and_killed(phantom: Path, tmp_path: 
 def _contents(out: Path) -> dict[str, str]:
     files = [file for file in sorted(out.rglob("*")) if file.is_file() and file.name not in TIMED]
     return {str(file.relative_to(out)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def test_the_window_says_how_long_each_phase_after_tracking_takes(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
+    folder, run = view_folder(tmp_path), SimpleNamespace(status="running", printed="", poll=lambda: None)
+    folder.mkdir(parents=True)
+    watch = RunWatch(tmp_path, 3)
+    step = SimpleNamespace(
+        frame=SimpleNamespace(T_world_camera=None, index=0, time_s=0.0),
+        track=SimpleNamespace(status="lost", reason="dark", map=0),
+    )
+    for _ in range(3):
+        watch(step)  # type: ignore[arg-type]
+        time.sleep(0.02)
+    with shown_window() as shown:
+        page = RunPage(run, folder, "run", lambda: None)  # type: ignore[arg-type]
+        for phase in ("adjusting keyframes", "fusing", "texturing", "writing"):
+            watch.progress(phase, *((1, 100) if phase == "fusing" else (0, 0)))
+            write_state(folder, watch.state())
+            if phase == "adjusting keyframes":
+                shown.show(page)
+            page.tick()
+            count = " 1 of 100 frames" if phase == "fusing" else ""
+            assert re.search(rf"{phase}{count}, (about|at least) \d+ s left", shown.words)
+        # The result is in its place then, and what can be seen of the run is gone.
+        shutil.rmtree(folder)
+        run.printed = "fusing frame 100 of 100\nwriting the report: about 2 s left\n"
+        page.tick()
+        assert "writing the report: about 2 s left" in shown.words

@@ -148,7 +148,7 @@ class RunWatch:
                 doing=doing,
                 done=self._done,
                 total=self._frames,
-                time_left=self._progress.time_left.rstrip(", ") if self._words == "tracking" else "",
+                time_left=self._progress.time_left.rstrip(", ") if self._live is None else "",
                 status="" if step is None else step.track.status,
                 reason="" if step is None or step.track.status != "lost" else step.track.reason,
                 lost=self._progress.lost,

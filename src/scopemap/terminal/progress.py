@@ -56,7 +56,8 @@ def run_progress(total: int | None, *, silent: bool, adjusts: bool = True) -> It
 
         def progress(doing: str, done: int, frames: int) -> None:
             line = state.words(doing, done, frames)
-            show(doing, done, total if doing == "resuming" else frames or None, "", line)
+            left = state.time_left.rstrip(", ")
+            show(doing, done, total if doing == "resuming" else frames or None, left, line)
 
         yield RunProgress((observe,), progress)
 

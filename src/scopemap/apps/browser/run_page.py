@@ -196,9 +196,10 @@ class RunPage:
     def _show_state(self) -> None:
         state = read_state(self._folder)
         if state is None:
+            # Before the first frame, and while the report is written: the result is in its place then.
             lines = [line for line in self._run.printed.splitlines() if line.strip()]
-            last = self._window.names.hidden(lines[-1]) if lines and self._first < 0 else "preparing"
-            self._words.content = escaped(last)
+            doing = lines[-1] if lines else "preparing" if self._first < 0 else "writing the report"
+            self._words.content = escaped(self._window.names.hidden(doing))
             return
         self._note_size(state)
         self._words.content = words_of(state) + self._size
