@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
+from scopemap.apps.browser.serving import NEXT_CLICK
 from scopemap.apps.browser.window import BrowserWindow, Page
 
 _PATIENCE_S = 120.0
@@ -84,6 +86,12 @@ class ShownWindow:
     def nodes(self) -> dict[str, Any]:
         """What is in the scene, by name."""
         return dict(self.window.scene._handle_from_node_name)
+
+    @property
+    def next_click(self) -> str:
+        """What stands over the scene: what the next click does."""
+        (over,) = (one.content for one in self.handles("Html") if NEXT_CLICK in one.content)
+        return re.sub("<[^>]*>", "", over)
 
     @property
     def words(self) -> str:

@@ -127,6 +127,33 @@ def test_a_distance_between_two_clicks_is_the_commands(
     assert {urlsplit(url).hostname for url in looked.requests if url.startswith("http")} <= {"localhost", "127.0.0.1"}
 
 
+@pytest.mark.parametrize("shown", [(1400, 900), (800, 1100)], indirect=True)
+def test_what_to_click_is_seen_wherever_the_panel_is_scrolled_to(shown: tuple[Looked, ResultPage, Path]) -> None:
+    looked, _, _ = shown
+    looked.tab("Measure")
+    looked.page.get_by_role("button", name="Distance").click()
+    looked.until(lambda: "Distance: click on the 1st of 2 points" in looked.words, "what to do")
+    scene = looked.page.locator("canvas").first.bounding_box()
+    looked.page.evaluate(
+        """() => { for (const part of document.querySelectorAll("*")) part.scrollTop = part.scrollHeight; }"""
+    )
+    shown_words = looked.page.get_by_text("Distance: click on the 1st of 2 points")
+    looked.page.wait_for_timeout(500)
+    box = shown_words.bounding_box()
+    assert scene["x"] <= box["x"] and box["x"] + box["width"] <= scene["x"] + scene["width"]  # noqa: PT018
+    assert scene["y"] <= box["y"] and box["y"] + box["height"] <= scene["y"] + scene["height"]  # noqa: PT018
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    # Nothing covers it, and a click goes through it to the scene.
+    on_top = """([x, y]) => {
+        const words = document.querySelector(".scopemap-next-click");
+        words.style.pointerEvents = "auto";
+        const found = document.elementFromPoint(x, y) === words;
+        words.style.pointerEvents = "";
+        return [found, document.elementFromPoint(x, y).tagName];
+    }"""
+    assert looked.page.evaluate(on_top, list(middle)) == [True, "CANVAS"]
+
+
 @pytest.mark.parametrize("shown", [(800, 1100)], indirect=True)
 def test_colours_are_those_of_the_surface_and_keys_move_the_time_line(shown: tuple[Looked, ResultPage, Path]) -> None:
     looked, _, _ = shown

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scopemap.apps.browser.scene import look_at, look_from
+from scopemap.apps.browser.serving import NEXT_CLICK
 from scopemap.apps.browser.shown_surface import ShownSurface
 from scopemap.apps.browser.window import escaped
 from scopemap.engine.errors import InputError
@@ -111,10 +113,10 @@ class ResultView:
         self._of_sizes += [sizes] if sizes else []
 
     def clicks_are_for(self, words: str) -> None:
-        """Say above all tabs what the next click does; `LOOKING`: nothing is measured."""
+        """Say over the scene what the next click does; `LOOKING`: nothing is measured."""
         changed = (words != LOOKING) != self.measuring
         self._click_words = words
-        self._clicks.content = f"**{escaped(words)}**" if self.measuring else escaped(words)
+        self._clicks.content = clicks_html(words, measuring=self.measuring)
         if changed:
             for call in self._of_measuring:
                 call()
@@ -205,7 +207,7 @@ class ResultView:
 
     def add_note(self) -> None:
         """Make the places of the sentence and of what a click does."""
-        self._clicks = self.window.gui.add_markdown(LOOKING)
+        self._clicks = self.window.gui.add_html(clicks_html(LOOKING, measuring=False))
         self._note = self.window.gui.add_markdown(_NOTHING)
 
     def say_sizes(self, words: str = "") -> None:
@@ -257,3 +259,9 @@ def _kept_coverage(folder: Path) -> Coverage:
         if (folder / PAGE).is_file():
             write_report(folder)
     return found
+
+
+def clicks_html(words: str, *, measuring: bool) -> str:
+    """Return what the next click does, as it stands over the scene."""
+    kind = f"{NEXT_CLICK} measures" if measuring else NEXT_CLICK
+    return f'<div class="{kind}" role="status">{html.escape(words)}</div>'

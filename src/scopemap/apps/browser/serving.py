@@ -24,6 +24,8 @@ _TITLE = "scopemap"
 RUN_GOES_ON = "scopemap-run-goes-on"
 """Name of an element of the page; while it is there the page draws rarely, unless someone moves it."""
 _RARELY = (Path(__file__).parent / "draw_rarely.js").read_text(encoding="utf-8").replace("ELEMENT", RUN_GOES_ON)
+NEXT_CLICK = "scopemap-next-click"
+"""Class of what says what the next click does: over the scene, so that it is seen wherever the panel is scrolled to."""
 # viser docks panels at the left and right of the scene. The time line, which is docked at the left, belongs below the
 # scene; in windows of up to 900 px so does the panel at the right, which would leave half of the width to the scene.
 # In windows of 576 px and less viser has a layout of its own.
@@ -45,7 +47,12 @@ _STYLE = b"""<style>
   [data-dock-region="right"] > div > div { width: 100% !important; }
   [data-dock-region-handle], [data-dock-region-resize] { display: none !important; }
 }
-</style>"""
+.NEXT_CLICK {
+  position: fixed; left: 10px; top: 10px; max-width: min(480px, 50vw); padding: 4px 10px; border-radius: 6px;
+  background: rgba(255, 255, 255, .9); color: #17202b; font-size: 15px; pointer-events: none;
+}
+.NEXT_CLICK.measures { font-weight: bold; border-left: 5px solid #228be6; }
+</style>""".replace(b"NEXT_CLICK", NEXT_CLICK.encode())
 # What the page may load: itself, what it makes in memory, and its own connection.
 _POLICY = (
     "default-src 'self' data: blob: 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval'; "
