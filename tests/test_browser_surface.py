@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 import trimesh
 from drawn_run import CAMERA, IN_RESULT, draw_run, draw_textured_run, pose_of, tube
+from shown_window import shown_window
 
+from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.seen_by import frames_that_saw
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
 from scopemap.apps.browser.surface_colours import colourings, depth_differences, in_relief
 from scopemap.apps.browser.unlit_mesh import before_tone_mapping, unlit_glb, unlit_textured_glb
+from scopemap.apps.coverage.coverage import coverage
 from scopemap.engine.fusion.open_glb import OpenGlb
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.srgb import LINEAR, srgb_picture
@@ -196,3 +199,26 @@ def test_a_frame_with_something_in_front_did_not_see_it(tmp_path: Path) -> None:
     # Without depth the surface itself decides.
     file.unlink()
     assert FRAME in [sight.frame for sight in frames_that_saw(surface, [pick])]
+
+
+def test_coverage_has_form_and_borders_around_what_was_not_seen(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
+    folder = draw_run(tmp_path)
+    with shown_window() as shown:
+        shown.show(ResultPage(folder))
+        shown.choose("Dropdown", "Colour by", "coverage")
+        shown.until(lambda: "Gaps of the surface are closed, but not the open ends of a lumen." in shown.words)
+        found = coverage(folder)
+        # All that was not seen has a border, a little on the cameras' side of it.
+        borders = shown.nodes["/page/model/borders"].points
+        flags = found.unseen_faces[np.asarray(found.surface.face_adjacency)]
+        edges = np.asarray(found.surface.face_adjacency_edges)[flags[:, 0] != flags[:, 1]]
+        assert len(borders) == len(edges) > 0
+        ends = np.asarray(found.surface.vertices)[edges]
+        assert 0 < np.linalg.norm(borders - ends, axis=-1).max() < 1.0
+        # Form is seen: the same colours, darker where the surface does not face a camera.
+        shaded = shown.nodes["/page/model/surface"].glb_data
+        shown.choose("Checkbox", "Shading", False)
+        assert shown.nodes["/page/model/surface"].glb_data != shaded
+        shown.choose("Dropdown", "Colour by", "picture")
+        assert "/page/model/borders" not in shown.nodes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,8 +11,10 @@ import trimesh
 from scopemap.apps.browser.legends import ramp_html, words_html
 from scopemap.apps.browser.result_view import MODEL, ResultView
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
+from scopemap.apps.browser.shown_surface import facing_of
 from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, stops_of
 from scopemap.apps.browser.unlit_mesh import unlit_glb, unlit_textured_glb
+from scopemap.apps.browser.unseen_part import unseen_borders
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.coverage_picture import COLOURS
 from scopemap.report.pale_parts import faded
@@ -29,12 +32,29 @@ _KEYFRAMES = f"{MODEL}/keyframes"
 _MOST_FRUSTA = 60
 _FRUSTUM_SHARE = 0.03
 _COVERAGE = "coverage"
+_BORDERS = f"{MODEL}/borders"
+_BORDER = (255, 255, 255)
 _MOST_FACES = 200_000
 _MOST_SUBMAPS = 100
 _CLOSED = (
     "Gaps of the surface are closed, but not the open ends of a lumen. Where you see the grey background, nothing was "
-    "examined."
+    "examined. White lines: the borders of what was probably not seen."
 )
+
+
+@dataclass(frozen=True)
+class _Covered:
+    """The closed surface in the colours of what was seen, and the borders (N, 2, 3) of what was not."""
+
+    mesh: trimesh.Trimesh
+    colours: np.ndarray
+    facing: np.ndarray
+    borders: np.ndarray
+
+    def glb(self, *, relief: bool) -> bytes:
+        """Return the surface as it is drawn; relief : darker where it does not face a camera."""
+        colours = in_relief(self.facing, self.colours) if relief else self.colours
+        return unlit_glb(np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces), colours)
 
 
 class SurfacePart:
@@ -42,7 +62,7 @@ class SurfacePart:
 
     def __init__(self, view: ResultView) -> None:
         self._view, window, gui = view, view.window, view.window.gui
-        self._shown: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._covered: _Covered | None = None
         if len(view.whole.submaps) > 1:
             self._names = [_submap_words(view, number) for number in range(len(view.whole.submaps[:_MOST_SUBMAPS]))]
             window.on(gui.add_dropdown("Submap", self._names), self._choose_submap)
@@ -79,7 +99,7 @@ class SurfacePart:
             return
         found = colourings(self._view.surface)[name]()
         self._explain(found)
-        self._shown, self._colouring = None, found
+        self._covered, self._colouring = None, found
         self._draw()
 
     def _explain(self, found: Colouring) -> None:
@@ -93,10 +113,12 @@ class SurfacePart:
         assert isinstance(part, trimesh.Trimesh)
         painted = simplified(part, _MOST_FACES)
         seen, _, hidden = COLOURS
-        colours = {name: COLOURS[name] for name in (seen, hidden)}
-        self._legend.content, self._legend.visible = words_html(colours), True
+        legend = {name: COLOURS[name] for name in (seen, hidden)}
+        self._legend.content, self._legend.visible = words_html(legend), True
         self._words.content = _CLOSED
-        self._shown = np.asarray(painted.vertices), np.asarray(painted.faces), vertex_colours(painted)[:, :3]
+        cameras = self._view.run.tracked["T_world_camera"][:, :3, 3]
+        colours = np.asarray(vertex_colours(painted)[:, :3])
+        self._covered = _Covered(painted, colours, facing_of(painted, cameras), unseen_borders(found, cameras))
         self._draw()
 
     def _draw(self) -> None:
@@ -105,8 +127,12 @@ class SurfacePart:
             scene.remove_by_name(_SURFACE)
             self._words.content = "There is no surface."
             return
-        content = unlit_glb(*self._shown) if self._shown is not None else self._coloured()
+        covered, relief = self._covered, self._relief.value
+        content = self._coloured() if covered is None else covered.glb(relief=relief)
         scene.add_glb(_SURFACE, content, cast_shadow=False, receive_shadow=False)
+        scene.remove_by_name(_BORDERS)
+        if covered is not None and len(covered.borders):
+            scene.add_line_segments(_BORDERS, covered.borders, _BORDER, thickness=2.0, thickness_units="screen")
 
     def _coloured(self) -> bytes:
         """Return the surface as GLB: with its texture, or with the colours that mean something."""

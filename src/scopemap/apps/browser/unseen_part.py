@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import trimesh
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import escaped
@@ -22,6 +23,8 @@ _LEAST_SHARE = 0.05
 """Of what was not seen: smaller spots are folded away."""
 _MARK = "/page/blind_spot"
 _INK = (255, 190, 11)
+_LIFT = 0.01
+"""Of the way to the nearest camera: by so much borders are in front of the surface, which is drawn simplified."""
 
 
 class UnseenPart:
@@ -136,3 +139,18 @@ def unseen_outline(found: Coverage, place: np.ndarray) -> np.ndarray:
     edges = np.sort(faces[patch][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     border = trimesh.grouping.group_rows(edges, require_count=1)
     return np.asarray(found.surface.vertices)[edges[border]]
+
+
+def unseen_borders(found: Coverage, cameras: np.ndarray) -> np.ndarray:
+    """Return the borders, segments (N, 2, 3), of all faces that were not seen, a little on the side of the cameras.
+
+    cameras : positions (M, 3).
+    """
+    surface = found.surface
+    neighbours = found.unseen_faces[np.asarray(surface.face_adjacency)]
+    edges = np.asarray(surface.face_adjacency_edges)[neighbours[:, 0] != neighbours[:, 1]]
+    places = np.asarray(surface.vertices)[edges]
+    if not len(places) or not len(cameras):
+        return places
+    away = cameras[cKDTree(cameras).query(places)[1]] - places
+    return np.asarray(places + _LIFT * away)
