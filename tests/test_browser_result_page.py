@@ -19,7 +19,6 @@ from shown_window import ShownWindow, shown_window
 
 from scopemap.apps.browser.files_part import export_place
 from scopemap.apps.browser.marks import CLICKED
-from scopemap.apps.browser.next_steps import plain_step
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.unseen_part import unseen_words
@@ -28,6 +27,7 @@ from scopemap.apps.coverage.coverage import BLIND, CAUTION, coverage
 from scopemap.engine.notices import Notice
 from scopemap.report.measured_by_hand import read_measurements
 from scopemap.report.page import PAGE, page_to_send, write_report
+from scopemap.report.plain_step import plain_step
 from scopemap.result.result import Result
 from scopemap.result.summary import summary_lines
 from scopemap.result.wording import facts_of_notices

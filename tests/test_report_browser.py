@@ -12,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, draw_textured_run, pose_of
+from drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, draw_textured_run, drawn_result, pose_of
 
 from scopemap.report.page import write_comparison, write_report
 from scopemap.result.result import Result
@@ -133,6 +133,21 @@ def test_the_verdict_is_seen_without_scrolling(browser: Any, report: Path) -> No
         assert reasons[1] == "A warning."  # the run's own, and nowhere else on the page
         opened.page.locator("#details summary").first.click()
         assert opened.text("body").lower().count("a warning") == 1
+
+
+def test_reasons_are_in_plain_words_with_options_in_a_small_line(browser: Any, tmp_path: Path) -> None:
+    camera = drawn_result().provenance["camera"] | {"source": "70 deg", "origin": "assumed"}
+    opened = Opened(browser, write_report(draw_run(tmp_path, camera=camera))[0])
+    lens = opened.page.locator("#reasons li", has_text="The lens is assumed")
+    plain, exact = lens.inner_text().split("\n")
+    assert plain.endswith("the ratio of depth to width may be wrong. Calibrate.")
+    assert exact == "Files and options: Calibrate (--camera), or run again with --fov or --scope."
+    assert lens.locator("small").inner_text() == exact
+    reasons = opened.page.locator("#reasons li").all()
+    assert len(reasons) > 2
+    for reason in reasons:
+        assert not any(word in reason.inner_text().split("\n")[0] for word in ("--", ".csv"))
+    assert opened.complaints == []
 
 
 def test_the_slider_moves_frame_and_frustum(browser: Any, report: Path) -> None:

@@ -97,6 +97,17 @@ def test_the_page_asks_for_nothing_and_a_name_cannot_end_its_script(tmp_path: Pa
     assert "alert(1)</script>" not in text
 
 
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [("/tmp/scopemap-x1/uploads/visit.mp4", "visit.mp4"), ("clips/visit.mp4", "clips/visit.mp4")],
+)
+def test_the_input_is_named_without_where_it_was(tmp_path: Path, given: str, named: str) -> None:
+    run = draw_run(tmp_path / "run", pictures=False, name=given, input_absolute="/tmp/scopemap-x1/uploads/visit.mp4")
+    text = write_report(run)[0].read_text(encoding="utf-8")
+    assert (shown(text)["input"], shown(text)["name"]) == (named, "visit.mp4")
+    assert "scopemap-x1" not in text
+
+
 def test_a_name_may_be_no_utf8(tmp_path: Path) -> None:
     name = os.fsdecode(b"video\xe4.mp4")
     file = write_report(draw_run(tmp_path / "run", pictures=False, name=name))[0]

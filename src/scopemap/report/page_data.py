@@ -17,6 +17,7 @@ from scopemap.engine.geometry.align import align_trajectories
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.report.facts import PicturedFrame, ReportFacts
 from scopemap.report.measured_by_hand import advice_by_reference, read_measurements
+from scopemap.report.plain_step import plain_step
 from scopemap.report.shown_maps import MapOnPage, opening_row, shown_map_numbers
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, textured_surface
 from scopemap.report.video_parts import video_parts
@@ -47,7 +48,8 @@ def page_data(facts: ReportFacts, *, name: str = "", share: float = 1.0) -> dict
     source = str(run.provenance.get("input", ""))
     return {
         "name": name or Path(source).name or source,
-        "input": source,
+        # Where it was tells a reader nothing: a video that was sent to the window was in a temporary place.
+        "input": Path(source).name if Path(source).is_absolute() else source,
         **by_hand_data(run),
         "titles": [one.facts for one in maps],
         "scale_known": run.scale_known,
@@ -72,7 +74,7 @@ def page_data(facts: ReportFacts, *, name: str = "", share: float = 1.0) -> dict
         "albedo": tomllib.loads(run.config_text).get("fusion", {}).get("colours") != "raw",
         "truth": _truth(run),
         "config": run.config_text,
-        "provenance": {name: value for name, value in run.provenance.items() if name not in PLACES},
+        "provenance": {name: value for name, value in run.provenance.items() if name not in (*PLACES, "input")},
     }
 
 
@@ -80,7 +82,9 @@ def by_hand_data(run: Result) -> dict[str, Any]:
     """Return what of `page_data` changes with what is measured by hand: that, and the verdict with what sizes are."""
     found, kept = verdict(run), read_measurements(run.folder)
     advice = advice_by_reference(found.advice, kept)
-    return {"verdict": asdict(found) | {"word": found.word, "advice": advice}, "measurements": kept}
+    reasons = [asdict(reason) | {"plain_step": plain_step(reason.next_step)} for reason in found.reasons]
+    shown = asdict(found) | {"word": found.word, "advice": advice, "reasons": reasons}
+    return {"verdict": shown, "measurements": kept}
 
 
 def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:

@@ -19,11 +19,6 @@ _CAMERA = {"scope", "fov"}
 
 _QUESTIONS = {"scope": "Which endoscope was it?", "fov": "Its horizontal field of view, degrees"}
 _BUTTONS = {"scope": "Run again with this endoscope", "fov": "Run again with this field of view"}
-# A part of a sentence that names an option of the command: in brackets, after "; ", or after "or", "and", "with".
-_IN_BRACKETS = re.compile(r" \([^()]*--[^()]*\)")
-_CLAUSE = re.compile(r"(?:;|,? (?:or|and)|,? with) [^,.;]*--[^,.;]*")
-_NOT_SAID = ("Run again with --", "See surfaces/")
-"""How sentences of next steps begin that the window leaves out."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +70,6 @@ def next_runs(step: str, run: Result) -> list[NextRun]:
         elif option == "fov":
             found.append(NextRun(option, number=(5.0, 170.0)))
     return found
-
-
-def plain_step(step: str) -> str:
-    """Return a next step without options and tables: the window has buttons and lists."""
-    others = [one for one in re.split(r"(?<=\.) ", step) if not one.startswith(_NOT_SAID)]
-    return _CLAUSE.sub("", _IN_BRACKETS.sub("", " ".join(others)))
 
 
 def source_of(run: Result) -> Path | None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from scopemap.apps.browser.next_steps import NextRun, next_runs, plain_step, source_of
+from scopemap.apps.browser.next_steps import NextRun, next_runs, source_of
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import escaped, typed_number
 from scopemap.engine.notices import Level
+from scopemap.report.plain_step import plain_step
 from scopemap.result.summary import summary_facts
 from scopemap.result.verdict import Reason, verdict
 

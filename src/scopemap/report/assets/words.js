@@ -5,10 +5,11 @@ const put = (id, text) => (document.getElementById(id).textContent = text);
 
 function list(id, items) {
   const box = document.getElementById(id);
-  box.replaceChildren(...items.map(([text, kind]) => {
+  box.replaceChildren(...items.map(([text, kind, below]) => {
     const item = document.createElement("li");
     item.textContent = text;
     if (kind) item.className = kind;
+    if (below) item.append(Object.assign(document.createElement("small"), { textContent: below }));
     return item;
   }));
 }
@@ -19,8 +20,11 @@ function writeVerdict(run) {
   document.querySelector(".word .icon").textContent = ICONS[level];
   put("word", word[0].toUpperCase() + word.slice(1));
   put("advice", advice);
-  list("reasons", reasons.map((reason) => [`${reason.text} ${reason.next_step}`.trim(), reason.level]));
-  document.querySelectorAll("#reasons li").forEach((item) => item.setAttribute("aria-label", names[item.className] + item.textContent));
+  list("reasons", reasons.map((reason) => {
+    const exact = reason.next_step === reason.plain_step ? "" : `Files and options: ${reason.next_step}`;
+    return [`${reason.text} ${reason.plain_step}`.trim(), reason.level, exact];
+  }));
+  document.querySelectorAll("#reasons li").forEach((item) => item.setAttribute("aria-label", names[item.className] + item.innerText));
 }
 
 function paragraph(text) {
