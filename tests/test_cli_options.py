@@ -128,13 +128,20 @@ def test_each_phase_after_tracking_says_about_how_long_the_rest_takes(
     clock.now += 20  # longer than its share
     assert state.time_left == "at least 76 s left, "
     assert state.words("fusing", 1, 100) == "fusing frame 1 of 100: about 76 s left"
-    clock.now += 10  # now by its own pace: 20 s, and half as much for what follows
-    assert state.words("fusing", 50, 100) == "fusing frame 50 of 100: about 20 s left"
+    clock.now += 10  # now by its own pace, 20 s, and a quarter of 101 s for what follows
+    assert state.words("fusing", 50, 100) == "fusing frame 50 of 100: about 35 s left"
     state.words("fusing", 100, 100)
     for phase in ("texturing", "writing", "writing the report"):
         assert "s left" in state.words(phase, 0, 0)
         clock.now += 1000
         assert state.time_left.startswith("at least ")
+    # Of a run that was resumed after its last frame only what is counted tells.
+    resumed = RunState(100)
+    resumed.words("resuming", 100, 0)
+    assert resumed.words("adjusting keyframes", 0, 0) == "adjusting keyframes"
+    resumed.words("fusing", 1, 100)
+    clock.now += 10
+    assert resumed.words("fusing", 50, 100) == "fusing frame 50 of 100: about 20 s left"
     # Nothing is known of a run that begins again.
     state.words("tracking again, lens b", 0, 0)
     assert state.words("preparing", 0, 0) == "preparing"

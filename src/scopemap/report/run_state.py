@@ -69,13 +69,17 @@ class RunState:
         """As `time_left`, after the last frame: by how long tracking took, and by how much of a phase is done."""
         spent_s, left = time.perf_counter() - self._phase_s, _LEFT_WHEN[self._phase]
         later = max((share for share in _LEFT_WHEN.values() if share < left), default=0.0)
-        if self._share_done > _LEAST_COUNTED:
-            phase_s = spent_s / self._share_done
-            return f"about {phase_s - spent_s + phase_s * later / (left - later):.0f} s left, "
-        if self.done <= self._first:
+        is_counted, is_tracked = self._share_done > _LEAST_COUNTED, self.done > self._first
+        phase_s = spent_s / self._share_done if is_counted else 0.0
+        if is_tracked:
+            tracking_s = (self._last_s - self.started) * self.done / (self.done - self._first)
+            all_s = self._share_afterwards * tracking_s
+        else:  # a run that was resumed after its last frame
+            all_s = phase_s / (left - later)
+        if is_counted:
+            return f"about {phase_s - spent_s + later * all_s:.0f} s left, "
+        if not is_tracked:
             return ""
-        tracking_s = (self._last_s - self.started) * self.done / (self.done - self._first)
-        all_s = self._share_afterwards * tracking_s
         is_in_time = spent_s < (left - later) * all_s
         left_s = left * all_s - spent_s if is_in_time else later * all_s
         return f"{'about' if is_in_time else 'at least'} {max(left_s, 1):.0f} s left, "
