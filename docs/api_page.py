@@ -35,6 +35,10 @@ _SECTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
         '`Result("result").frames["status"]` is a column.',
         ("Result", "Trajectory", "read_trajectory", "evaluate_poses"),
     ),
+    "Ask a result": (
+        "Each answers as the command of its name does.",
+        ("coverage", "measure", "measure_lesion", "locate"),
+    ),
     "Frames": ("", ("Frame",)),
     "Errors": ("", ("ScopemapError",)),
 }

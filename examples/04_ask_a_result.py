@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap import Result, ScopemapError, open_sequence, reconstruct
+from scopemap import Result, ScopemapError, coverage, locate, measure, measure_lesion, open_sequence, reconstruct
 from scopemap_bench import PhantomSpec, write_phantom
 
 
 def main(result: Result, video: Path) -> None:
-    found = result.coverage()
+    found = coverage(result)
     print(found)
     for spot in found.spots:
         print(f"look again at {np.round(spot.position_mm, 1)}: the camera was nearest in frame {spot.frame}")
@@ -29,12 +29,12 @@ def main(result: Result, video: Path) -> None:
     x, y, half = camera.width / 2, 0.75 * camera.height, camera.width / 16
     left, right = (x - half, y), (x + half, y)
     outline = [left, (x, y - half), right, (x, y + half)]
-    for measure in result.measure(frame, outline, reference=[left, right]):
-        print(measure)
-    lesion = result.measure_lesion(outline, frame, reference=[left, right])
+    for size in measure(result, frame, outline, reference=[left, right]):
+        print(size)
+    lesion = measure_lesion(result, outline, frame, reference=[left, right])
     print(f"{lesion.measures[0]}, from {len(lesion.masks)} frames; the scale rests on {lesion.scale}")
 
-    located = result.locate(video)
+    located = list(locate(result, video))
     print(f"{sum(one.status == 'found' for one in located)} of {len(located)} frames located")
 
 

@@ -23,6 +23,7 @@ from scopemap.input.camera_files.writing import write_calibration
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import FrameTable
+from scopemap.result.result import Result
 
 # Where the keyframes are; the last two are in a submap, whose world is another one.
 KEYFRAMES = [pose(at_mm=(x, 0.0, z)) for x, z in ((-30, 0), (-22, -2), (22, 2), (30, 0))]
@@ -63,7 +64,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def places(run: Path) -> PlaceMap:
-    return PlaceMap(run)
+    return PlaceMap(Result(run))
 
 
 @pytest.mark.parametrize("gain", [1.0, 0.55])

@@ -7,10 +7,9 @@
 >>> result.mesh.export("surface.stl")
 >>> print(evaluate_poses(result.trajectory, read_trajectory("truth.txt"), "sim3")["ate_rmse_mm"])
 
-A result is opened again by `Result("result")`. It says what was not seen, how large something is and where another
-video is (`result.coverage()`, `measure`, `measure_lesion`, `locate`). `Reconstructor` takes frames one at a time. The
-command line is `scopemap`; docs/ has the rest. Phantoms with exact truth: `from scopemap_bench import PhantomSpec,
-write_phantom`.
+A result is opened again by `Result("result")`. `coverage` says what was not seen of it, `measure` and `measure_lesion`
+how large something is, `locate` where another video is. `Reconstructor` takes frames one at a time. The command line is
+`scopemap`; docs/ has the rest. Phantoms with exact truth: `from scopemap_bench import PhantomSpec, write_phantom`.
 """
 
 from __future__ import annotations
@@ -91,6 +90,10 @@ _choose_kernel_cache()
 if TYPE_CHECKING:
     __version__: str
 
+    from scopemap.apps.coverage.coverage import coverage
+    from scopemap.apps.locate.locate import locate
+    from scopemap.apps.measure.lesion import measure_lesion
+    from scopemap.apps.measure.measure import measure
     from scopemap.engine.config import Config
     from scopemap.engine.depth.custom import CustomDepth
     from scopemap.engine.errors import ScopemapError
@@ -112,7 +115,11 @@ __all__ = [
     "ScopemapError",
     "Trajectory",
     "__version__",
+    "coverage",
     "evaluate_poses",
+    "locate",
+    "measure",
+    "measure_lesion",
     "open_sequence",
     "read_trajectory",
     "reconstruct",
@@ -126,7 +133,11 @@ _HOMES = {
     "Result": "result.result",
     "ScopemapError": "engine.errors",
     "Trajectory": "input.trajectory.trajectory",
+    "coverage": "apps.coverage.coverage",
     "evaluate_poses": "evaluation.doubts",
+    "locate": "apps.locate.locate",
+    "measure": "apps.measure.measure",
+    "measure_lesion": "apps.measure.lesion",
     "open_sequence": "input.opening",
     "read_trajectory": "result.trajectories",
     "reconstruct": "runner.reconstruct",

@@ -13,11 +13,10 @@ import json
 import warnings
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike
 
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.config import Config
@@ -31,13 +30,6 @@ from scopemap.result.stated_verdict import StatedVerdict
 from scopemap.result.surface_segments import SurfaceSegment, read_segments, save_segments, surface_file
 from scopemap.result.trajectory_folders import read_frames, submap_folders
 from scopemap.result.wording import scale_words
-
-if TYPE_CHECKING:
-    from scopemap.apps.coverage.coverage import Coverage
-    from scopemap.apps.locate.locate import LocatedFrame
-    from scopemap.apps.measure.lesion import MeasuredLesion
-    from scopemap.apps.measure.measure import Measure
-    from scopemap.input.sequence import Sequence
 
 _SCALE_NOT_STATED = "scale unknown (the run does not state it): compare shapes, not sizes"
 _MOST_PX = 1 << 15
@@ -299,68 +291,6 @@ class Result:
             rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
             return {int(row["index"]): (float(row["sharpness"]), float(row["ms"])) for row in rows}
 
-    def coverage(self) -> Coverage:
-        """Return which share of the tissue no frame saw, and where, as `scopemap coverage` does.
-
-        `total` and `segments` are shares with intervals of 90 %, `spots` the blind spots, the largest first, `map` the
-        unrolled map; `print` shows it in words (docs/coverage.md). Raises `InputError` where it cannot be said.
-        """
-        from scopemap.apps.coverage.coverage import coverage
-
-        return coverage(self.folder)
-
-    def measure(
-        self, frame: int, pixels: ArrayLike, reference: ArrayLike | None = None, reference_mm: float | None = None
-    ) -> list[Measure]:
-        """Return distances between two pixels (2, 2) of a frame, or the area inside more, as `scopemap measure` does.
-
-        Each has `what`, `value`, `unit`, and `low` and `high`, the ends of its 95 % interval.
-        reference : two pixels (2, 2) of the frame whose distance is the unit, or is `reference_mm` (docs/measure.md).
-        Raises `InputError` where nothing can be measured there.
-        """
-        from scopemap.apps.measure.measure import measure
-
-        ends = None if reference is None else np.asarray(reference, float)
-        return measure(self.folder, frame, np.asarray(pixels, float), ends, reference_mm)
-
-    def measure_lesion(
-        self,
-        masks: Path | str | ArrayLike,
-        frame: int | None = None,
-        *,
-        reference: ArrayLike | None = None,
-        reference_frame: int | None = None,
-        reference_mm: float | None = None,
-    ) -> MeasuredLesion:
-        """Return the sizes of a lesion from all frames together, as `scopemap measure --lesion` does.
-
-        `measures` are its sizes, `scale` what they rest on, `masks` the lesion by frame.
-        masks : a folder of pictures numbered as frames; or of one `frame` a picture, a mask (H, W) bool, or the corners
-        (N, 2) of an outline, px. reference : as in `measure`, pixels of `reference_frame`, by default of `frame`.
-        Raises `InputError` where nothing can be measured.
-        """
-        from scopemap.apps.measure.lesion import measure_lesion
-
-        return measure_lesion(
-            self.folder,
-            Path(masks) if isinstance(masks, Path | str) else np.asarray(masks),
-            frame,
-            reference=None if reference is None else np.asarray(reference, float),
-            reference_frame=reference_frame,
-            reference_mm=reference_mm,
-        )
-
-    def locate(self, sequence: Sequence | Path | str) -> list[LocatedFrame]:
-        """Return where each frame of another video is in the map of this result, as `scopemap locate` does.
-
-        Each has its `status`, "found" or "not found", `T_world_camera` and `inliers`.
-        sequence : from `open_sequence`; or the path of a video, which has the camera of this result's input where it
-        has no calibration of its own (docs/locate.md). Raises `InputError` where the result has no map.
-        """
-        from scopemap.apps.locate.locate import locate
-
-        return list(locate(self.folder, sequence))
-
     def save(self, folder: Path | str) -> None:
         """Write everything but the depth maps, which a `DepthWriter` writes frame by frame.
 
@@ -397,3 +327,11 @@ class Result:
         from scopemap.report.notebook import as_html
 
         return as_html(self)
+
+
+def opened(result: Result | Path | str) -> Result:
+    """Return a result, or that of a folder, with its table read.
+
+    Raises `InputError` where the folder holds no finished run, or the result is in memory alone.
+    """
+    return (result if isinstance(result, Result) else Result(result)).checked()

@@ -27,7 +27,7 @@ from scopemap.report.coverage_picture import COLOURS, OUTSIDE, draw_coverage
 from scopemap.report.sheet import rgb_of
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.json_numbers import without_nan
-from scopemap.result.result import Result
+from scopemap.result.result import Result, opened
 from scopemap.result.verdict import verdict
 
 HIDDEN_AREA = {"lumen": 1.3, "cavity": 1.0}
@@ -234,13 +234,15 @@ class Coverage:
         return found
 
 
-def coverage(folder: Path) -> Coverage:
-    """Return which share of the tissue of a result, or of a submap in `maps/N`, was not seen, and where.
+def coverage(result: Result | Path | str) -> Coverage:
+    """Return which share of the tissue of a result, or of a submap in `maps/N`, no frame saw, and where.
 
-    Raises `InputError` where the folder holds no finished run, no surface or no depth, where its verdict is "not
-    usable", and where no part of the space was seen enough.
+    `total` and `segments` are shares with intervals of 90 %, `spots` the blind spots, the largest first, `map` the
+    unrolled map; `print` shows it in words (docs/coverage.md). result : opened, or its folder.
+    Raises `InputError` where it holds no finished run, no surface or no depth, where its verdict is "not usable", and
+    where no part of the space was seen enough.
     """
-    run = _checked(folder)
+    run = _checked(result)
     space = examined_space(run)
     surface, layout, row, hours, inside = space.surface, space.layout, space.row, space.hours, space.inside
     tracked, views = run.frames.only(run.frames.tracked), views_of(run, surface)
@@ -283,8 +285,9 @@ class _Faces(NamedTuple):
     hidden: np.ndarray
 
 
-def _checked(folder: Path) -> Result:
-    run = Result(folder).checked()
+def _checked(result: Result | Path | str) -> Result:
+    run = opened(result)
+    folder = run.folder
     if not len(run.mesh.faces):
         raise InputError(f"the run {folder} has no surface")
     if not any(map(run.depth.has, run.frames["index"][run.frames.tracked].tolist())):

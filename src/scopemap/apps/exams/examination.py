@@ -23,7 +23,7 @@ class Examination:
 
     def __init__(self, folder: Path, source: Path | None = None) -> None:
         self.folder, self.source = folder, source
-        self.run = Result(folder).checked()
+        self.run = Result(folder, source).checked()
         if not self.run.depth.present:
             raise InputError(f"the run {folder} kept no depth maps")
         if not len(self.run.mesh.faces):

@@ -94,7 +94,7 @@ def _agreement(pairs: Correspondences3D, first_mm: float, second_mm: float) -> t
 
 def _correspondences(one: Examination, other: Examination) -> tuple[Correspondences3D, int]:
     """Return the pairs by the keyframes of the other that are located in the main map of one; how many these are."""
-    places = PlaceMap(one.folder, one.source)
+    places = PlaceMap(one.run)
     first, second, located = [np.zeros((0, 3))], [np.zeros((0, 3))], 0
     for frame in reread_frames(other.folder, set(other.poses), other.source):
         found, depth_mm = places.locate(frame), other.run.depth.read(frame.index)

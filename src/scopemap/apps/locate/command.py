@@ -32,12 +32,14 @@ def locate(
     import numpy as np
 
     from scopemap.apps.locate import locate as locating
+    from scopemap.result.result import Result
     from scopemap.terminal.progress import count_progress
 
     options.warn_of_damage(run, silent=quiet)
-    found, sequence = [], locating.open_other(run, path, camera, dataset, frames, camera_fit)
+    result = Result(run, source).checked()
+    found, sequence = [], locating.open_other(result, path, camera, dataset, frames, camera_fit)
     with count_progress("locating", "located", silent=quiet or as_json) as show:
-        for one in locating.locate(run, sequence, source):
+        for one in locating.locate(result, sequence):
             found.append(one)
             if show is not None:
                 show(len(found), sequence.count)

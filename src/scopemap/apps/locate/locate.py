@@ -23,7 +23,7 @@ from scopemap.engine.tracking.features import FeatureDetector, Features, relativ
 from scopemap.input.mask_files import masks_of
 from scopemap.input.opening import open_sequence
 from scopemap.input.sequence import Sequence as FrameSequence
-from scopemap.result.result import Result
+from scopemap.result.result import Result, opened
 from scopemap.runner.reread_frames import reread_frames
 
 _CANDIDATES = 8  # keyframes whose matches are verified
@@ -83,14 +83,13 @@ class _Match(NamedTuple):
 class PlaceMap:
     """The keyframes of a result and of its submaps, in which frames are located.
 
-    source : where the result's input is now; else it is looked for. Raises `InputError` where the folder holds no
-    finished run, kept no depth, or its input is gone.
+    The result's input is at its `input_path`; else it is looked for. Raises `InputError` where the result kept no
+    depth, or its input is gone.
     """
 
-    def __init__(self, folder: Path, source: Path | None = None, detector: FeatureDetector | None = None) -> None:
-        run = Result(folder).checked()
+    def __init__(self, run: Result, detector: FeatureDetector | None = None) -> None:
         if not run.depth.present:
-            raise InputError(f"the run {folder} kept no depth maps")
+            raise InputError(f"the run {run.folder} kept no depth maps")
         self._detector, self._flow, self._depth = detector or AlikeFeatures(), DisFlow(), run.depth
         self._places: list[_Place] = []
         poses: dict[int, tuple[int, np.ndarray]] = {}
@@ -99,7 +98,7 @@ class PlaceMap:
             pose_of = dict(zip(tracked["index"].tolist(), tracked["T_world_camera"], strict=True))
             known = pose_of.keys() & (set(tracked["keyframe"].tolist()) or pose_of.keys())
             poses |= {index: (number, pose_of[index]) for index in known}
-        for frame in reread_frames(folder, set(poses), source):
+        for frame in reread_frames(run.folder, set(poses), run.input_path):
             depth_mm = run.depth.read(frame.index)
             if depth_mm is not None:
                 features = self._detector.detect(replace(frame, depth_mm=depth_mm))
@@ -166,7 +165,7 @@ class PlaceMap:
 
 
 def open_other(
-    folder: Path,
+    run: Result,
     path: Path | str,
     camera: Path | str | None = None,
     dataset: str | None = None,
@@ -178,7 +177,6 @@ def open_other(
     The settings of the input, and the parameters, are those of `open_sequence`, which see for what is raised.
     camera_fit : that of the settings' `input`, for this video.
     """
-    run = Result(folder).checked()
     kept, settings = run.source_camera_file, run.config.input.model_copy(update={"frames": ""})
     if camera_fit is not None:
         settings = settings.model_copy(update={"camera_fit": camera_fit})
@@ -189,14 +187,17 @@ def open_other(
     return open_sequence(path, camera=kept, dataset=dataset, frames=frames, settings=resized)
 
 
-def locate(folder: Path, sequence: FrameSequence | Path | str, source: Path | None = None) -> Iterator[LocatedFrame]:
-    """Yield where each frame of a sequence is in the map of the result in a folder; raises as `PlaceMap` does.
+def locate(result: Result | Path | str, sequence: FrameSequence | Path | str) -> Iterator[LocatedFrame]:
+    """Yield where each frame of another video is in the map of a result.
 
-    Frames are masked by the result's settings. sequence : or the path of a video, for `open_other`. source : where the
-    result's own input is now; else it is looked for.
+    Each has its `status`, "found" or "not found", `T_world_camera` and `inliers`. Frames are masked by the result's
+    settings. result : opened, its own input at `input_path`, or its folder. sequence : from `open_sequence`; or a path
+    of a video, which has the camera of the result's input where it has no calibration of its own (docs/locate.md).
+    Raises `InputError` where the result has no finished run, kept no depth, or its input is gone.
     """
-    sequence = open_other(folder, sequence) if isinstance(sequence, Path | str) else sequence
-    places, settings = PlaceMap(folder, source), Result(folder).config.mask.model_copy(update={"files": ""})
+    run = opened(result)
+    sequence = open_other(run, sequence) if isinstance(sequence, Path | str) else sequence
+    places, settings = PlaceMap(run), run.config.mask.model_copy(update={"files": ""})
     mask = Masker(settings, masks_of(settings, sequence))
     return (places.locate(mask(frame)) for frame in sequence.frames())
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from scopemap.apps.measure.intervals import LogChanges
@@ -26,7 +27,7 @@ from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.decoding import by_number, read_decoded, write_image
 from scopemap.input.image_names import decimal_numbers
-from scopemap.result.result import Result
+from scopemap.result.result import Result, opened
 
 _OF_VIEWS = "the outline and what frames differ by"
 _OF_RELIEF = "depth, which tells little of relief"
@@ -71,34 +72,36 @@ class MeasuredLesion:
 
 
 def measure_lesion(
-    folder: Path,
-    masks: Path | np.ndarray,
+    result: Result | Path | str,
+    masks: Path | str | ArrayLike,
     frame: int | None = None,
     *,
-    reference: np.ndarray | None = None,
+    reference: ArrayLike | None = None,
     reference_frame: int | None = None,
     reference_mm: float | None = None,
 ) -> MeasuredLesion:
-    """Return the sizes of a lesion on the surface of a run.
+    """Return the sizes of a lesion on the surface of a result, from all frames together.
 
+    `measures` are its sizes, `scale` what they rest on, `masks` the lesion by frame. result : opened, or its folder.
     masks : a folder of pictures numbered as frames, white is lesion; or of one `frame` a picture, a mask (H, W) bool,
     or the corners (N, 2) of an outline, px. reference : two pixels (2, 2) of `reference_frame`, by default `frame`,
     whose straight distance is the unit of what is returned, or is `reference_mm`; needed where the run's scale is
     unknown. Raises `InputError` where it is missing, where masks do not fit, and where no frame sees the whole lesion.
     """
-    run = Result(folder).checked(with_poses=True)
-    scale = known_scale(run, _known(reference, frame if reference_frame is None else reference_frame, reference_mm))
-    of_frames = _masks_of_folder(run, masks) if isinstance(masks, Path) and masks.is_dir() else None
-    shown = carried_masks(run, *_mask_of_frame(run, masks, frame)) if of_frames is None else of_frames
+    run, pair = opened(result).checked(with_poses=True), None if reference is None else np.asarray(reference, float)
+    scale = known_scale(run, _known(pair, frame if reference_frame is None else reference_frame, reference_mm))
+    given = Path(masks) if isinstance(masks, Path | str) else np.asarray(masks)
+    of_frames = _masks_of_folder(run, given) if isinstance(given, Path) and given.is_dir() else None
+    shown = carried_masks(run, *_mask_of_frame(run, given, frame)) if of_frames is None else of_frames
     views = {index: view for index, mask in shown.items() if (view := _view(run, index, mask)) is not None}
     if not views:
         raise InputError(
-            f"no frame of {folder} sees the whole lesion with its depth: it is cut off, smaller than {_LEAST_PX} "
+            f"no frame of {run.folder} sees the whole lesion with its depth: it is cut off, smaller than {_LEAST_PX} "
             "pixels, or its depth is unknown"
         )
-    given = views.get(frame) if of_frames is None and frame is not None else None
-    if given is not None:  # a frame of another diameter shows a part of it
-        views = {n: view for n, view in views.items() if abs(np.log(view.diameter / given.diameter)) < _MOST_DIFFERENCE}
+    own = views.get(frame) if of_frames is None and frame is not None else None
+    if own is not None:  # a frame of another diameter shows a part of it
+        views = {n: view for n, view in views.items() if abs(np.log(view.diameter / own.diameter)) < _MOST_DIFFERENCE}
     found = []
     for figure, (name, power, common) in _FIGURES.items():
         value, sigma = _combined(views, shown, figure, common)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
 from scopemap.apps.measure.intervals import SIGMAS, LogChanges
 from scopemap.apps.measure.measured_surface import (
@@ -25,7 +26,7 @@ from scopemap.apps.measure.measured_surface import (
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
-from scopemap.result.result import Result
+from scopemap.result.result import Result, opened
 
 WIDE = 1.5
 """An interval is wide where its ends differ by more than this factor (by hand: about a quarter to either side)."""
@@ -90,19 +91,24 @@ class _Picked:
 
 
 def measure(
-    folder: Path, frame: int, pixels: np.ndarray, reference: np.ndarray | None = None, reference_mm: float | None = None
+    result: Result | Path | str,
+    frame: int,
+    pixels: ArrayLike,
+    reference: ArrayLike | None = None,
+    reference_mm: float | None = None,
 ) -> list[Measure]:
     """Return distances between two pixels (2, 2) of a frame, straight and along the surface, or the area inside more.
 
-    pixels : x, y of the frame's rectified picture, as large as its depth map; (0, 0) is the middle of its first pixel.
-    reference : two pixels (2, 2) of the same frame whose straight distance is the unit of what is returned, or is
-    `reference_mm`; needed where the run's scale is unknown. Raises `InputError` where the frame, or a surface at a
-    pixel, is not there, and where neither the run nor a reference gives a scale.
+    Each has `what`, `value`, `unit`, and `low` and `high`, the ends of its 95 % interval (docs/measure.md).
+    result : opened, or its folder. pixels : x, y of the frame's rectified picture, as large as its depth map; (0, 0) is
+    the middle of its first pixel. reference : two pixels (2, 2) of the same frame whose straight distance is the unit
+    of what is returned, or is `reference_mm`; needed where the run's scale is unknown. Raises `InputError` where the
+    frame, or a surface at a pixel, is not there, and where neither the run nor a reference gives a scale.
     """
     if reference is None and reference_mm is not None:
         raise SettingsError("a length of the reference without its two points: give both")
-    run = Result(folder).checked(with_poses=True)
-    scale = known_scale(run, None if reference is None else Known(frame, reference, reference_mm))
+    run, pixels = opened(result).checked(with_poses=True), np.asarray(pixels, float)
+    scale = known_scale(run, None if reference is None else Known(frame, np.asarray(reference, float), reference_mm))
     pose, mesh = _pose(run, frame), measured_mesh(run, frame)
     picked = _picked(run, mesh, frame, pose, pixels)
     if len(pixels) > 2:
