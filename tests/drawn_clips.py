@@ -132,7 +132,3 @@ def inset(number: int, picture: np.ndarray) -> np.ndarray:
     out = picture.copy()
     out[:80, 220:] = np.clip(tissue(3 * number, (100, 80), seed=7) // 2 + 60, 0, 255)[:, :, [1, 1, 0]]
     return out
-
-
-def stamps_with_a_hole(count: int) -> list[int]:
-    return [number + (5 if number >= count // 2 else 0) for number in range(count)]

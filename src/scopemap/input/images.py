@@ -94,6 +94,7 @@ class ImageFolder(Source):
     """
 
     name = "images"
+    seeks = True
     depth_code: DepthCode = ((16, 1.0, 65535),)
 
     def __init__(self, path: Path, files: list[Path] | None = None) -> None:

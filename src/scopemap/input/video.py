@@ -132,6 +132,7 @@ class VideoFile(Source):
             self._promised = len(stream.index_entries)
             self.count = sum(not entry.is_discard for entry in stream.index_entries)
             self._frame_index = frame_index(container, stream)
+            self.seeks = self._frame_index is not None
         elif not self.count:
             self.count = None if duration_s is None else round(duration_s * self.rate_hz)
 

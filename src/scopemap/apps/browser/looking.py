@@ -25,10 +25,7 @@ _MOST_DECODED = 1200
 """Videos are decoded from their beginning: no more than these."""
 _SPREAD = 60
 _TOGETHER = 60
-_OF_NEIGHBOURS = {
-    "rate-high", "rate-variable", "frames-dropped", "time-order", "length-claimed", "duplicates", "motion-fast",
-    "unlike", "soft", "cut", "texture-low",
-}  # fmt: skip
+_OF_NEIGHBOURS = {"rate-high", "duplicates", "motion-fast", "cut"}
 """Codes of findings that need frames that follow each other."""
 _USUAL_FRAMES_PER_S = {"default": (4.0, 14.0), "realtime": (9.0, 21.0)}
 """Of the whole command on two idle cores, start-up included (README)."""
@@ -69,7 +66,7 @@ class Look:
         if self.spread is self.together:
             return list(self.spread.findings)
         found = [one for one in self.spread.findings if one.code not in _OF_NEIGHBOURS]
-        found += [one for one in self.together.findings if one.code in _OF_NEIGHBOURS - {"length-claimed"}]
+        found += [one for one in self.together.findings if one.code in _OF_NEIGHBOURS]
         return sorted(found, key=lambda one: ("error", "warning", "info").index(one.severity))
 
     @property

@@ -79,20 +79,18 @@ class OverlayWatcher:
         return sorted(found, key=lambda one: one.box)
 
     def findings(self) -> Iterator[VideoFinding]:
-        """Yield the overlays in and beside the field of view, and the warning about patients' names."""
+        """Yield the overlays in the field of view, and the warning about patients' names in all of them."""
         overlays = self.overlays()
-        inside, outside = ([one for one in overlays if one.in_field is where] for where in (True, False))
+        inside = [one for one in overlays if one.in_field]
         if inside:
             kinds = "text, logos or an instrument that rests"
             message = f"{len(inside)} overlay(s) in the field of view ({kinds}): {_places(inside)}"
             advice = "runs leave them out; where they miss some, give masks: --set mask.files=FOLDER"
             yield VideoFinding("warning", "overlay", message, advice)
-        if outside:
-            message = f"{len(outside)} overlay(s) beside the field of view (text or logos): {_places(outside)}"
-            yield VideoFinding("info", "overlay-outside", message)
         if overlays:
-            message = "burned-in text may name a patient: look before you pass the video or pictures of it on"
-            yield VideoFinding("info", "overlay-privacy", message)
+            message = f"burned-in text may name a patient: {_places(overlays)}"
+            advice = "look before you pass the video or pictures of it on; --redact X,Y,WIDTH,HEIGHT blackens a box, px"
+            yield VideoFinding("info", "overlay-privacy", message, advice)
 
 
 def _square(side_px: int) -> np.ndarray:

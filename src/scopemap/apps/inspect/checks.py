@@ -1,8 +1,9 @@
-"""Findings about a video's frames: time stamps, repeated, blank, blurred, badly exposed frames, odd colours, motion.
+"""Findings about a video's frames: its rate, repeated, blank, blurred frames, odd colours, cuts, motion.
 
-Each check takes a `Clip` and yields findings, with the option that answers each as its advice. The limits of motion and
-texture separate clips that runs track whole (correlation above 0.84, motion below 2 % of width, sharpness above 0.015)
-from a colonoscopy and a bare tube of which they lost most frames.
+Each check takes a `Clip` and yields findings, with the option that answers each as its advice. What no option answers
+is no finding: the facts have the usual exposure and motion, and the forecast says what they mean for a run. The limits
+of motion and texture separate clips that runs track whole (correlation above 0.84, motion below 2 % of width, sharpness
+above 0.015) from a colonoscopy and a bare tube of which they lost most frames.
 """
 
 from __future__ import annotations
@@ -11,22 +12,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from scopemap.apps.inspect.clip import Clip, Segment, VideoFinding, covered, segments_of
+from scopemap.apps.inspect.clip import Clip, Segment, VideoFinding, covered
 from scopemap.input.video_format.stereo_packing import Packing
 
 _BLACK_LEVEL = 16.0
-# Shares of the video's usual sharpness: of a blurred frame, of a soft one. No texture: sharpness of the usual frame.
+# Share of the video's usual sharpness that a blurred frame has. No texture: sharpness of the usual frame.
 _BLURRED_SHARE = 0.35
-_SOFT_SHARE = 0.6
 _NO_TEXTURE = 0.008
 # Mean red over the stronger of green and blue, of tissue in white light.
 _LEAST_REDNESS = 1.1
 _MOSTLY = 0.9
-_UNEVEN = 0.2
-_UNEVEN_SHARE = 0.05
-_HOLE = 1.5
-_LENGTH_SHARE = 0.05
-_LENGTH_S = 1.0
 _FAST_HZ = 45.0
 _SLOW_MOTION = 0.004
 _FAST = 0.05  # motion per frame, share of the width
@@ -35,47 +30,11 @@ _CUT = 0.2
 _LIKE = 0.7
 _SOME = 0.05  # shares of the frames
 _MANY = 0.25
-_EXPOSURES = (
-    ("clipped", 0.1, "over-exposed"),
-    ("dark", 0.5, "under-exposed"),
-    ("highlights", 0.1, "specular highlights"),
-)
 
 
-def check_timing(clip: Clip, claimed_s: float | None) -> Iterator[VideoFinding]:
-    """Yield what is wrong with the time stamps; `claimed_s` is the length in the file's header, s, or None."""
-    steps_s = clip.steps_s
-    if steps_s.size < 2:
-        return
-    back = tuple((int(i) + 1, int(i) + 1) for i in np.flatnonzero(steps_s <= 0))
-    if back:
-        message = f"{len(back)} time stamps are not later than the one before (frames {{positions}})"
-        yield clip.finding(
-            "warning", "time-order", message, back, "poses keep their order; take no speeds from the time stamps"
-        )
-        return
-    usual_s = float(np.median(steps_s))
-    before = np.flatnonzero(steps_s > _HOLE * usual_s)
-    if 0 < before.size <= _UNEVEN_SHARE * len(clip):
-        lost = int(np.round((steps_s[before] / usual_s - 1) * np.diff(clip["position"])[before]).sum())
-        what = "time stamps leave" if clip.stamped else "numbers in the names leave"
-        message = f"{what} {before.size} hole(s), about {lost} picture(s) were dropped (between frames {{positions}})"
-        yield clip.finding("warning", "frames-dropped", message, tuple((int(i), int(i) + 1) for i in before))
-    if not clip.stamped:
-        return
-    if claimed_s is not None and (clip.selection.start or 0, clip.selection.stop, clip.step) == (0, None, 1):
-        read_s = float(np.ptp(clip["time_s"])) + usual_s
-        if abs(read_s - claimed_s) > max(_LENGTH_S, _LENGTH_SHARE * claimed_s):
-            message = f"the file's header claims {claimed_s:.1f} s, its pictures last {read_s:.1f} s"
-            advice = "what can be read is used; copy the file again if it is cut off"
-            yield VideoFinding("warning", "length-claimed", message, advice)
-    # A hole is no variable rate.
-    rest = np.abs(steps_s[steps_s < _HOLE * usual_s] / usual_s - 1)
-    if (rest > _UNEVEN).mean() > _UNEVEN_SHARE:
-        low, high = 1 / np.percentile(steps_s, [95, 5])
-        message = f"variable rate: {low:.3g} to {high:.3g} pictures per second, usually {1 / usual_s:.3g}"
-        yield VideoFinding("info", "rate-variable", message, "runs use the time stamps; --fps thins out by them, too")
-    if clip.rate_hz >= _FAST_HZ and np.median(clip["motion"]) < _SLOW_MOTION * clip.step:
+def check_rate(clip: Clip) -> Iterator[VideoFinding]:
+    """Yield that little moves from frame to frame of a video of a high rate."""
+    if clip.stamped and clip.rate_hz >= _FAST_HZ and np.median(clip["motion"]) < _SLOW_MOTION * clip.step:
         message = f"little moves from frame to frame at {clip.rate_hz:.3g} pictures per second"
         yield VideoFinding("info", "rate-high", message, f"--fps {clip.rate_hz / 2:.3g} halves the work")
 
@@ -96,28 +55,29 @@ def check_packing(packed: Packing | None, *, interlaced: bool) -> Iterator[Video
 def check_repeats(clip: Clip) -> Iterator[VideoFinding]:
     """Yield duplicates, as conversions between rates make them, and frozen segments."""
     frozen = clip.segments(clip.repeats, seconds=0.3, least=4)
-    single = segments_of(clip.repeats & ~covered(frozen, len(clip)))
+    single = clip.segments(clip.repeats & ~covered(frozen, len(clip)))
     advice = "runs leave them out (--set input.skip_duplicates=false keeps them)"
     if frozen:
         yield clip.finding("warning", "frozen", "the picture is frozen for {frames}", frozen, advice)
     if single:
-        message = f"the same picture as before: {{frames}}{_rhythm(single) if clip.step == 1 else ''}"
+        message = f"the same picture as before: {{frames}}{_rhythm(clip, single) if clip.step == 1 else ''}"
         yield clip.finding("info", "duplicates", message, single, advice)
 
 
-def _rhythm(single: tuple[Segment, ...]) -> str:
+def _rhythm(clip: Clip, single: tuple[Segment, ...]) -> str:
     """Return the interval in words where duplicates come at an even pace, as from 25 to 30 frames per second."""
-    steps = np.diff([first for first, _ in single])
+    firsts = np.array([first for first, _ in single])
+    steps = np.diff(firsts)[np.diff(clip["part"][firsts]) == 0]
     if steps.size < 3 or np.percentile(steps, 90) - np.percentile(steps, 10) > 1:
         return ""
     return f", about every {np.median(steps):.0f}th: the video was converted to a higher rate"
 
 
 def check_frames(clip: Clip) -> Iterator[VideoFinding]:
-    """Yield which frames are blank, blurred, of another colour than tissue, or badly exposed."""
+    """Yield which frames are blank, blurred, or of another colour than tissue."""
     blank, black, sharpness = clip["blank"], clip["brightness"] <= _BLACK_LEVEL, clip["sharpness"]
     for flags, code, words in ((blank & black, "black", "black"), (blank & ~black, "one-colour", "of one colour")):
-        if segments := segments_of(flags):
+        if segments := clip.segments(flags):
             yield clip.finding("warning", code, f"{words}: {{frames}}", segments, "{selection}")
     usual = np.median(sharpness[~blank]) if not blank.all() else 0.0
     if segments := clip.segments(~blank & (sharpness < _BLURRED_SHARE * usual), seconds=0.15, least=3, gap=2):
@@ -136,11 +96,6 @@ def check_frames(clip: Clip) -> Iterator[VideoFinding]:
         elif not covered(segments, len(clip)).all():
             advice += ", else {selection}"
         yield clip.finding("warning", "not-tissue", message, segments, advice)
-    for name, most, words in _EXPOSURES:
-        if segments := clip.segments(~blank & (clip[name] > most), seconds=0.15, least=3, gap=2):
-            worst = float(np.max(clip[name][~blank]))
-            message = f"more than {most:.0%} of the field is {words} in {{frames}}, {worst:.0%} at worst"
-            yield clip.finding("info", name, message, segments)
 
 
 def exposure_figures(clip: Clip) -> dict[str, float]:
@@ -154,8 +109,8 @@ def _dangers(clip: Clip) -> tuple[dict[str, np.ndarray], bool]:
     """Return flags of the frames that were read, (N,) bool each, and whether the video is without texture.
 
     fast : the picture moves by more than 5 % of its width. unlike : hardly like the frame before, moved by its flow.
-    cut : so unlike, between frames that are like their neighbours; not in `unlike`. soft : less than 0.6 of the usual
-    sharpness, but more than a blurred frame. Blank and repeated frames, which runs leave out, are in none of them.
+    cut : so unlike, between frames that are like their neighbours; not in `unlike`. Blank and repeated frames, which
+    runs leave out, are in none of them.
     """
     shown = ~clip["blank"] & ~clip.repeats
     correlation, sharpness = clip["correlation"], clip["sharpness"]
@@ -169,37 +124,24 @@ def _dangers(clip: Clip) -> tuple[dict[str, np.ndarray], bool]:
         "cut": cut,
         "fast": follows & (clip["motion"] > _FAST),
         "unlike": follows & (correlation < _UNLIKE) & ~cut,
-        "soft": shown & (sharpness < _SOFT_SHARE * usual) & (sharpness >= _BLURRED_SHARE * usual),
     }
     return flags, usual < _NO_TEXTURE
 
 
 def check_dangers(clip: Clip) -> Iterator[VideoFinding]:
-    """Yield what may make a run lose frames: of what was read, so of every n-th frame where these were selected."""
-    flags, textureless = _dangers(clip)
-    if textureless:
-        message = "too little texture: the camera motion along such walls cannot be measured"
-        yield VideoFinding("warning", "texture-low", message)
+    """Yield what makes a run lose frames and an option avoids: cuts, and fast motion where frames are passed over."""
+    flags, _ = _dangers(clip)
     if flags["cut"].any():
         message = "the picture changes at once, as at a cut: {frames}"
-        yield clip.finding("warning", "cut", message, segments_of(flags["cut"]), "{selection}")
-    moving = clip["motion"]
-    motion = (
-        f"fast motion: the picture moves by {np.median(moving):.1%} of its width from frame to frame, by "
-        f"{np.percentile(moving, 95):.1%} in the fastest; by more than {_FAST:.0%} in {{frames}}"
-    )
-    unlike = (
-        "{frames} differ strongly from the previous frame even after motion compensation (fast turns, motion blur, "
-        "close-ups, water, smoke)"
-    )
-    slower = "use every frame, not one of several" if clip.step > 1 else "a recording of a higher rate moves less"
-    for name, code, message, advice in (
-        ("fast", "motion-fast", motion, slower),
-        ("unlike", "unlike", unlike, ""),
-        ("soft", "soft", "soft because of motion blur or a close-up: {frames}", ""),
-    ):
-        if flags[name].mean() > _SOME:
-            yield clip.finding("warning", code, message, segments_of(flags[name], gap=2), advice)
+        yield clip.finding("warning", "cut", message, clip.segments(flags["cut"]), "{selection}")
+    if clip.step > 1 and flags["fast"].mean() > _SOME:
+        moving = clip["motion"]
+        message = (
+            f"fast motion: the picture moves by {np.median(moving):.1%} of its width from frame to frame, by "
+            f"{np.percentile(moving, 95):.1%} in the fastest; by more than {_FAST:.0%} in {{frames}}"
+        )
+        advice = "use every frame: --frames without a step"
+        yield clip.finding("warning", "motion-fast", message, clip.segments(flags["fast"], gap=2), advice)
 
 
 def forecast(clip: Clip) -> str:
@@ -207,6 +149,8 @@ def forecast(clip: Clip) -> str:
     flags, textureless = _dangers(clip)
     lost, cuts = int((flags["fast"] | flags["unlike"] | flags["cut"]).sum()), int(flags["cut"].sum())
     which = f"of one frame in {clip.step}: " if clip.step > 1 else ""
+    if len(clip) < clip.count:
+        which = f"of {len(clip)} frames in {clip['part'].max() + 1} parts of the video: "
     if textureless:
         return f"{which}poor: walls without texture; expect most frames to be lost or in separate submaps"
     if lost > _MANY * len(clip):

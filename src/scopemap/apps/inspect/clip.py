@@ -35,11 +35,17 @@ class VideoFinding(Finding):
     segments: tuple[Segment, ...] = ()
 
 
-def segments_of(flags: np.ndarray, least: int = 1, gap: int = 0) -> tuple[Segment, ...]:
-    """Return where `flags` (N,) bool is True for `least` frames or more; up to `gap` False between two are bridged."""
+def segments_of(flags: np.ndarray, least: int = 1, gap: int = 0, part: np.ndarray | None = None) -> tuple[Segment, ...]:
+    """Return where `flags` (N,) bool is True for `least` frames or more; up to `gap` False between two are bridged.
+
+    part : (N,) numbers of the parts of a video that the frames are of; no segment is of two parts.
+    """
     true = np.flatnonzero(flags)
-    parts = np.split(true, np.flatnonzero(np.diff(true) > gap + 1) + 1) if true.size else []
-    return tuple((int(part[0]), int(part[-1])) for part in parts if part[-1] - part[0] + 1 >= least)
+    breaks = np.diff(true) > gap + 1
+    if part is not None:
+        breaks |= np.diff(part[true]) > 0
+    found = np.split(true, np.flatnonzero(breaks) + 1) if true.size else []
+    return tuple((int(one[0]), int(one[-1])) for one in found if one[-1] - one[0] + 1 >= least)
 
 
 def covered(segments: Sequence[Segment], count: int) -> np.ndarray:
@@ -52,11 +58,15 @@ def covered(segments: Sequence[Segment], count: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Clip:
-    """The frames that were read: their measures, whether time stamps are the video's own, and the selection."""
+    """The frames that were read: their measures, whether time stamps are the video's own, and the selection.
+
+    count : frames of the selection, read or not; those that were read where only reading on would tell.
+    """
 
     measures: tuple[FrameMeasures, ...]
     stamped: bool
     selection: slice
+    count: int
 
     def __len__(self) -> int:
         return len(self.measures)
@@ -87,9 +97,9 @@ class Clip:
         """Which frames repeat the last one that was no repeat, (N,) bool; blank frames repeat nothing."""
         return (self["change"] < LEAST_DIFFERENCE) & ~self["blank"]
 
-    def segments(self, flags: np.ndarray, seconds: float, least: int, gap: int = 0) -> tuple[Segment, ...]:
+    def segments(self, flags: np.ndarray, seconds: float = 0.0, least: int = 1, gap: int = 0) -> tuple[Segment, ...]:
         """Return the segments of `flags` (N,) bool that last `seconds` and have at least `least` frames."""
-        return segments_of(flags, max(least, round(seconds * self.rate_hz / self.step)), gap)
+        return segments_of(flags, max(least, round(seconds * self.rate_hz / self.step)), gap, self["part"])
 
     def finding(
         self, severity: Severity, code: str, message: str, segments: tuple[Segment, ...], advice: str = ""

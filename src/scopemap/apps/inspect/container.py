@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import av
 
-from scopemap.apps.inspect.clip import VideoFinding
 from scopemap.input.video_format.streams import stated_length_s, video_stream
 
 _FULL_RANGE = 2
@@ -45,20 +43,3 @@ def read_container(media: str) -> dict[str, Any] | None:
             }
     except (av.FFmpegError, OSError, ValueError):
         return None
-
-
-def check_container(facts: dict[str, Any]) -> Iterator[VideoFinding]:
-    """Yield what in the header is unusual."""
-    aspect, rotation, bits = facts["pixel_aspect"], facts["rotation_deg"], facts["bits"]
-    if abs(aspect - 1) > 1e-3:
-        yield VideoFinding(
-            "info", "pixel-aspect", f"pixels are {aspect:.4g} times as wide as high; runs reckon with it"
-        )
-    if bits > 8:
-        yield VideoFinding("info", "bit-depth", f"{bits} bits per channel; runs work on 8")
-    if rotation:
-        message = f"players turn the picture by {rotation} deg; a calibration must fit the picture that runs see"
-        yield VideoFinding("info", "rotation", message)
-    if facts["interlaced"]:
-        message = "the header says that the pictures are interlaced"
-        yield VideoFinding("info", "field-order", message, "runs use one field where combs are found, too")

@@ -17,11 +17,6 @@ Shape = Literal["full", "bars", "circle", "cut corners", "rounded corners"]
 ShareBox = tuple[float, float, float, float]
 """Left, top, right, bottom as shares of width and height."""
 
-_WORDS: dict[Shape, str] = {
-    "circle": "a circle",
-    "cut corners": "a rectangle with cut corners",
-    "rounded corners": "a rectangle with rounded corners",
-}
 _FULL_SHARE = 0.995
 _BAR_SHARE = 0.01
 _EDGE_PX = 2
@@ -103,23 +98,14 @@ class FieldWatcher:
         return float(alike.max(initial=0.0))
 
     def findings(self) -> Iterator[VideoFinding]:
-        """Yield shape and motion of a field that does not fill the picture."""
+        """Yield that a field which does not fill the picture moves so far that the calibration changes."""
         field = self.field()
-        if field.shape == "full":
-            return
-        left, top, right, bottom = field.box
-        margins = f"left {left:.1%}, right {1 - right:.1%}, top {top:.1%}, bottom {1 - bottom:.1%}"
-        words = _WORDS.get(field.shape, f"a rectangle inside black borders ({margins})")
-        message = f"the field of view is {words}, {field.share:.0%} of the picture; runs leave the rest out"
-        yield VideoFinding("info", f"field-{field.shape.replace(' ', '-')}", message)
-        if field.moved > _MOVED:
+        if field.shape != "full" and field.moved > _FAR:
             message = (
-                f"the field of view moves in the picture, by {field.moved:.1%} of its size; runs take all that was "
-                "ever lit for it, less what is black in a frame"
+                f"the field of view moves in the picture, by {field.moved:.1%} of its size: a zoom or a turn of the "
+                "camera's head, which changes the calibration, too"
             )
-            advice = "a zoom or a turn of the camera's head changes the calibration, too: run the parts by themselves"
-            far = field.moved > _FAR
-            yield VideoFinding("warning" if far else "info", "field-moves", message, advice if far else "")
+            yield VideoFinding("warning", "field-moves", message, "run the parts by themselves: --frames A:B")
 
 
 def shares_of(box: Sequence[int], shape: tuple[int, ...]) -> ShareBox:

@@ -24,15 +24,17 @@ _LEAST_LIT = 0.05
 class FrameMeasures:
     """Measures of one frame.
 
-    position : in the input, from 0, as `--frames` counts. time_s : from the reader. blank : whether it shows next to
-    nothing that is not black. brightness : mean level in the field, 0-255. sharpness : as the tracker has it.
-    change : mean difference from the last frame that was no repeat, grey levels. motion : median flow since the frame
-    before, share of the width. correlation : correlation with the frame before, moved by that flow, -1 to 1; 1 for the
-    first frame. redness : mean red over the stronger of green and blue. clipped, dark, highlights : shares of the
-    field. usable : share of the frame that a run would use.
+    position : in the input, from 0, as `--frames` counts. part : number of the part of the video that was read.
+    time_s : from the reader. blank : whether it shows next to nothing that is not black. brightness : mean level in the
+    field, 0-255. sharpness : as the tracker has it. change : mean difference from the last frame of the part that was
+    no repeat, grey levels. motion : median flow since the frame before, share of the width. correlation : correlation
+    with the frame before, moved by that flow, -1 to 1; 1 for the first frame of a part. redness : mean red over the
+    stronger of green and blue. clipped, dark, highlights : shares of the field. usable : share of the frame that a run
+    would use.
     """
 
     position: int
+    part: int
     time_s: float
     blank: bool
     brightness: float
@@ -65,16 +67,22 @@ class InspectedFrame:
 
 
 class FrameInspector:
-    """Measures the frames of a video in their order; keeps the last one that was no repeat."""
+    """Measures the frames of a video in their order; keeps the last one of a part that was no repeat."""
 
     def __init__(self) -> None:
         self._field, self._masker = FieldOfView(), Masker(MaskSettings())
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
         self._before: np.ndarray | None = None
+        self._part = 0
 
-    def __call__(self, position: int, rgb: np.ndarray, frame: Frame) -> InspectedFrame:
-        """Return the picture (H, W, 3) uint8 at a position, with the frame that a run makes of it, measured."""
+    def __call__(self, position: int, part: int, rgb: np.ndarray, frame: Frame) -> InspectedFrame:
+        """Return the picture (H, W, 3) uint8 at a position, with the frame that a run makes of it, measured.
+
+        part : number of the part of the video; the first frame of each is compared with none before it.
+        """
+        if part != self._part:
+            self._part, self._kept, self._before = part, None, None
         small = shrunk(rgb, _SMALL_PX)
         lit = is_lit(small)
         field, masked = self._field(lit, np.ones_like(lit)), self._masker(frame)
@@ -85,6 +93,7 @@ class FrameInspector:
         motion, correlation = self._motion(small)
         measures = FrameMeasures(
             position=position,
+            part=part,
             time_s=masked.time_s,
             blank=bool(is_constant(small) or lit[inside].mean() < _LEAST_LIT),
             brightness=sum(cv2.mean(small, inside.astype(np.uint8))[:3]) / 3,

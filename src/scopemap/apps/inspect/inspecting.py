@@ -1,4 +1,4 @@
-"""The one pass over a video: every frame is measured once, in order, and few are kept."""
+"""The one pass over a video: frames are measured once, in order, of a long video short parts; few are kept."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from scopemap.apps.inspect import checks
 from scopemap.apps.inspect.burned_in import InsetWatcher, Overlay, OverlayWatcher
 from scopemap.apps.inspect.clip import Clip, VideoFinding
-from scopemap.apps.inspect.container import check_container, read_container
+from scopemap.apps.inspect.container import read_container
 from scopemap.apps.inspect.field_shape import Field, FieldWatcher, ShareBox
 from scopemap.apps.inspect.frame_measures import FrameInspector, InspectedFrame
 from scopemap.apps.inspect.scope_guess import check_scope
@@ -23,9 +23,12 @@ from scopemap.engine.frame import Frame
 from scopemap.input.opening import open_sequence, open_source
 from scopemap.input.prepared import OF_UNKNOWN_VIEWS, sample_pairs, shows_two_fields
 from scopemap.input.sequence import Sequence
+from scopemap.input.source import SourceFrame
 from scopemap.input.video_format.stereo_packing import Packing, packing
 from scopemap.result.wording import in_words
 
+_PARTS = 12  # by hand: 300 frames, in about 4 s, show what concerns a whole video
+_FRAMES_OF_PART = 25  # by hand: a second of most videos, for what lasts
 _KEPT = 8
 _NAMED = 3
 _ORDER = ("error", "warning", "info")
@@ -35,9 +38,9 @@ _ORDER = ("error", "warning", "info")
 class Inspection:
     """What was found in a video.
 
-    path : the file or folder. size : of a picture (of one view, if there are two), px. clip : measures of every
-    picture. container : facts in the file's header, or None. packed : layout of two views in a picture, or None.
-    findings : worst first. samples : a few frames.
+    path : the file or folder. size : of a picture (of one view, if there are two), px. clip : measures of the pictures
+    that were read. container : facts in the file's header, or None. packed : layout of two views in a picture, or
+    None. findings : worst first. samples : a few frames.
     """
 
     path: Path
@@ -57,7 +60,8 @@ class Inspection:
         facts = (self.container or {}) | {
             "width": self.size[0],
             "height": self.size[1],
-            "pictures": len(self.clip),
+            "pictures": self.clip.count,
+            "pictures_read": len(self.clip),
             "span_s": float(np.diff(self.clip["time_s"][[0, -1]])[0]),
             "usual_rate_hz": self.clip.rate_hz,
             "motion_per_frame_share": float(np.median(self.clip["motion"])),
@@ -96,10 +100,11 @@ def inspect(
     frames: slice | None = None,
     listener: Callable[[int, int | None], None] | None = None,
 ) -> Inspection:
-    """Read a video, a folder of images or a data set's folder once and return what was found.
+    """Read a video, a folder of images or a data set's folder and return what was found.
 
-    `dataset`, `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called after
-    each. Raises `InputError` and `CalibrationError` where it cannot be opened or holds fewer than two pictures.
+    Of more than 300 frames 12 parts of 25 are read, evenly spread; what lies between them is not seen. `dataset`,
+    `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called after each. Raises
+    `InputError` and `CalibrationError` where it cannot be opened or holds fewer than two pictures.
     """
     plain = InputSettings(stereo="none", skip_duplicates=False, deinterlace="off")
     # Whether there are two views comes first: the camera may be that of one.
@@ -115,25 +120,27 @@ def inspect(
     container = None if media is None else read_container(media)
     field, overlays, insets, sampled = FieldWatcher(), OverlayWatcher(), InsetWatcher(), _Sampled()
     measures, stopped = [], ""
+    due = None if sequence.count is None else sum(map(len, _parts(sequence)))
     try:
         for item in _inspected(sequence):
             for watcher in (field, overlays, insets, sampled):
                 watcher.add(item)
             measures.append(item.measures)
             if listener is not None:
-                listener(len(measures), sequence.count)
+                listener(len(measures), due)
     except ScopemapError as error:
         stopped = str(error)
     if len(measures) < 2:
         found = stopped or f"{len(measures)} picture(s) could be read, two are needed"
         raise InputError(f"inspecting {sequence.path}: {found}")
-    clip = Clip(tuple(measures), sequence.source.stamped, sequence.selection)
+    is_whole = due is None or due == sequence.count
+    count = len(measures) if is_whole or sequence.count is None else sequence.count
+    clip = Clip(tuple(measures), sequence.source.stamped, sequence.selection, count)
     size = sequence.source.width, sequence.source.height
     findings = [
         *([VideoFinding("error", "reading-stopped", stopped)] if stopped else []),
         *_of_source(list(map(in_words, sequence.warnings))),
-        *(check_container(container) if container else []),
-        *checks.check_timing(clip, container["length_s"] if container else None),
+        *checks.check_rate(clip),
         *checks.check_packing(packed, interlaced=interlaced),
         *checks.check_repeats(clip),
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
@@ -156,20 +163,46 @@ def inspect(
 
 
 def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:
-    """Yield the frames, measured, with their positions in the input.
+    """Yield the frames of the parts, measured, with their positions in the input.
 
     Unreadable images and damaged frames of a video have a position, too.
     """
     known = sequence.source.stamps(slice(None)) or []
-    start, _, step = sequence.selection.indices(sequence.source.count or sys.maxsize)
     positions = {index: position for position, (index, _) in enumerate(known)}
     inspector = FrameInspector()
     is_video = sequence.source.media() is not None
-    for number, item in enumerate(sequence.source.frames(sequence.selection)):
+    for part, number, item in _read(sequence):
         rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
         frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
-        place = item.index if is_video else positions.get(item.index, start + step * number)
-        yield inspector(place, item.rgb, frame)
+        place = item.index if is_video else positions.get(item.index, number)
+        yield inspector(place, part, item.rgb, frame)
+
+
+def _read(sequence: Sequence) -> Iterator[tuple[int, int, SourceFrame]]:
+    """Yield the frames of the parts, each with the number of its part and about its position in the input."""
+    source, selection = sequence.source, sequence.selection
+    parts, (start, _, step) = _parts(sequence), selection.indices(source.count or sys.maxsize)
+    if source.seeks or len(parts) == 1:
+        for part, numbers in enumerate(parts):
+            first = selection.start if len(parts) == 1 else start + step * numbers.start
+            # The last one is read to the end of the input, for its reader to say where that breaks off.
+            stop = selection.stop if part == len(parts) - 1 else start + step * numbers.stop
+            read = source.frames(slice(first, stop, selection.step))
+            yield from ((part, start + step * number, item) for number, item in enumerate(read, numbers.start))
+        return
+    part_of = {number: part for part, numbers in enumerate(parts) for number in numbers}
+    for number, item in enumerate(source.frames(selection)):
+        if number in part_of:
+            yield part_of[number], start + step * number, item
+
+
+def _parts(sequence: Sequence) -> list[range]:
+    """Return which of the selected frames are read: short parts, evenly spread; all where they are few or uncounted."""
+    count = sequence.count
+    if count is None or count <= _PARTS * _FRAMES_OF_PART:
+        return [range(count or 0)]
+    firsts = np.linspace(0, count - _FRAMES_OF_PART, _PARTS).round().astype(int).tolist()
+    return [range(first, first + _FRAMES_OF_PART) for first in firsts]
 
 
 def _of_source(warnings: list[str]) -> list[VideoFinding]:

@@ -38,11 +38,6 @@ _BANDS = {
     "duplicates": "#ef8a62",
     "blurred": "#762a83",
     "not-tissue": "#1b7837",
-    "clipped": "#e6c200",
-    "dark": "#2166ac",
-    "highlights": "#80cdc1",
-    "frames-dropped": "#8c510a",
-    "time-order": "#c51b7d",
 }
 
 
@@ -70,7 +65,7 @@ def draw_inspection(inspection: Inspection, file: Path) -> None:
     _draw_times(sheet, top, inspection, [view.measures.position for view in views])
     width, height = inspection.size
     codes = [finding.code for finding in inspection.findings if finding.severity != "info"]
-    facts = f"{inspection.path.name}: {len(inspection.clip)} pictures of {width}x{height} px"
+    facts = f"{inspection.path.name}: {inspection.clip.count} pictures of {width}x{height} px"
     sheet.headline(f"{facts}; {', '.join(dict.fromkeys(codes)) or 'nothing to warn of'}")
     sheet.save(file)
 
@@ -137,7 +132,8 @@ def _draw_times(sheet: Sheet, top: float, inspection: Inspection, shown: list[in
         label = f"frame, counted from 0{' (orange dots: repeated)' if again.size else ''}"
         plot = marked(_LINE_PX, (0.0, most), label * (row == len(_LINES) and not bands))
         places = plot.place(np.column_stack([positions, values]))
-        sheet.line(places, _LINE_COLOUR)
+        for part in np.unique(clip["part"]):
+            sheet.line(places[clip["part"] == part], _LINE_COLOUR)
         sheet.dots(places[again], _BANDS["duplicates"], 2)
         sheet.text((_LEFT_PX + 6, top + 3), words, 12)
         top += _LINE_PX + _GAP_PX
