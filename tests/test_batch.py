@@ -6,6 +6,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -86,6 +88,21 @@ def test_a_part_is_every_nth_video_with_a_table_of_its_own(folder: Path, tmp_pat
     assert {name: row["status"] for name, row in rows.items()} == {
         **{"colon_0": "waiting", "colon_1": "done", "colon_2": "waiting"}
     }
+
+
+def test_two_parts_at_once_give_one_table(folder: Path, tmp_path: Path) -> None:
+    """As two jobs of an array; the part that ends last writes the rows of both."""
+    words = ["batch", str(folder / "colon*"), "--out", str(tmp_path / "out"), "--workers", "1", "--quiet", *QUICK]
+    command = [sys.executable, "-m", "scopemap", *words]
+    jobs = [subprocess.Popen([*command, "--part", f"{number}/2"]) for number in (1, 2)]
+    assert [job.wait() for job in jobs] == [0, 0]
+    shares = [list(batch_rows(tmp_path / "out" / f"batch-{number}-of-2.csv")) for number in (1, 2)]
+    assert shares == [["colon_0", "colon_2"], ["colon_1"]]
+    rows = batch_rows(tmp_path / "out" / "batch.csv")
+    assert [(name, row["status"]) for name, row in rows.items()] == [(f"colon_{number}", "done") for number in range(3)]
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("colon_*/**/*")}
+    assert call(*words) == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("colon_*/**/*")} == before
 
 
 def test_a_restart_does_nothing_twice(folder: Path, done: tuple[Path, int, list[int]]) -> None:

@@ -5,20 +5,26 @@ from __future__ import annotations
 import importlib.util
 import multiprocessing
 import os
+import secrets
+import shutil
 import signal
+import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from front_door import refused
+from front_door import call, refused
 from process_tasks import FAULTS, LIMIT_S, WHATS, act, soon
+from result_files import batch_rows
+from tiny_phantom import write_tiny
 
 from scopemap.apps.batch.engines import Engine, WorkerNeeds
 from scopemap.apps.batch.ray_engine import RayEngine
 from scopemap.engine.errors import InputError
-from scopemap.runner.processes import ProcessLimits, run_in_processes, usable_cores
+from scopemap.runner.processes import THREADS, ProcessLimits, run_in_processes, usable_cores
 from scopemap_bench.scripts.batch import POISONED, single_runs, trial, write_videos
 
 NEEDS = WorkerNeeds(cores=1, memory_gb=0.5)
@@ -28,11 +34,39 @@ CLUSTER = pytest.mark.skipif(
 )
 
 
+@pytest.fixture(scope="module")
+def ray_address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a Ray of this machine with two cores, begun as a user does, which ends with these tests."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    folder = tmp_path_factory.mktemp("ray")
+    # Who has no token cannot connect.
+    os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    words = ["ray", "start", "--head", "--block", "--port", address.rpartition(":")[2], "--num-cpus", "2"]
+    words += ["--include-dashboard", "false", "--disable-usage-stats"]
+    words += ["--object-store-memory", str(100 << 20), "--temp-dir", f"/tmp/ray-{os.getpid()}"]
+    own = {name: value for name, value in os.environ.items() if name not in ("ORT_DISABLE_TELEMETRY", *THREADS)}
+    own["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    with (folder / "log").open("wb") as log:
+        ray = subprocess.Popen(words, stdout=log, stderr=log, env=own)
+    try:
+        assert soon(lambda: b"Ray runtime started" in (folder / "log").read_bytes() or ray.poll() is not None)
+        assert ray.poll() is None, (folder / "log").read_text()
+        yield address
+    finally:
+        ray.terminate()
+        ray.wait()
+        shutil.rmtree(f"/tmp/ray-{os.getpid()}", ignore_errors=True)
+
+
 @pytest.fixture(params=["processes", pytest.param("ray", marks=CLUSTER)])
 def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Engine:
     """An engine whose workers find the modules of these tests."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
-    return {"processes": run_in_processes, "ray": RayEngine(NEEDS)}[request.param]
+    if request.param == "processes":
+        return run_in_processes
+    return RayEngine(NEEDS, request.getfixturevalue("ray_address"))
 
 
 def test_each_task_has_the_outcome_that_it_deserves(engine: Engine, tmp_path: Path) -> None:
@@ -66,15 +100,14 @@ def test_what_is_begun_ends_with_who_waits_for_it(engine: Engine, tmp_path: Path
     assert soon(lambda: not Path(f"/proc/{outcome.value[0]}").exists())
 
 
-@pytest.mark.parametrize("run", [run_in_processes, pytest.param(RayEngine(NEEDS), marks=CLUSTER)])
 def test_a_worker_does_one_task_after_the_other_with_its_share_of_threads(
-    run: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
     monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
     tasks = [("work", tmp_path / f"{number}") for number in range(3)]
-    found = {outcome.value for _, outcome in run(act, tasks, ProcessLimits(1))}
-    assert [threads for _, threads in found] == [str(usable_cores())]
+    found = {outcome.value for _, outcome in engine(act, tasks, ProcessLimits(1))}
+    share = NEEDS.cores if isinstance(engine, RayEngine) else usable_cores()
+    assert [threads for _, threads in found] == [str(share)]
     assert "NUMBA_NUM_THREADS" not in os.environ
 
 
@@ -109,41 +142,22 @@ def _runs(pid: str) -> bool:
 
 
 @CLUSTER
-def test_what_no_node_has_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_no_node_has_is_a_sentence(ray_address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.apps.batch.ray_engine._LONGEST_START_S", 3.0)
+    engine = RayEngine(WorkerNeeds(1, 0.5, gpus=64), ray_address)
     with pytest.raises(InputError, match="no worker has started on Ray in 3 s: has a node the cores"):
-        list(RayEngine(WorkerNeeds(1, 0.5, gpus=64))(act, [("work", tmp_path / "a")], ProcessLimits(1)))
+        list(engine(act, [("work", tmp_path / "a")], ProcessLimits(1)))
 
 
 @CLUSTER
-def test_ray_of_this_machine_is_reached_from_nowhere_else_and_tells_nobody(tmp_path: Path) -> None:
-    """In a process of its own, as a Ray that was imported before has chosen its address."""
-    code = (
-        "import os\nfrom scopemap.apps.batch.ray_engine import RayEngine\n"
-        "from scopemap.apps.batch.engines import WorkerNeeds\n"
-        "def listening():\n"
-        "    lines = [line.split() for name in ('tcp', 'tcp6') for line in open(f'/proc/net/{name}')]\n"
-        "    return [line[1] for line in lines if line[3] == '0A']\n"
-        "with RayEngine(WorkerNeeds(1, 0.5))._connected(1) as ray:\n"
-        "    facts = ray.util.get_node_ip_address(), os.environ['RAY_USAGE_STATS_ENABLED']\n"
-        "    facts += ('dashboard' in ray._private.worker._global_node.all_processes,)\n"
-        "    during = listening()\n"
-        "for line in (facts, during, listening()):\n    print(*line)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True)
-    facts, during, after = done.stdout.splitlines()
-    assert facts == "127.0.0.1 0 False"
-    new = set(during.split()) - set(after.split())
-    loopback = ("0100007F:", "00000000000000000000000001000000:", "0000000000000000FFFF00000100007F:")
-    assert new
-    assert {address for address in new if not address.startswith(loopback)} == set()
-
-
-@CLUSTER
-def test_a_ray_that_would_ask_others_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr("ray._private.node.Node.start_api_server")
-    with pytest.raises(InputError, match=r"starting Ray \d.*asking which cloud this is; install the version in const"):
-        list(RayEngine(WorkerNeeds(1, 0.5))(act, [("work", tmp_path / "a")], ProcessLimits(1)))
+def test_two_workers_of_a_ray_run_a_batch(ray_address: str, tmp_path: Path) -> None:
+    for number in range(2):
+        write_tiny(tmp_path / "archive" / f"colon_{number}", frames=4)
+    words = ("batch", tmp_path / "archive", "--out", tmp_path / "out", "--engine", "ray", "--address", ray_address)
+    needs = ("--workers", 2, "--worker-cores", 1, "--worker-memory", "500MB", "--quiet")
+    assert call(*words, *needs, "--set", "mapping.triangulate_depth=false") == 0
+    rows = batch_rows(tmp_path / "out" / "batch.csv")
+    assert {name: row["status"] for name, row in rows.items()} == {"colon_0": "done", "colon_1": "done"}
 
 
 @pytest.fixture(scope="module")
@@ -171,6 +185,7 @@ def test_a_disturbed_batch_has_the_results_of_single_runs(
     [
         (("--worker-cores", 2), "--worker-cores is an option of --engine ray"),
         (("--engine", "ray", "--address", "127.0.0.1:1", "--workers", 1), "cannot connect to Ray at 127.0.0.1:1"),
+        (("--engine", "ray"), "how many videos run at once on Ray? Give --workers"),
     ],
 )
 def test_what_an_engine_cannot_do_is_refused(

@@ -67,10 +67,10 @@ def batch(
     ] = 1,
     engine: Annotated[
         Literal["processes", "ray"],
-        options.advanced(help="Run videos in processes of this machine, or on a Ray cluster."),
+        options.advanced(help="Run videos in processes of this machine, or on a Ray that runs already."),
     ] = "processes",
     address: Annotated[
-        str | None, options.advanced(help="Address of a Ray cluster, such as auto; default: Ray on this machine only.")
+        str | None, options.advanced(help="Address of the Ray; default: auto, the one that this machine is a node of.")
     ] = None,
     worker_cores: Annotated[
         int | None, options.advanced(min=1, metavar="N", help="Cores of each Ray worker; default: 2.")
@@ -114,8 +114,8 @@ def batch(
     from scopemap.runner.processes import ProcessLimits, usable_cores
 
     videos = videos_of(named_inputs(inputs), shared, of_scope | options.parse_settings(settings or []))
-    if workers is None and address:
-        raise SettingsError("how many videos run at once on the cluster? Give --workers")
+    if workers is None and engine == "ray":
+        raise SettingsError("how many videos run at once on Ray? Give --workers")
     limits = ProcessLimits(workers or max(1, usable_cores() // 2), time_limit, retries)
     given: dict[str, Any] = {"address": address, "worker-cores": worker_cores}
     given |= {"worker-memory": worker_memory, "worker-gpus": worker_gpus}
@@ -215,7 +215,7 @@ def engine_of(name: str, given: dict[str, Any], videos: list[Video]) -> Engine:
         gpus = float(any(video.config.networks.device.startswith("cuda") for video in videos))
     memory_gb = options.parse_memory(memory) / 1000 if memory else by_default.memory_gb
     needs = WorkerNeeds(given["worker-cores"] or by_default.cores, memory_gb, gpus)
-    return RayEngine(needs, given["address"])
+    return RayEngine(needs, given["address"] or "auto")
 
 
 def _forecast(videos: list[Video], out: Path, limits: Any, engine: Engine, *, as_json: bool, quiet: bool) -> None:
@@ -228,23 +228,29 @@ def _forecast(videos: list[Video], out: Path, limits: Any, engine: Engine, *, as
 
         found = forecast(videos, out, limits, shown, engine)
     if as_json:
-        print_json([asdict(one) for one in found])
+        print_json([_facts(one) for one in found])
     elif not quiet:
         for line in forecast_lines(found, limits.processes):
             typer.echo(line)
 
 
+def _facts(one: Forecast) -> dict[str, Any]:
+    """Return a forecast as JSON has it, its cost with the names of `scopemap run --dry-run`."""
+    cost = {} if one.cost is None else asdict(one.cost) | {"seconds": one.cost.seconds}
+    return {"name": one.name, "fault": one.fault, "input_bytes": one.input_bytes} | cost
+
+
 def forecast_lines(found: list[Forecast], processes: int) -> list[str]:
     """Return the sum of forecasts, one fact per line."""
-    known = [one for one in found if one.seconds is not None]
+    known = [one.cost for one in found if one.cost is not None]
     failed = [one for one in found if one.fault]
     unknown = len(found) - len(known) - len(failed)
-    work_s = [one.seconds or 0.0 for one in known]
+    work_s = [cost.seconds for cost in known]
     # Videos are not divided: the longest one bounds the time.
     least_s = max([sum(work_s) / processes, *work_s])
-    read, written = sum(one.input_bytes for one in found), sum(one.result_bytes or 0 for one in known)
+    read, written = sum(one.input_bytes for one in found), sum(cost.result_bytes for cost in known)
     lines = [
-        f"{len(found)} video{'s' * (len(found) != 1)}, {_span(sum(one.video_s or 0.0 for one in known))}, "
+        f"{len(found)} video{'s' * (len(found) != 1)}, {_span(sum(cost.video_s for cost in known))}, "
         f"{read / 1e9:.2f} GB",
         f"results: about {written / 1e9:.2f} GB",
         f"time: about {_span(least_s)} with {processes} at once ({_span(sum(work_s))} one after the other)",
@@ -261,9 +267,9 @@ def _span(seconds: float) -> str:
 
 
 def _forecast_line(one: Forecast) -> str:
-    if one.seconds is None:
+    if one.cost is None:
         return f"{one.name}: {one.fault or 'of unknown length'}"
-    return f"{one.name}: {one.frames} frames, about {one.seconds:.0f} s"
+    return f"{one.name}: {one.cost.frames} frames, about {one.cost.seconds:.0f} s"
 
 
 def _row_line(row: BatchRow) -> str:

@@ -7,13 +7,12 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from scopemap.apps.batch.batch import LOGS, Video, log_to
 from scopemap.apps.batch.engines import Engine
 from scopemap.engine.errors import reporting
 from scopemap.input.inputs import RemoteFile
-from scopemap.runner.forecast import bytes_in, run_cost
+from scopemap.runner.forecast import RunCost, bytes_in, run_cost
 from scopemap.runner.processes import ProcessLimits, run_in_processes
 
 
@@ -21,18 +20,14 @@ from scopemap.runner.processes import ProcessLimits, run_in_processes
 class Forecast:
     """What running a video costs.
 
-    fault : why its first second could not be run, or "". frames : those that would be used, None where only reading on
-    tells. video_s : their time. input_bytes : of its file or folder. seconds, result_bytes : estimated for all frames,
-    with one process; None where the number of frames is unknown, or the second failed.
+    fault : why its first second could not be run, or "". input_bytes : of its file or folder. cost : with one process;
+    None where the number of frames is unknown, or the second failed.
     """
 
     name: str
-    fault: str = ""
-    frames: int | None = None
-    video_s: float | None = None
-    input_bytes: int = 0
-    seconds: float | None = None
-    result_bytes: int | None = None
+    fault: str
+    input_bytes: int
+    cost: RunCost | None
 
 
 @dataclass(frozen=True)
@@ -62,8 +57,7 @@ def forecast(
         for number, outcome in engine(_measure, [_Part(video, folder) for video in videos], limits):
             video = videos[number]
             video.forget_fetched(folder)
-            known = outcome.value or {}
-            found[number] = Forecast(video.name, outcome.fault, input_bytes=_bytes(video.path), **known)
+            found[number] = Forecast(video.name, outcome.fault, _bytes(video.path), outcome.value)
             on_change(found[number], len(videos) - len(found))
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -72,15 +66,11 @@ def forecast(
     return [found[number] for number in sorted(found)]
 
 
-def _measure(part: _Part) -> dict[str, Any]:
-    """Run the first second of a video, and return what its forecast says."""
+def _measure(part: _Part) -> RunCost | None:
+    """Run the first second of a video, and return what all of it costs, as `scopemap run --dry-run` does."""
     log_to(part.out / LOGS / f"{part.video.name}.txt")
     video = part.video.fetched(part.out)
-    cost = run_cost(video.open(), video.open, video.config, part.out / video.name)
-    if cost is None:
-        return {}
-    names = ("frames", "video_s", "seconds", "result_bytes")
-    return {name: getattr(cost, name) for name in names}
+    return run_cost(video.open(), video.open, video.config, part.out / video.name)
 
 
 def _bytes(path: Path | RemoteFile) -> int:

@@ -1,4 +1,4 @@
-"""Tasks on a Ray cluster, or on a Ray of this machine alone: actors that do one task after the other."""
+"""Tasks on a Ray that runs already, a cluster or one machine: actors that do one task after the other."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import re
 import signal
 import socket
 import sys
-import tempfile
 import threading
 import time
 from collections import deque
@@ -20,9 +19,8 @@ from typing import Any
 import cv2
 
 from scopemap.apps.batch.engines import WorkerNeeds
-from scopemap.apps.batch.local_ray import keep_to_loopback, start_local_ray
 from scopemap.engine.errors import InputError, reporting
-from scopemap.runner.processes import NEW, THREADS, Outcome, ProcessLimits, attempt, threads_of_each
+from scopemap.runner.processes import NEW, THREADS, Outcome, ProcessLimits, attempt
 
 _LONGEST_START_S = 300.0
 _LONGEST_CONNECT_S = 10.0
@@ -33,13 +31,13 @@ _MOST_FAILED_STARTS = 3
 class RayEngine:
     """Runs tasks as `run_in_processes` does, in actors on Ray, which share a file system.
 
-    needs : of each actor. address : of a cluster, as `ray.init` takes it; None: a Ray that begins and ends with the
-    tasks, at this machine's loopback address. A task whose actor or node dies is tried again in another actor.
-    Raises `InputError` where there is no Ray, and where no actor starts.
+    needs : of each actor. address : as `ray.init` takes it; "auto": of the Ray that this machine is a node of.
+    A task whose actor or node dies is tried again in another actor. Raises `InputError` where there is no Ray, and
+    where no actor starts.
     """
 
     needs: WorkerNeeds
-    address: str | None = None
+    address: str = "auto"
 
     def __call__(
         self,
@@ -52,8 +50,8 @@ class RayEngine:
         waiting = deque((number, NEW) for number in range(len(tasks)))
         workers: list[_Worker] = []
         failed_starts = 0
-        with self._connected(limits.processes) as ray:
-            actor = self._actor(ray, limits.processes)
+        with self._connected() as ray:
+            actor = self._actor(ray)
             while waiting or any(worker.is_busy for worker in workers):
                 # An actor that is placed nowhere yet holds no task: those that run do them all.
                 starting = sum(not worker.is_busy for worker in workers)
@@ -78,38 +76,26 @@ class RayEngine:
                         worker.kill()
                         workers.remove(worker)
 
-    def _actor(self, ray: Any, processes: int) -> Callable[[], Any]:
+    def _actor(self, ray: Any) -> Callable[[], Any]:
         """Return what makes an actor."""
         needs = self.needs
-        threads = threads_of_each(processes) if self.address is None else needs.cores
         declared = {"num_cpus": needs.cores, "num_gpus": needs.gpus, "memory": int(needs.memory_gb * 1e9)}
         kind = ray.remote(_Tasks).options(**declared, max_restarts=0)
-        return lambda: kind.remote(threads)
+        return lambda: kind.remote(needs.cores)
 
     @contextmanager
-    def _connected(self, processes: int) -> Iterator[Any]:
+    def _connected(self) -> Iterator[Any]:
         """Yield the module ray, connected; all its actors end with the connection."""
-        if self.address is None:
-            keep_to_loopback()
         try:
             import ray
         except ImportError:
             raise InputError("--engine ray needs the extra `cluster`: pip install -e '.[cluster]'") from None
-        place, needs = self.address, self.needs
         handler = signal.getsignal(signal.SIGTERM)
-        # What Ray thinks of workers that die goes to stdout otherwise.
-        with (
-            redirect_stdout(sys.stderr),
-            tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder,
-        ):
+        with redirect_stdout(sys.stderr):  # what Ray thinks of workers that die goes to stdout otherwise
             try:
-                with reporting(f"cannot {'start Ray' if place is None else f'connect to Ray at {place}'}"):
-                    if place is None:
-                        memory_bytes = int(needs.memory_gb * 1e9) * processes
-                        start_local_ray(ray, folder, needs.cores * processes, memory_bytes)
-                    else:
-                        _check_reached(place)
-                        ray.init(place, log_to_driver=False, logging_level=logging.ERROR)
+                with reporting(f"cannot connect to Ray at {self.address}; see docs/batch.md"):
+                    _check_reached(self.address)
+                    ray.init(self.address, log_to_driver=False, logging_level=logging.ERROR)
                 if threading.current_thread() is threading.main_thread():
                     signal.signal(signal.SIGTERM, handler)  # Ray's own would replace that of the command
                 yield ray
