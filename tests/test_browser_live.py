@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,17 +28,29 @@ from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.browser.workspace import Workspace
-from scopemap.apps.live.shown import words_and_facts
+from scopemap.apps.live.live_state import LiveState
 from scopemap.engine.errors import InputError
 from scopemap.result.result import Result
 from scopemap.result.run_view import look, read_map, read_pictures, read_state, view_folder
 
 PATIENCE_S = 240.0
-STATE = {
-    **{"state": "lost", "words": "lost: move back slowly", "reason": "too dark", "frame": 3, "frames_per_s": 14.5},
-    **{"latency_ms": 71, "latency_p50_ms": 70, "latency_p95_ms": 99, "read": 40, "dropped": 2, "tracked": 30},
-    **{"lost": 8, "map": 1, "scale_known": False, "snapshot": "", "full": False},
-}
+STATE = LiveState(
+    state="lost",
+    reason="too dark",
+    frame=3,
+    frames_per_s=14.5,
+    latency_ms=71,
+    latency_p50_ms=70,
+    latency_p95_ms=99,
+    read=40,
+    dropped=2,
+    tracked=30,
+    lost=8,
+    map=1,
+    scale_known=False,
+    snapshot="",
+    full=False,
+)
 
 
 @pytest.fixture(scope="module")
@@ -60,17 +73,16 @@ def wait_for(is_so: Callable[[], Any]) -> Any:
 
 
 def test_facts_of_a_session_are_words() -> None:
-    doing, facts = words_and_facts(STATE, "Of map 2 until 9 s, 31 % was not seen")
-    assert doing == "lost: move back slowly"
-    assert facts == {
+    assert STATE.words == "lost: move back slowly"
+    assert STATE.line.startswith("lost: move back slowly: 14.5 frames/s, latency 70 ms (95 % below 99), 2 of 40 frames")
+    assert STATE.facts == {
         "why": "too dark",
         "latency": "70 ms (95 % below 99 ms)",
         "frames": "14.5 per second; 2 of 40 dropped",
         "tracked": "30, lost 8, submap 2",
         "scale": "unknown: compare shapes, not sizes",
-        "coverage": "Of map 2 until 9 s, 31 % was not seen",
     }
-    _, full = words_and_facts(STATE | {"full": True, "scale_known": True, "reason": "", "snapshot": "a.png"}, "")
+    full = replace(STATE, full=True, scale_known=True, reason="", snapshot="a.png").facts
     assert list(full) == ["latency", "frames", "tracked", "scale", "surface", "snapshot"]
     assert full["scale"] == "known"
 

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,6 +22,7 @@ from scopemap.terminal.terminal_keys import terminal_keys
 
 if TYPE_CHECKING:
     from scopemap.apps.live.live import LiveSession
+    from scopemap.apps.live.live_state import LiveState
     from scopemap.engine.config import Config
     from scopemap.engine.odometry import Step
     from scopemap.runner.reconstructor import Reconstructor
@@ -131,7 +133,7 @@ def live(
         if not silent:
             _print(result.provenance, session.state(), out)
         elif as_json:
-            print_json(result.provenance | {"live": session.state()})
+            print_json(result.provenance | {"live": asdict(state := session.state()) | {"words": state.words}})
     if interruption.exit_code:
         raise typer.Exit(interruption.exit_code)
 
@@ -232,28 +234,21 @@ def _show(session: LiveSession, ended: threading.Event) -> None:
     """Show a session's state until it ends: in one line of a terminal, else in one every ten seconds and at changes."""
     terminal, shown, shown_s = sys.stderr.isatty(), "", 0.0
     while not ended.wait(_SHOWN_EVERY_S):
-        if (state := session.state())["state"] == "ended":  # the summary says so, once
+        if (state := session.state()).state == "ended":  # the summary says so, once
             continue
         if terminal:
-            sys.stderr.write("\r\033[K" + _line(state)[:100])
+            sys.stderr.write("\r\033[K" + state.line[:100])
             sys.stderr.flush()
-        elif state["state"] != shown or time.monotonic() - shown_s > _LINE_EVERY_S:
-            typer.echo(_line(state), err=True)
-            shown, shown_s = state["state"], time.monotonic()
+        elif state.state != shown or time.monotonic() - shown_s > _LINE_EVERY_S:
+            typer.echo(state.line, err=True)
+            shown, shown_s = state.state, time.monotonic()
     if terminal:
         sys.stderr.write("\n")
 
 
-def _line(state: dict[str, Any]) -> str:
-    latency = f"latency {state['latency_p50_ms']} ms (95 % below {state['latency_p95_ms']})"
-    full = ", surface full" if state["full"] else ""
-    drops = f"{state['dropped']} of {state['read']} frames dropped"
-    return f"{state['words']}: {state['frames_per_s']} frames/s, {latency}, {drops}, submap {state['map'] + 1}{full}"
-
-
-def _print(provenance: dict[str, Any], state: dict[str, Any], out: Path | None) -> None:
+def _print(provenance: dict[str, Any], state: LiveState, out: Path | None) -> None:
     print_warnings(provenance)
     typer.echo(f"{provenance['tracked']} of {provenance['frames']} frames tracked, {provenance['lost']} lost")
-    typer.echo(_line(state))
+    typer.echo(state.line)
     if out is not None:
         typer.echo(f"Open {out / 'report.html'} in a browser. All files of the result are in {out}.")

@@ -7,11 +7,12 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import cv2
 import numpy as np
 
+from scopemap.apps.live.live_state import LiveState
 from scopemap.engine.config import Config
 from scopemap.engine.errors import reporting
 from scopemap.engine.frame import Frame
@@ -30,7 +31,6 @@ LIMITS = Limits(frames=50_000, maps=8, blocks=80_000, stored=9_000)
 """Of a session: about 60 MB of rows, 1 GB of surfaces, and on disk 4 GB of frames: ten minutes at 15 frames/s."""
 _REMEMBERED = 300  # latencies
 _AHEAD = 1
-_LOST = "lost: move back slowly"
 
 LiveObserver = Callable[[Step, Reconstructor], None]
 """Called with each step, in the thread that fuses."""
@@ -90,40 +90,32 @@ class LiveSession:
         """Write the next frame's picture (PNG), its pose and the surface so far (PLY) to the folder for snapshots."""
         self._wants_snapshot = True
 
-    def state(self) -> dict[str, Any]:
-        """Return what is shown of the session, as plain values.
-
-        state : "starting", "tracking", "lost", "paused" or "ended"; words : the same for people, reason : why it is
-        lost. frame, frames_per_s, latency_ms, latency_p50_ms, latency_p95_ms : of the last 300 frames, from a frame's
-        time to its pose. read, dropped : frames of the source. tracked, lost : frames since the last reset. map :
-        number of the map. scale_known. snapshot : the last one's file. full : whether the surface takes no more.
-        """
+    def state(self) -> LiveState:
+        """Return how the session is now."""
         with self._lock:
             latencies, times_s, step = list(self._latencies_ms), list(self._times_s), self._step
         span_s = times_s[-1] - times_s[0] if len(times_s) > 1 else 0.0
         median, slowest = np.percentile(latencies, [50, 95]) if latencies else (0.0, 0.0)
-        state = self._state_word()
-        words = {"lost": _LOST, "starting": "starting: hold still and look at tissue"}.get(state, state)
-        return {
-            "state": state,
-            "words": words,
-            "reason": step.track.reason if step is not None and state == "lost" else "",
-            "frame": -1 if step is None else step.frame.index,
-            "frames_per_s": round((len(times_s) - 1) / span_s, 1) if span_s > 0 else 0.0,
-            "latency_ms": round(latencies[-1]) if latencies else 0,
-            "latency_p50_ms": round(float(median)),
-            "latency_p95_ms": round(float(slowest)),
-            "read": self._source.read,
-            "dropped": self._source.dropped,
-            "tracked": self._tracked,
-            "lost": self._lost,
-            "map": 0 if step is None else step.track.map,
-            "scale_known": self._scale_known,
-            "snapshot": self._last_snapshot,
-            "full": self._full,
-        }
+        word = self._state_word()
+        return LiveState(
+            state=word,
+            reason=step.track.reason if step is not None and word == "lost" else "",
+            frame=-1 if step is None else step.frame.index,
+            frames_per_s=round((len(times_s) - 1) / span_s, 1) if span_s > 0 else 0.0,
+            latency_ms=round(latencies[-1]) if latencies else 0,
+            latency_p50_ms=round(float(median)),
+            latency_p95_ms=round(float(slowest)),
+            read=self._source.read,
+            dropped=self._source.dropped,
+            tracked=self._tracked,
+            lost=self._lost,
+            map=0 if step is None else step.track.map,
+            scale_known=self._scale_known,
+            snapshot=self._last_snapshot,
+            full=self._full,
+        )
 
-    def _state_word(self) -> str:
+    def _state_word(self) -> Literal["starting", "tracking", "lost", "paused", "ended"]:
         step = self._step
         if self._ended or step is None:
             return "ended" if self._ended else "starting"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from scopemap.runner.watched import RunWatch
 
@@ -30,8 +30,9 @@ class ShownSession:
         covered = self._covered
 
         def live() -> tuple[str, dict[str, str]]:
-            words, facts = words_and_facts(session.state(), covered.shown.words)
-            return "writing the result" if words == "ended" and self._writes else words, facts
+            state, coverage = session.state(), covered.shown.words
+            words = "writing the result" if state.state == "ended" and self._writes else state.words
+            return words, state.facts | ({"coverage": coverage} if coverage else {})
 
         self._watch = RunWatch(None, folder=self._folder, live=live, drawn=lambda: covered.shown.png)
         return self._watch
@@ -43,19 +44,3 @@ class ShownSession:
             self._watch.forget()
         self._of = reconstructor
         self._watch(step)
-
-
-def words_and_facts(state: dict[str, Any], coverage: str) -> tuple[str, dict[str, str]]:
-    """Return what a session does, and what is known of it by name; coverage : what was not seen, in words."""
-    latency = f"{state['latency_p50_ms']} ms (95 % below {state['latency_p95_ms']} ms)"
-    facts = {
-        "why": state["reason"],
-        "latency": latency,
-        "frames": f"{state['frames_per_s']} per second; {state['dropped']} of {state['read']} dropped",
-        "tracked": f"{state['tracked']}, lost {state['lost']}, submap {state['map'] + 1}",
-        "scale": "known" if state["scale_known"] else "unknown: compare shapes, not sizes",
-        "surface": "full: no more tissue is added; forget all to start a new one" if state["full"] else "",
-        "snapshot": state["snapshot"],
-        "coverage": coverage,
-    }
-    return state["words"], {name: fact for name, fact in facts.items() if fact}
