@@ -6,6 +6,7 @@ Sources: DICOM PS3.3, A.85.1 (Encapsulated STL IOD), C.35.1 (Manufacturing 3D Mo
 from __future__ import annotations
 
 from hashlib import sha256
+from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,6 @@ def _dataset(run: Result, unit: tuple[str, str]) -> Any:
     from pydicom.sr.codedict import codes
     from pydicom.uid import UID, ExplicitVRLittleEndian
 
-    from scopemap import __version__
-
     data = Dataset()
     data.file_meta = FileMetaDataset()
     data.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
@@ -71,7 +70,7 @@ def _dataset(run: Result, unit: tuple[str, str]) -> Any:
     data.Modality, data.SeriesNumber, data.InstanceNumber = "M3D", 1, 1
     data.SeriesDescription = "surface from an endoscope's video"
     data.Manufacturer = data.ManufacturerModelName = "scopemap"
-    data.DeviceSerialNumber, data.SoftwareVersions = "none", __version__
+    data.DeviceSerialNumber, data.SoftwareVersions = "none", version("scopemap")
     data.BurnedInAnnotation, data.DocumentTitle = "NO", "surface, research only"
     known = "scale as stated" if (run.provenance.get("scale") or {}).get("stated") else "scale known"
     data.ContentDescription = known if run.scale_known else "scale unknown: do not measure"

@@ -106,16 +106,7 @@ def inspect(
     `camera` and `frames` as in `open_sequence`; `listener(pictures read, in all or None)` is called after each. Raises
     `InputError` and `CalibrationError` where it cannot be opened or holds fewer than two pictures.
     """
-    plain = InputSettings(stereo="none", skip_duplicates=False, deinterlace="off")
-    # Whether there are two views comes first: the camera may be that of one.
-    source = open_source(path, dataset=dataset, settings=plain)
-    unknown = source.name in OF_UNKNOWN_VIEWS  # the readers of data sets know what a picture holds
-    pairs = sample_pairs(source)
-    packed = packing([rgb for rgb, _ in pairs], source.pixel_aspect) if unknown else None
-    interlaced = shows_two_fields(source, pairs)
-    del pairs
-    settings = plain if packed is None else plain.model_copy(update={"stereo": packed.layout})
-    sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
+    sequence, packed, interlaced = _opened(path, dataset, camera, frames)
     media = sequence.source.media()
     container = None if media is None else read_container(media)
     field, overlays, insets, sampled = FieldWatcher(), OverlayWatcher(), InsetWatcher(), _Sampled()
@@ -160,6 +151,21 @@ def inspect(
         findings=tuple(sorted(findings, key=lambda finding: _ORDER.index(finding.severity))),
         samples=tuple(sampled.kept),
     )
+
+
+def _opened(
+    path: Path, dataset: str | None, camera: Path | None, frames: slice | None
+) -> tuple[Sequence, Packing | None, bool]:
+    """Return the pictures as they are in the input, of two views the first; their layout; whether they have fields."""
+    plain = InputSettings(stereo="none", skip_duplicates=False, deinterlace="off")
+    # Whether there are two views comes first: the camera may be that of one.
+    source = open_source(path, dataset=dataset, settings=plain)
+    unknown = source.name in OF_UNKNOWN_VIEWS  # the readers of data sets know what a picture holds
+    pairs = sample_pairs(source)
+    packed = packing([rgb for rgb, _ in pairs], source.pixel_aspect) if unknown else None
+    settings = plain if packed is None else plain.model_copy(update={"stereo": packed.layout})
+    sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
+    return sequence, packed, shows_two_fields(source, pairs)
 
 
 def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:

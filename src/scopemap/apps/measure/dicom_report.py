@@ -6,6 +6,7 @@ It refers to the surface as `export --to dicom` writes it; where that is filed, 
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -42,12 +43,10 @@ def write_dicom_report(run: Result, findings: list[SurfaceFinding], about_scale:
         from highdicom import UID, sr
     except ModuleNotFoundError:
         raise SettingsError("a DICOM report needs highdicom: pip install -e '.[dicom]'") from None
-    from scopemap import __version__
-
     surface = dicom_stl(run, "mm", "lps")
     device = sr.DeviceObserverIdentifyingAttributes(uid=UID(), name="scopemap")
     context = sr.ObservationContext(sr.ObserverContext(sr.CodedConcept("121007", "DCM", "Device"), device))
-    about = sr.AlgorithmIdentification("scopemap", __version__, [about_scale, _ONLY_RESEARCH])
+    about = sr.AlgorithmIdentification("scopemap", version("scopemap"), [about_scale, _ONLY_RESEARCH])
     groups = [
         sr.PlanarROIMeasurementsAndQualitativeEvaluations(
             tracking_identifier=sr.TrackingIdentifier(UID(), one.name),
