@@ -22,6 +22,7 @@ lint:
 docs:
 	python docs/settings_page.py
 	python docs/api_page.py
+	python docs/camera_programs.py
 	python docs/method_picture.py
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 

@@ -114,7 +114,7 @@ def test_a_list_called_calibration(lens: list[float], tmp_path: Path) -> None:
     assert read(tmp_path, text) == (OpenCvCamera(plane, tuple(lens)) if lens else plane)
 
 
-def opensfm(kind: str, **values: float) -> dict[str, Any]:
+def opensfm(kind: str, **values: float | str) -> dict[str, Any]:
     return {"v2 x": {"projection_type": kind, "width": 1350, "height": 1080, **values}}
 
 
@@ -131,6 +131,7 @@ def test_opensfm_counts_in_shares_of_the_longer_side_from_the_middle(tmp_path: P
     assert found.distortion == (-0.1, 0.02, 1e-3, 2e-3, 0.003)
     assert read(tmp_path, opensfm("perspective", focal=0.6, k1=0.0, k2=0.0), (1350, 1080)).central.fx == 810
     assert "'dual'" in refusal(tmp_path, opensfm("dual", focal=0.6), (1350, 1080))
+    assert "k1 must be a finite number" in refusal(tmp_path, opensfm("perspective", focal=0.6, k1=""), (1350, 1080))
 
 
 def meshroom(**values: Any) -> dict[str, Any]:
@@ -152,7 +153,7 @@ def test_meshroom_counts_in_mm_of_the_sensor(tmp_path: Path) -> None:
     assert "'3deanamorphic4'" in refusal(tmp_path, meshroom(type="3deanamorphic4"), (1350, 1080))
     newer = meshroom(type="pinhole", distortionType="radialk3", distortionParams=["0.1", "0.05", "-0.001"])
     assert read(tmp_path, newer, (1350, 1080)).distortion == (0.1, 0.05, 0.0, 0.0, -0.001)
-    assert "3 distortionParams" in refusal(tmp_path, meshroom(type="pinhole"), (1350, 1080))
+    assert "has 0 coefficients (none), found 3" in refusal(tmp_path, meshroom(type="pinhole"), (1350, 1080))
     assert "'equidistant'" in refusal(tmp_path, meshroom(type="equidistant"), (1350, 1080))
     assert "pixelRatio" in refusal(tmp_path, meshroom(pixelRatio="1.2"), (1350, 1080))
     both = meshroom()
@@ -166,6 +167,7 @@ def test_gyroflow_states_its_lens(tmp_path: Path) -> None:
     assert isinstance(read(tmp_path, {**profile, "distortion_model": "opencv_standard"}), OpenCvCamera)
     assert "'poly5'" in refusal(tmp_path, {**profile, "distortion_model": "poly5"})
     assert "stretched" in refusal(tmp_path, {**profile, "input_horizontal_stretch": 1.33})
+    assert read(tmp_path, {**profile, "input_horizontal_stretch": 0.0}) == FISHEYE  # not set
 
 
 def test_a_pose_beside_a_camera_is_no_distortion(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import yaml
 import scopemap
 import scopemap_bench
 from docs.api_page import api_page
+from docs.camera_programs import PAGE, programs_page
 from docs.method_picture import BANDS, FILE, LETTERS, lines_of, method_picture
 from scopemap import __version__
 from scopemap.cli.app import app
@@ -66,6 +67,11 @@ def test_the_page_of_the_interface_is_the_generated_one_and_has_every_public_nam
     shown = re.findall(r"^### (\w+)$", _text("docs/api.md"), flags=re.MULTILINE)
     assert sorted(shown) == sorted([*scopemap._HOMES, *scopemap_bench.__all__])
     assert set(scopemap.__all__) == set(scopemap._HOMES) | {"__version__"}
+
+
+def test_the_list_of_programs_is_that_of_their_table() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert page == programs_page(page), "docs/calibrate.md is out of date: python docs/camera_programs.py writes it"
 
 
 def test_the_diagram_of_the_method_is_the_drawn_one_and_fits_its_boxes() -> None:

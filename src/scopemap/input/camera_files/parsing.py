@@ -30,7 +30,7 @@ _LONGEST_QUOTE = 40
 _PASSED_OVER = re.compile(r"^camera1?\.|^cam_|[-_\s]+")
 _WORD_BREAK = re.compile(r"[-_.\s]+")
 _BARE_POINT = re.compile(r"(?<=\d)\.(?=[\s,\]}eE])")
-_SEPARATORS = str.maketrans(",;[]", "    ")
+SEPARATORS = str.maketrans(",;[]", "    ")
 _SECTION = re.compile(r"\[\s*([A-Za-z_][^\[\],\"']*)\]")
 _YAML_NODES = "[{*&!|>"
 _COMMENT = re.compile(r"(#|//|%|^\s*;).*")
@@ -64,10 +64,14 @@ class Fields:
     def nodes(self, names: Iterable[str]) -> Iterator[tuple[str, Any]]:
         """Yield spelling and node of each of `names`, same spelling first; `ValueError` where one is there twice."""
         for name in names:
-            found = self._by_name.get(plain_name(name), [])
+            found = self.called(name)
             if len({spelling for spelling, _ in found}) < len(found):
                 raise ValueError(f"{found[0][0][:_LONGEST_QUOTE]!r} is there twice: leave one out")
             yield from sorted(found, key=lambda pair: pair[0] != name)
+
+    def called(self, name: str) -> list[tuple[str, Any]]:
+        """Return spelling and node of all that have a name."""
+        return self._by_name.get(plain_name(name), [])
 
     def number(self, names: Iterable[str]) -> float | None:
         """Return the first of `names` that is a leaf, None where none is; `ValueError` where it is no finite number."""
@@ -165,7 +169,7 @@ def number_rows(text: str) -> list[list[float]] | None:
     commas = [word for word in words if "," in word]
     if commas and len(words) >= _LEAST_WITH_COMMA and all(map(_WITH_COMMA.fullmatch, words)):
         raise ValueError(f"it has decimal commas ({commas[0]}): write points")
-    lines = (line.translate(_SEPARATORS) for line in plain)
+    lines = (line.translate(SEPARATORS) for line in plain)
     try:
         return [row for line in lines if (row := [float(word) for word in line.split()])]
     except ValueError:
@@ -201,7 +205,7 @@ def _pair(part: str, yaml_nodes: str) -> tuple[str, str] | None:
     if not (separator and name and value) or value[0] in yaml_nodes:
         return None
     bare = value.strip("\"'")
-    return name, bare if is_number(bare) else value.translate(_SEPARATORS).strip()
+    return name, bare if is_number(bare) else value.translate(SEPARATORS).strip()
 
 
 def read_tree(text: str) -> Any:
@@ -210,7 +214,10 @@ def read_tree(text: str) -> Any:
     is_ini = bool(start == "[" and _SECTION.fullmatch(text.lstrip().splitlines()[0].strip()))
     try:
         if start == "<":
-            return _of_element(xml_root(text))
+            root = xml_root(text)
+            inner = _of_element(root)
+            # What the whole is called tells some programs' files.
+            return Fields([(f"<{root.tag}>", ""), *inner.pairs]) if isinstance(inner, Fields) else inner
         if is_ini or start not in ("{", "["):
             return named_values(text) or (_not_ini() if is_ini else _yaml(text))
         # OpenCV wrote numbers such as 318. into its JSON.
@@ -266,7 +273,11 @@ def xml_root(text: str) -> ElementTree.Element:
 
 
 def _of_element(element: ElementTree.Element) -> Any:
+    """Return the children of an element by their tags, and its attributes, where no child has the name of one."""
     inner = [(child.tag, _of_element(child)) for child in element]
-    if not inner:
-        return (element.text or "").strip()
-    return [node for _, node in inner] if all(tag == "_" for tag, _ in inner) else Fields(inner)
+    if inner and all(tag == "_" for tag, _ in inner):
+        return [node for _, node in inner]
+    text = (element.text or "").strip()
+    tags = {tag for tag, _ in inner}
+    attributes = [] if text and not inner else [pair for pair in element.items() if pair[0] not in tags]
+    return Fields([*inner, *attributes]) if inner or attributes else text

@@ -1,11 +1,11 @@
-"""Scaramuzza's lens in files: by name (C3VD's config.ini, ours, MATLAB's), and OCamCalib's `calib_results.txt`."""
+"""Scaramuzza's lens by the names that C3VD's config.ini and our own files have."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from scopemap.engine.cameras.lenses import OmnidirectionalCamera
-from scopemap.input.camera_files.calibration import Calibration, Size, check_size
+from scopemap.input.camera_files.calibration import Calibration, Size
 from scopemap.input.camera_files.parsing import MOST_TERMS, Fields
 from scopemap.input.camera_files.sizes import size_of
 
@@ -36,25 +36,6 @@ def omnidirectional_of(levels: Sequence[Fields], root: Fields, image_size: Size)
     size, note = size_of(levels, root, (0.0, 0.0, cx, cy), image_size)
     camera = OmnidirectionalCamera(tuple(polynomial), cx, cy, *(size or image_size), (c, d, e))
     return Calibration(camera, None, note, "stated" if size else "images")
-
-
-def of_ocamcalib(
-    polynomial: Sequence[float], centre: Sequence[float], affine: Sequence[float], size: Sequence[float]
-) -> OmnidirectionalCamera:
-    """Return the camera of the toolbox (Scaramuzza et al., IROS 2006).
-
-    Its numbers: a0 a1 ...; row, column of the centre, from 0; c d e; height, width. Its axes are x down, y right, z
-    backwards, and [[c, d], [e, 1]] takes (down, right) to (row, column). With right before down that is
-    [[1, e], [d, c]], divided by c what our camera has; rho is c times the toolbox' then. Raises `ValueError` where its
-    numbers are not the toolbox'.
-    """
-    (row, column), (c, d, e), (height, width) = centre, affine, size
-    first = polynomial[0] if 0 < len(polynomial) <= MOST_TERMS else 0.0
-    if first >= 0 or not 0.5 < c < 2:
-        begins = f"its polynomial begins with {first:g} and its affine part with {c:g}"
-        raise ValueError(f"{begins}: the toolbox writes a negative number and one near 1")
-    forward = tuple(-a * c ** (1 - power) for power, a in enumerate(polynomial))
-    return OmnidirectionalCamera(forward, column, row, *check_size(width, height), (1 / c, e / c, d / c))
 
 
 def _polynomial(place: Fields) -> list[float]:
