@@ -328,6 +328,7 @@ def test_a_compressed_bomb_is_not_unpacked(tmp_path: Path) -> None:
 def test_arrays_that_are_damaged_or_pickled_are_refused(tmp_path: Path) -> None:
     assert "its arrays cannot be read" in refusal(tmp_path, npz(K=np.eye(3))[:100])
     assert "its arrays cannot be read" in refusal(tmp_path, npy(np.array([{"fx": 1}])))
+    assert "its arrays cannot be read" in refusal(tmp_path, npy(np.eye(3)).replace(b"}", b" "))
     assert "no 3x3 camera matrix" in refusal(tmp_path, npz(K=np.array([{"fx": 1}])))
 
 

@@ -6,6 +6,7 @@ import io
 import zipfile
 import zlib
 from collections.abc import Mapping
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,11 @@ LARGEST_BYTES = 1 << 24
 _NPY = b"\x93NUMPY"
 _NPZ = b"PK\x03\x04"
 _DEEPEST = 3
-_DAMAGED = (ValueError, OSError, EOFError, KeyError, zlib.error, zipfile.BadZipFile, MemoryError, RuntimeError)
+# NumPy tokenizes the header as Python.
+_DAMAGED = (
+    ValueError, OSError, EOFError, KeyError, SyntaxError, TokenError, zlib.error, zipfile.BadZipFile, MemoryError,
+    RuntimeError,
+)  # fmt: skip
 
 
 def numpy_fields(content: bytes) -> Fields | None:
