@@ -15,6 +15,8 @@ from scopemap.engine.errors import InputError
 from scopemap.input.inputs import RemoteFile, is_address, named_inputs, remote_files
 from scopemap_bench.scripts.batch import CAMERA, write_videos
 
+pytestmark = pytest.mark.cluster
+
 QUICK = ["--set", "mapping.triangulate_depth=false"]
 
 

@@ -17,6 +17,8 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.tracking import alike
 from scopemap.engine.tracking.alike import AlikeFeatures, descriptors_at, network_answer
 
+pytestmark = pytest.mark.networks
+
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / "src" / "scopemap" / "engine" / "tracking" / "alike.onnx"
 RGB = plane_scene.see(plane_scene.pose()).rgb

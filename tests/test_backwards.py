@@ -19,6 +19,8 @@ from scopemap.engine.tracking.track import Track, TrackingLoss
 from scopemap.engine.tracking.tracker import Tracker
 from scopemap.result.result import Result
 
+pytestmark = pytest.mark.slow
+
 FRAMES, LOST = 16, range(6, 9)
 LIGHT = {
     "depth__files_kind": "depth",

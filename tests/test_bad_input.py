@@ -29,6 +29,8 @@ from scopemap.result.reference import reference_trajectory
 from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.datasets.survey import survey
 
+pytestmark = pytest.mark.slow
+
 Capture = pytest.CaptureFixture[str]
 LONG = "a folder with spaces, äöü 中文 and a long name " + "x" * 40
 NOBODY = 65534

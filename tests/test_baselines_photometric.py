@@ -22,6 +22,8 @@ from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.methods.baselines import SETTINGS, StandingStill, create_endo_depth_and_motion
 
+pytestmark = pytest.mark.slow
+
 PLAIN = {
     **{"mapis__frame_scale": "none", "mapis__blend": "none", "networks__flow": "none"},
     **{"mapping__method": "none", "fusion__enabled": False},

@@ -23,6 +23,8 @@ from scopemap.apps.batch.command import videos_of
 from scopemap.input.inputs import named_inputs
 from scopemap.report.batch_page import BatchRow, write_batch_page
 
+pytestmark = pytest.mark.slow
+
 QUICK = ["--set", "mapping.triangulate_depth=false"]
 
 

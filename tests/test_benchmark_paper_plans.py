@@ -7,8 +7,12 @@ import shutil
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
+import numpy as np
 from drawn_benchmarks import as_hamlyn, as_scared, as_scared_c, seen
 from front_door import call
 from small_networks import use_weights, write_weights
@@ -27,6 +31,8 @@ from scopemap_bench.plan import Plan, found_sequences, read_plan
 from scopemap_bench.result import RunResult
 from scopemap_bench.runner import run_entry, run_plan
 from scopemap_bench.tables import published_rows
+
+pytestmark = pytest.mark.networks
 
 OURS = ("scopemap", "scopemap, paper's depth", "paper's preset", "paper's preset, strict", "MDE (per-frame Depth Pro)")
 BASELINES = ("EDAM", "Park", "SB", "Po2Pl", "Po2Po")

@@ -20,6 +20,8 @@ from scopemap_bench.plan import Plan, read_plan
 from scopemap_bench.result import RunResult
 from scopemap_bench.runner import Benchmark, run_plan
 
+pytestmark = pytest.mark.slow
+
 PLAN = """
 title = "tiny"
 settings = { "networks.flow" = "dis", "networks.perceptual" = "structure", "fusion.voxel_mm" = 2.0 }

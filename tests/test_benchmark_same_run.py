@@ -5,6 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
 from front_door import call
 from small_networks import saved, small_depth_anything, use_weights, write_weights
 from tiny_phantom import write_tiny
@@ -12,6 +16,8 @@ from tiny_phantom import write_tiny
 from scopemap_bench.entry import Entry
 from scopemap_bench.plan import MethodPlan, ProtocolPlan, SequencePlan
 from scopemap_bench.runner import run_entry
+
+pytestmark = pytest.mark.networks
 
 FRAMES = 6
 # Without weights for them: flow by DIS, and structural similarity.

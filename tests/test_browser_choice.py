@@ -15,6 +15,8 @@ from scopemap.apps.browser.looking import LeftEarlier, Look, in_words, look, mea
 from scopemap.apps.browser.run_choice import RunChoice
 from scopemap.engine.errors import SettingsError
 
+pytestmark = pytest.mark.slow
+
 DEMO = Path(command.__file__).parents[1] / "demo" / "clip"
 
 

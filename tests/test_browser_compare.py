@@ -37,6 +37,8 @@ from scopemap.engine.geometry.se3 import so3_exp
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 
+pytestmark = pytest.mark.slow
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 # Without a graphics card: WebGL on the processor.
 ARGUMENTS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")

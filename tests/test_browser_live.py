@@ -33,6 +33,8 @@ from scopemap.engine.errors import InputError
 from scopemap.result.result import Result
 from scopemap.result.run_view import look, read_map, read_pictures, read_state, view_folder
 
+pytestmark = pytest.mark.slow
+
 PATIENCE_S = 240.0
 STATE = LiveState(
     state="lost",

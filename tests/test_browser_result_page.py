@@ -32,6 +32,8 @@ from scopemap.result.result import Result
 from scopemap.result.summary import summary_lines
 from scopemap.result.wording import facts_of_notices
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
 
 KNOWN = {"known": True, "source": "a ruler", "measured": True}

@@ -26,6 +26,8 @@ from scopemap.apps.browser.window import BrowserWindow, escaped, fenced
 from scopemap.apps.browser.workspace import Workspace
 from scopemap.cli.app import app
 
+pytestmark = pytest.mark.slow
+
 DEMO = Path(command.__file__).parents[1] / "demo" / "clip"
 
 

@@ -33,6 +33,8 @@ from scopemap.result.result import Result
 from scopemap.result.run_view import read_map, view_folder
 from scopemap.result.verdict import verdict
 
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 # Without a graphics card: WebGL on the processor.
 ARGUMENTS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")

@@ -12,6 +12,8 @@ from drawn_clips import Change, circle, clip, inside, text, write
 
 from scopemap.apps.inspect.inspecting import Inspection, inspect
 
+pytestmark = pytest.mark.slow
+
 
 def inspected(folder: Path, *changes: Change) -> Inspection:
     folder.mkdir(exist_ok=True)

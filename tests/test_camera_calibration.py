@@ -34,6 +34,8 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.lenses import OpenCvCamera
 from scopemap.engine.errors import CalibrationError, InputError, SettingsError
 
+pytestmark = pytest.mark.slow
+
 CHARUCO = CharucoBoard(7, 5, 4.0, 3.0)
 WRONG, BLURRED = 100, 101
 

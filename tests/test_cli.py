@@ -22,6 +22,8 @@ from tiny_phantom import FRAMES, SIZE, only_images, write_black, write_tiny
 from scopemap import __version__
 from scopemap.cli.app import app, main
 
+pytestmark = pytest.mark.slow
+
 Capture = pytest.CaptureFixture[str]
 JSON_KEYS = [
     "input",

@@ -23,6 +23,8 @@ from scopemap.input.trajectory.trajectory import write_kitti
 from scopemap.report.depth_figures import MASKED_GREY
 from scopemap_bench.result import RunResult
 
+pytestmark = pytest.mark.slow
+
 
 def run(*arguments: object, code: int = 0) -> object:
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])

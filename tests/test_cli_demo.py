@@ -17,6 +17,8 @@ from scopemap.apps.demo.demo import Demonstration
 from scopemap.engine.config import Config
 from scopemap.engine.models import weights
 
+pytestmark = pytest.mark.slow
+
 COUNT = 12
 
 

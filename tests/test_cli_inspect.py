@@ -11,6 +11,8 @@ import pytest
 from drawn_clips import clip, inset, text, write
 from front_door import call
 
+pytestmark = pytest.mark.slow
+
 Say = Callable[..., tuple[int, str, str]]
 
 

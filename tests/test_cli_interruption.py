@@ -22,6 +22,8 @@ from scopemap.input.sequence import Sequence
 from scopemap.result.trajectories import read_trajectory
 from scopemap.terminal.interruption import Interruption
 
+pytestmark = pytest.mark.slow
+
 STOPPED = FRAMES - 3
 
 

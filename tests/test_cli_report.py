@@ -8,6 +8,8 @@ import pytest
 from front_door import call, refused
 from tiny_phantom import FRAMES, write_tiny
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_report_is_made_again_with_pictures_from_the_input(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     folder, out = write_tiny(tmp_path / "phantom"), tmp_path / "out"

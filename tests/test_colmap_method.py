@@ -16,6 +16,8 @@ from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 from scopemap_bench.plan import MethodPlan
 
+pytestmark = pytest.mark.slow
+
 COLMAP = MethodPlan(name="COLMAP", use="colmap")
 
 

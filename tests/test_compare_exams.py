@@ -31,6 +31,8 @@ from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 
+pytestmark = pytest.mark.slow
+
 CAMERA_FACTS = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
 ANOTHER_WORLD = Similarity(1.3, so3_exp(np.array([0.2, -0.5, 0.9])), np.array([30.0, -8.0, 4.0]))
 SPOT_MM, BUMP_MM, RADIUS_MM, RISE_MM = np.array([8.0, 4.0]), np.array([-8.0, -5.0]), 4.0, 2.5

@@ -12,6 +12,8 @@ from scopemap.engine.frame import Frame
 from scopemap_bench.scripts import depth_without_download as bench
 from scopemap_bench.scripts.depth_without_download import drawn
 
+pytestmark = pytest.mark.networks
+
 CAMERA = PinholeCamera(50.0, 50.0, 31.5, 23.5, 64, 48)
 SHAPE = (300, 400)
 

@@ -6,8 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
+import numpy as np
 import torch
 from small_networks import saved, small_depth_anything, small_depth_pro
 
@@ -20,6 +24,8 @@ from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.errors import WeightsError
 from scopemap.engine.frame import Frame
 from scopemap.runner.depth_backends import create_anchor, create_depth
+
+pytestmark = pytest.mark.networks
 
 HEIGHT, WIDTH = 50, 61
 

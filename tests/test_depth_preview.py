@@ -22,6 +22,8 @@ from scopemap.result.result import Result
 from scopemap.result.summary import summary_lines
 from scopemap.result.wording import scale_words
 
+pytestmark = pytest.mark.slow
+
 UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
 
 

@@ -6,9 +6,13 @@ import math
 from importlib.metadata import version
 from pathlib import Path
 
+import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
 import cv2
 import numpy as np
-import pytest
 import torch
 from torch import nn
 
@@ -26,6 +30,8 @@ from scopemap.engine.models import weights
 from scopemap.runner.depth_backends import create_depth
 from training.export import export
 from training.network import ScopeNet
+
+pytestmark = pytest.mark.networks
 
 HEIGHT, WIDTH = 50, 61  # no multiple of anything
 CAMERA = PinholeCamera(40.0, 42.0, 28.0, 26.0, WIDTH, HEIGHT)

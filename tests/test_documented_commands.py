@@ -18,6 +18,8 @@ from scopemap.apps.demo import demo as demonstration
 from scopemap.cli.app import app
 from scopemap_bench.scripts.demo_clip import SPEC, write_clip
 
+pytestmark = pytest.mark.slow
+
 # ClickException, wherever typer has it.
 REFUSED = next(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")
 ABOUT_THE_DEMO = re.compile(r"scopemap-demo/")

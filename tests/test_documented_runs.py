@@ -19,6 +19,8 @@ from front_door import call
 from scopemap.apps.demo import demo as demonstration
 from scopemap_bench.scripts.demo_clip import SPEC, write_clip
 
+pytestmark = pytest.mark.slow
+
 ONLY_PARSED = {
     r"^bench (?!speed my)|^datasets|^climb|SCARED|CLIMB|CLIP|FOLDER|/archive/": "data sets and benchmarks are not here",
     r"^models pull": "downloads",

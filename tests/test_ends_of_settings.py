@@ -14,6 +14,8 @@ from tiny_phantom import write_tiny
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.engine.errors import InputError, SettingsError
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 30
 QUICK = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 3}
 NEEDS_MORE = {

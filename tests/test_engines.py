@@ -27,6 +27,8 @@ from scopemap.engine.errors import InputError
 from scopemap.runner.processes import THREADS, ProcessLimits, run_in_processes, usable_cores
 from scopemap_bench.scripts.batch import POISONED, single_runs, trial, write_videos
 
+pytestmark = pytest.mark.cluster
+
 NEEDS = WorkerNeeds(cores=1, memory_gb=0.5)
 CLUSTER = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("ray", "moto", "s3fs")),

@@ -8,10 +8,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-import nbformat
 import pytest
+from extras import DEV
+
+pytest.importorskip("nbclient", reason=DEV)
+
+import nbformat
 from nbclient import NotebookClient
 from tiny_phantom import write_tiny
+
+pytestmark = pytest.mark.dev
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 PROMISED = {

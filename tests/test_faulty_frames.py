@@ -27,6 +27,8 @@ from scopemap.input.depth_files import FilesDepth
 from scopemap.input.images import ImageFolder
 from scopemap.input.source import Source
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

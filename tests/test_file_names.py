@@ -16,6 +16,8 @@ from tiny_phantom import write_tiny
 from scopemap.result import result_folder
 from scopemap.result.depth_maps import DepthReader
 
+pytestmark = pytest.mark.slow
+
 SOURCE = Path(__file__).resolve().parents[1] / "src" / "scopemap"
 NAME = "Jörg, 内視鏡 №1"
 """Of a folder: with letters that no single code page of Windows has."""

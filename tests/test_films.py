@@ -15,6 +15,8 @@ from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.report.films import write_turntable
 from scopemap.result.result import Result
 
+pytestmark = pytest.mark.slow
+
 
 def pictures_of(film: Path) -> list[np.ndarray]:
     with av.open(str(film)) as container:

@@ -6,9 +6,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
 import cv2
 import numpy as np
-import pytest
 import torch
 from torchvision.models.optical_flow import raft_large, raft_small
 
@@ -18,6 +22,8 @@ from scopemap.engine.flow.estimator import agree, pair_flow
 from scopemap.engine.flow.flows import create_flow
 from scopemap.engine.flow.raft import RaftFlow, torchvision_names
 from scopemap.engine.geometry.warp import pull
+
+pytestmark = pytest.mark.networks
 
 SHAPE = (140, 171)
 

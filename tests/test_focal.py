@@ -28,6 +28,8 @@ from scopemap.input.sequence import Sequence
 from scopemap.result.wording import in_words
 from scopemap.runner.reconstruct import reconstruct
 
+pytestmark = pytest.mark.slow
+
 HALF_PX = 160.0
 ROTATION_DEG, TRANSLATION = (6.0, 4.0, 2.0), (0.25, -0.15, 0.1)
 

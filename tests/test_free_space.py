@@ -16,6 +16,8 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.free_space import FreeSpace, views_among
 from scopemap.engine.geometry.se3 import se3, so3_exp
 
+pytestmark = pytest.mark.slow
+
 CAMERA = PinholeCamera(150.0, 150.0, 119.5, 89.5, 240, 180)
 WALL_MM, FRONT_MM, WIDTH_MM = 60.0, 40.0, 12.0
 RED, PALE, GREY = (150, 60, 50), (200, 170, 120), (120, 120, 125)

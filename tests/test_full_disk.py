@@ -15,6 +15,8 @@ from scopemap import open_sequence, reconstruct
 from scopemap.engine.errors import InputError
 from scopemap.result.result_folder import UNFINISHED
 
+pytestmark = pytest.mark.slow
+
 _LIMITED = """
 import resource, signal, sys
 from scopemap.cli.app import main

@@ -18,6 +18,8 @@ from scopemap.engine.frame import Frame, Rows
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion, TsdfVolume, choose_parameters, depth_notices
 
+pytestmark = pytest.mark.slow
+
 VIEW = PinholeCamera(150.0, 150.0, 79.5, 59.5, 160, 120)
 
 

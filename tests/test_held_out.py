@@ -36,6 +36,8 @@ from scopemap.result.summary import summary_lines
 from scopemap.terminal.figures import show
 from scopemap_bench.evaluation.surface import distances_mm
 
+pytestmark = pytest.mark.slow
+
 CAMERA = PinholeCamera(60.0, 60.0, 39.5, 31.5, 80, 64)
 BLACK = np.zeros((64, 80, 3), np.uint8)
 

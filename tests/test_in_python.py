@@ -14,6 +14,8 @@ import scopemap_bench
 from scopemap import Reconstructor, evaluate_poses, open_sequence, read_trajectory, reconstruct
 from scopemap.engine.errors import ScopemapError
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def phantom(tmp_path_factory: pytest.TempPathFactory) -> Path:

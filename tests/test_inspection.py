@@ -37,6 +37,8 @@ from scopemap.input.mask_files import MaskFiles
 from scopemap.input.opening import open_sequence, open_source
 from scopemap.input.scopes import SCOPES
 
+pytestmark = pytest.mark.slow
+
 COUNT = 50
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
+import numpy as np
 import torch
 from pipeline_steps import stepped
 from tiny_phantom import write_tiny
@@ -25,6 +29,8 @@ from scopemap.engine.pipeline import Pipeline
 from scopemap.input.mask_files import create_masks
 from scopemap.runner.estimators import create_estimators
 from training.export import read_network
+
+pytestmark = pytest.mark.networks
 
 HEIGHT, WIDTH = 70, 94
 CAMERA = PinholeCamera(60.0, 60.0, 47.0, 35.0, WIDTH, HEIGHT)

@@ -24,6 +24,8 @@ from scopemap.input.scopes import KINDS, SCOPES
 from scopemap.result.verdict import verdict
 from scopemap.runner.reconstruct import reconstruct
 
+pytestmark = pytest.mark.slow
+
 HALF_PX, POINTS = 160.0, 150
 FORWARD = {"rotation_deg": (0.0, 0.0, 0.0), "translation": (0.05, -0.03, 0.3)}
 TURNING = {"rotation_deg": (6.0, 4.0, 2.0), "translation": (0.25, -0.15, 0.1)}

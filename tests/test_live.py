@@ -30,6 +30,8 @@ from scopemap.input.live_source import LiveSource
 from scopemap.input.opening import sequence_of
 from scopemap.result.result import Result
 
+pytestmark = pytest.mark.slow
+
 FPS = 10
 SETTINGS = {"input.focal": "assume", "fusion.every": 1}
 

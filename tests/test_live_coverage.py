@@ -26,6 +26,8 @@ from scopemap.result.depth_maps import DepthReader, DepthWriter
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.result import Result
 
+pytestmark = pytest.mark.slow
+
 NO_SURFACE = "the run so far has no surface"
 
 

@@ -17,6 +17,8 @@ from scopemap.engine.geometry.se3 import inverse, se3_exp
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
 from scopemap.engine.mapping.local_adjustment import LocalAdjustment
 
+pytestmark = pytest.mark.slow
+
 LOCAL = MappingSettings(method="local")
 COUNT, SLIDING = 9, 2.5
 BEND = np.linspace(-0.15, 0.15, plane_scene.CAMERA.width, dtype=np.float32)  # of ln depth, over the columns

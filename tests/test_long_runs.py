@@ -24,6 +24,8 @@ from scopemap.engine.tracking.track import Track
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.result.frame_table import ROW, FrameTable, GrowingFrameTable
 
+pytestmark = pytest.mark.slow
+
 
 def _row(number: int) -> dict[str, Any]:
     T = plane_scene.pose(at_mm=(float(number), 1.0, 2.0))

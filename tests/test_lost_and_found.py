@@ -20,6 +20,8 @@ from scopemap.engine.tracking import keyframe_alignment, relocalisation
 from scopemap.engine.tracking.track import Track
 from scopemap.engine.tracking.tracker import Tracker
 
+pytestmark = pytest.mark.slow
+
 
 def _settings(**changes: Any) -> TrackingSettings:
     return TrackingSettings(keyframe_every=3, finest_level=0, **changes)

@@ -38,6 +38,8 @@ from scopemap_bench.datasets.c3vd import C3vdFolder
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 
+pytestmark = pytest.mark.slow
+
 FIRST, SECOND, LOST_BEFORE_NEW = 10, 13, 2
 LIGHT = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__new_map_after": LOST_BEFORE_NEW}
 

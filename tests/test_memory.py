@@ -24,6 +24,8 @@ from scopemap.engine.mapping.mapper import MOST_OBSERVATIONS
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.network_cost import network_cost
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -27,6 +27,8 @@ from scopemap.runner.estimators import create_estimators, largest_depth_mm
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 
+pytestmark = pytest.mark.slow
+
 CAMERA = PinholeCamera(160.0, 160.0, 159.5, 119.5, 320, 240)
 MOTION = se3_exp(np.array([0.01, -0.02, 0.01, 2.0, 0.5, -1.0]))
 COUNT = 800

@@ -20,6 +20,8 @@ from scopemap.runner.depth_backends import create_depth
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import write_phantom
 
+pytestmark = pytest.mark.slow
+
 PACKAGES = ("torch", "torchvision", "transformers", "huggingface_hub", "safetensors", "lpips")
 COMMAND = f"""
 import sys

@@ -14,6 +14,8 @@ from scopemap.engine.mapping.bundle_problem import BundleProblem, Observations, 
 from scopemap.engine.mapping.judge import ShapeTest
 from scopemap.engine.mapping.other_starts import with_other_starts
 
+pytestmark = pytest.mark.slow
+
 FOCAL_PX = 400.0  # 320 px wide: 44 degrees, as a laparoscope's
 SEEN_PX = np.array([160.0, 128.0])
 NOISE_PX = 0.2

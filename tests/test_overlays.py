@@ -16,6 +16,8 @@ from scopemap.engine.masking.masker import Masker
 from scopemap.engine.masking.overlays import OverlayFinder
 from scopemap.input.opening import open_sequence
 
+pytestmark = pytest.mark.slow
+
 CAMERA = PinholeCamera(300.0, 300.0, 159.5, 119.5, *SIZE)
 EVERYWHERE = np.ones(SIZE[::-1], bool)
 

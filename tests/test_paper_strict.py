@@ -7,8 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
+import numpy as np
 from plane_scene import CAMERA, EVERYWHERE, pose, see
 from small_networks import saved, small_depth_anything, small_depth_pro
 from tiny_phantom import FRAMES, only_images, write_tiny
@@ -22,6 +26,8 @@ from scopemap.engine.flow.flows import create_flow
 from scopemap.engine.frame import Frame
 from scopemap.engine.odometry import Step
 from scopemap.engine.tracking.tracker import Tracker
+
+pytestmark = pytest.mark.networks
 
 PAPER, STRICT = Config.load("paper"), Config.load("paper-strict")
 BEYOND = {key: value for key, value in PRESETS["paper-strict"].items() if PRESETS["paper"].get(key) != value}

@@ -8,11 +8,14 @@ import threading
 from pathlib import Path
 from types import FrameType
 
+import pytest
 from tiny_phantom import write_tiny
 
 import scopemap
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.engine.frame import Frame
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = Path(scopemap.__file__).parent

@@ -6,14 +6,20 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
 import cv2
 import numpy as np
-import pytest
 import torch
 
 from scopemap.engine.depth.perceptual import LpipsAlex, create_perceptual
 from scopemap.engine.errors import SettingsError, WeightsError
 from scopemap.engine.geometry.similarity import structural_similarity
+
+pytestmark = pytest.mark.networks
 
 SHAPE = (70, 93, 3)
 

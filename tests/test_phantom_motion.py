@@ -19,6 +19,8 @@ from scopemap_bench.phantom.slit import in_wound
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import DISPLACEMENT, write_phantom
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 13
 MOVED = {
     "several": PhantomSpec(deform=True, breath_frames=8.0, events=parse_events("peristalsis:0-12")),

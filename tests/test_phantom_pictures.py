@@ -25,6 +25,8 @@ from scopemap_bench.phantom.shading import VideoCoding, develop, lagging_gains, 
 from scopemap_bench.phantom.spec import PhantomSpec, parse_events
 from scopemap_bench.phantom.writer import write_phantom
 
+pytestmark = pytest.mark.slow
+
 # ---- the camera: motion blur, exposure, coding, lens
 
 

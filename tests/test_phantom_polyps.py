@@ -14,6 +14,8 @@ from scopemap_bench.phantom.render import prepare, render_frame
 from scopemap_bench.phantom.spec import PhantomSpec, Polyp, parse_polyps
 from scopemap_bench.phantom.writer import write_phantom
 
+pytestmark = pytest.mark.slow
+
 PLAIN = PhantomSpec(frames=3, width=128, height=96, seed=203)
 SPEC = PhantomSpec(
     frames=3, width=128, height=96, seed=203, polyps=parse_polyps("sessile:8@1,flat:6@2,pedunculated:6@0")

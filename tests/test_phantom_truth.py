@@ -14,6 +14,8 @@ from scopemap_bench.phantom.render import Phantom, build_scene, camera_path, pre
 from scopemap_bench.phantom.spec import PhantomSpec
 from scopemap_bench.phantom.writer import seen_surface
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"width": 96, "height": 80, "frames": 12}
 
 

@@ -26,6 +26,8 @@ from scopemap.engine.tracking.track import KeyframeDecision, Track
 from scopemap.result.trajectories import read_trajectory
 from scopemap.runner.estimators import create_estimators
 
+pytestmark = pytest.mark.slow
+
 WITHOUT_NETWORKS = {"networks__flow": "dis", "networks__perceptual": "structure"}
 WEMA = {"smoothing__method": "wema", "smoothing__dynamic": False}
 OK = ["ok"] * FRAMES

@@ -11,6 +11,8 @@ from tiny_phantom import SIZE, only_images, write_tiny
 from scopemap import Config, open_sequence, reconstruct
 from scopemap.engine.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 WITHOUT_NETWORKS = {"networks.flow": "dis", "networks.perceptual": "structure"}
 
 

@@ -20,6 +20,8 @@ from scopemap.result.depth_maps import DepthReader
 from scopemap.result.result import Result
 from scopemap.runner.estimators import create_estimators
 
+pytestmark = pytest.mark.slow
+
 LOST, FRAMES = 8, 14
 EXPONENT = 1.3
 SETTINGS = {"networks__flow": "dis", "networks__perceptual": "structure", "tracking__keyframe_every": 2}

@@ -13,6 +13,8 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.tracking.track import KeyframeDecision
 from scopemap.engine.tracking.tracker import Tracker
 
+pytestmark = pytest.mark.slow
+
 LOST, FRAMES = 4, 9
 # True depth that is said to be predicted, so that MAPIS links the frames.
 SETTINGS = {

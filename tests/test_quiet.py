@@ -26,6 +26,8 @@ from tiny_phantom import only_images, write_tiny
 
 from scopemap.cli.app import app
 
+pytestmark = pytest.mark.slow
+
 # Of the environment, for nothing else may switch telemetry off: the runtime is quiet where it finds a CI's variables.
 KEPT = {"PATH", "SYSTEMROOT", "LANG", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR"}
 # Each command says its name before it begins: what ends the process is that of the last one named.

@@ -31,6 +31,8 @@ from scopemap.result.depth_maps import DEPTH_SCALE_MM, DepthReader, DepthWriter
 from scopemap.result.trajectories import read_trajectory
 from scopemap.result.verdict import verdict
 
+pytestmark = pytest.mark.slow
+
 COLUMNS = "index time_s name status reason map segment keyframe residual inlier_share correlation overlap iterations"
 COLUMNS += " depth_scale warped_share usable sharpness motion quality cause orientation"
 COLUMNS += " moving_share moving_x moving_y"

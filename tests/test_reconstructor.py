@@ -19,6 +19,8 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.finish import finished
 from scopemap.runner.provenance import Limits
 
+pytestmark = pytest.mark.slow
+
 CAMERA = PinholeCamera(100.0, 100.0, 79.5, 63.5, 160, 128)
 FRAMES = 6
 

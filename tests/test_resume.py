@@ -25,6 +25,8 @@ from scopemap.result.result_folder import LOCK, UNFINISHED
 from scopemap.runner.checkpoints import can_resume, check_resumable, discard_unfinished, identity_of
 from scopemap.runner.observers import RunStopped
 
+pytestmark = pytest.mark.slow
+
 # Seconds, and sums of files that hold some.
 _OF_ITS_TIME = {"provenance.json", "SHA256SUMS"}
 

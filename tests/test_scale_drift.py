@@ -21,6 +21,8 @@ from scopemap.engine.mapping.judge import LensTest
 from scopemap.engine.mapping.keyframes import path_without_drift
 from scopemap.engine.mapping.mapper import Backend
 
+pytestmark = pytest.mark.slow
+
 
 def _tracked(log_scale: np.ndarray, map_number: int = 0) -> list[TrackedPose]:
     """A straight path of steps of 1 mm, times the scale of each."""

@@ -26,6 +26,8 @@ from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.depth.scopenet.estimator import ScopeNetDepth
 from scopemap.engine.frame import Frame
 
+pytestmark = pytest.mark.slow
+
 # Of the core; what each allows: use, change and distribution, also in closed programs.
 PERMISSIVE = {
     *("0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0"),

@@ -20,6 +20,8 @@ from scopemap.input.frame_choice import FrameChoice
 from scopemap.input.source import SourceFrame
 from scopemap.result.trajectories import read_trajectory
 
+pytestmark = pytest.mark.slow
+
 FAST = ("--preset", "realtime", "--quiet")
 
 

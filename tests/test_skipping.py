@@ -16,6 +16,8 @@ from scopemap.engine.preprocessing import DepthTurns
 from scopemap.input.picture_difference import is_at_rest
 from scopemap.result.depth_maps import DepthReader
 
+pytestmark = pytest.mark.slow
+
 FRAMES = 24
 BLACK, WALL = {4, 5, 6}, set(range(7, 20))
 PASSED_OVER = {17, 18, 19}  # the first ten of a wall are looked at

@@ -18,6 +18,8 @@ from scopemap.engine.errors import InputError
 from scopemap_bench import speed
 from scopemap_bench.speed import STAGES, Speed, measure_speed, read_speed, resolved
 
+pytestmark = pytest.mark.slow
+
 
 def _functions() -> list[Callable[..., Any]]:
     owners = [resolved(place) for places in STAGES.values() for place in places]

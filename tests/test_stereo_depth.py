@@ -35,6 +35,8 @@ from scopemap.runner.depth_backends import create_depth
 from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.phantom.spec import PhantomSpec
 
+pytestmark = pytest.mark.slow
+
 PAIR = StereoPair(LEFT, LEFT, beside(), "")
 BENT_PAIR = StereoPair(LEFT, BENT, T_BENT, "")
 SIZE = (WIDTH, HEIGHT)

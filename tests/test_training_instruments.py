@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+from extras import DEV
+
+pytest.importorskip("onnx", reason=DEV)
+
 import numpy as np
 import onnx
-import pytest
 from drawn_buffers import HEIGHT, WIDTH, sphere
 from onnx import numpy_helper
 
@@ -15,6 +19,8 @@ from scopemap.engine.depth.scopenet import estimator as module
 from training.instrument_layers import Layer, LayerStore, render_layer, render_layers
 from training.instrument_samples import make_instrument_sample
 from training.instruments import main
+
+pytestmark = pytest.mark.dev
 
 SHIPPED = Path(module.__file__).parent / module.WEIGHTS_NAME
 

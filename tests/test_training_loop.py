@@ -8,8 +8,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
+import numpy as np
 import torch
 from drawn_buffers import HEIGHT, WIDTH, sphere
 
@@ -21,6 +25,8 @@ from training.network import TYPICAL_LOG_MM, ScopeNet
 from training.recipe import Part, Recipe, Use
 from training.report import LOOKS, write_report
 from training.train import Training
+
+pytestmark = pytest.mark.networks
 
 SMALL = Part("small", WIDTH, HEIGHT, 4)
 HELD_OUT = Part("held-out", WIDTH, HEIGHT, 3)

@@ -1,11 +1,17 @@
 """The loss: zero where the network is right up to one factor, blind to what is unknown, differentiable everywhere."""
 
-import numpy as np
 import pytest
+from extras import NETWORKS
+
+pytest.importorskip("torch", reason=NETWORKS)
+
+import numpy as np
 import torch
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from training.losses import Weights, loss_parts, total
+
+pytestmark = pytest.mark.networks
 
 
 @pytest.fixture

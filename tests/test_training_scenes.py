@@ -16,6 +16,8 @@ from training.scene import COLON, KINDS, LAPAROSCOPY, SINUS, Scene
 from training.shapes import ELLIPSOID, shape_row
 from training.viewpoint import random_camera
 
+pytestmark = pytest.mark.slow
+
 SIZE = (32, 40)
 CAMERA = np.array([0, 24.0, 24.3, 19.0, 16.2, 40, 32], np.float32)
 

@@ -18,6 +18,8 @@ from scopemap.report.page import keep_measurements, write_report
 from scopemap.result import checksums
 from scopemap.result.checksums import SUMS, input_checksum
 
+pytestmark = pytest.mark.slow
+
 Capture = pytest.CaptureFixture[str]
 
 

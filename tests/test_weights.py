@@ -17,6 +17,8 @@ from scopemap.engine.models import weights
 from scopemap.engine.models.device import choose_device
 from scopemap.engine.models.weights import REGISTRY, Checkpoint, find
 
+pytestmark = pytest.mark.networks
+
 CONTENT = b"not really a network"
 TOY = Checkpoint(
     name="toy",
