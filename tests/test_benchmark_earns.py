@@ -36,6 +36,7 @@ def test_each_idea_is_another_value_of_a_constant_of_the_engine() -> None:
         assert known != ast.literal_eval(value)
 
 
+@pytest.mark.slow
 def test_a_constant_is_changed_for_one_run(tmp_path: Path) -> None:
     clip = RealClip("a clip", write_tiny(tmp_path / "phantom"), arguments=("--frames", "0:2"))
     earns.run_with(clip, "tracking.tracker._PATIENCE=0", tmp_path / "run")
@@ -50,6 +51,7 @@ def test_the_phantoms_are_eight_and_those_of_the_other_tables() -> None:
     assert all({"--scene", "--frames", "--seed"} <= set(words) for words in found.values())
 
 
+@pytest.mark.slow
 def test_a_cell_has_the_error_of_the_path_and_the_verdict_or_that_the_run_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,6 +51,7 @@ def measured(table: Path) -> dict[str, str]:
     return {head.partition(" [")[0]: text for head, text in row.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "columns"), [("table1", 13), ("table2", 10), ("table3", 9)])
 def test_figures_are_those_by_hand(name: str, columns: int, folder: Path) -> None:
     radians, degrees = (measured(folder / unit / "tables" / f"{name}.csv") for unit in ("rad", "deg"))

@@ -248,6 +248,7 @@ def test_results_that_were_kept_give_the_same_tables(tmp_path: Path) -> None:
     assert {name: table.csv() for name, table in before.items()} == {name: table.csv() for name, table in after.items()}
 
 
+@pytest.mark.slow
 def test_files_hold_what_the_tables_say(tmp_path: Path) -> None:
     files = write_tables(RESULTS, tmp_path, title="Colon_", notes=["hamlyn: *not* there"])
     names = [table.name for table in benchmark_tables(RESULTS)]

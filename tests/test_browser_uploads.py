@@ -125,6 +125,7 @@ def send(client: Client, handle: Any, name: str, content: bytes, number: str) ->
     client.part(handle, 0, content, number)
 
 
+@pytest.mark.slow
 def test_a_calibration_is_sent_and_chosen(opened: tuple[BrowserWindow, Workspace, Client]) -> None:
     window, workspace, client = opened
     for name in ("colon.mp4", "camera.yaml"):

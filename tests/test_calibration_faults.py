@@ -78,6 +78,7 @@ def refused(file: Path) -> str:
     return message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bomb", [*BOMBS, *BINARY])
 def test_bombs(bomb: str, tmp_path: Path) -> None:
     (tmp_path / "bomb").write_bytes(BINARY.get(bomb) or BOMBS[bomb].encode())
@@ -101,6 +102,7 @@ def test_a_pipe_and_a_loop_are_not_waited_for(tmp_path: Path) -> None:
         assert name in refused(tmp_path / name)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the limit of memory is Linux' own")
 @pytest.mark.parametrize("bomb", ["aliases", "entities", "brackets", "elements", "many elements", "many rows"])
 def test_bombs_take_little_memory(bomb: str, tmp_path: Path) -> None:

@@ -320,6 +320,7 @@ def test_mat_files_that_cannot_be_read_are_one_sentence(content: bytes, message:
     assert "\n" not in refusal(tmp_path, content)
 
 
+@pytest.mark.slow
 def test_a_compressed_bomb_is_not_unpacked(tmp_path: Path) -> None:
     assert "larger than any calibration" in refusal(tmp_path, bomb())
     assert "larger than any calibration" in refusal(tmp_path, npz(K=np.zeros(40_000_000)))

@@ -82,6 +82,7 @@ def test_a_calibration_that_every_command_reads(calibrate: Say, frames: Path, tm
     assert {"frame", "name", "corners", "rms_px", "tilt_deg", "distance_mm"} == set(told["views"][0])
 
 
+@pytest.mark.slow
 def test_two_views_in_a_picture_are_read_as_a_run_reads_them(calibrate: Say, frames: Path, tmp_path: Path) -> None:
     pictures = [read_image(file) for file in sorted(frames.iterdir())[::2]]
     both = [np.hstack([left, np.roll(left[::-1], 12, axis=1)]) for left in pictures]

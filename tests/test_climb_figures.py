@@ -101,6 +101,7 @@ def test_the_scores_are_those_made_by_hand(
     assert (score.ate, score.rotation) == pytest.approx(by_hand)
 
 
+@pytest.mark.slow
 def test_a_run_that_says_how_long_it_took_has_a_score(tmp_path: Path) -> None:
     true = path_of(300)
     truth = write_reference(tmp_path / "truth", true)

@@ -64,6 +64,7 @@ def test_a_run_without_its_time_is_a_failed_one(truths: Path, tmp_path: Path) ->
     assert "Seq_000_a" in ranking_of(out, truths).failed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", ["timestamp", "tx", "tz", "qw", "qz"])
 @pytest.mark.parametrize("value", ["nan", "inf"])
 def test_a_number_that_is_none_costs_its_frame_and_no_more(
@@ -88,6 +89,7 @@ def test_a_number_that_is_none_costs_its_frame_and_no_more(
     assert one.rotation == pytest.approx(whole.rotation * (1 + 0.5 * lost / FRAMES), abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stamp", "weight"), [("0", 1.5), ("nan", 1.5), ("inf", 1.5), (None, 1.0)])
 def test_time_stamps_that_tell_no_interval_cost_the_whole_weight_of_the_time(
     stamp: str | None, weight: float, truths: Path, tmp_path: Path
@@ -145,6 +147,7 @@ def test_a_benchmark_ranks_its_methods_by_the_rule() -> None:
     assert "untimed" not in table.markdown()
 
 
+@pytest.mark.slow
 def test_the_command_scores(truths: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "submission"
     write_runs(out / "Seq_000_a", path_of(FRAMES, 0), [0.0] * 5)

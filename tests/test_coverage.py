@@ -78,6 +78,7 @@ def holed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_run(tmp_path_factory.mktemp("holed") / "run", without(tube(), in_hole), ALONG_THE_TUBE)
 
 
+@pytest.mark.slow
 def test_a_hole_in_a_tube_is_found_where_it_is(whole: Path, holed: Path) -> None:
     found, full = coverage(holed), coverage(whole)
     assert isinstance(found.layout, Lumen)
@@ -100,6 +101,7 @@ def test_a_hole_in_a_tube_is_found_where_it_is(whole: Path, holed: Path) -> None
     assert around[0].share == max(part.share for part in found.segments[1:])
 
 
+@pytest.mark.slow
 def test_a_lid_over_an_open_end_is_no_wall(whole: Path, tmp_path: Path) -> None:
     bottom = 84.9  # the tube has one at its far end, which was seen
     opened = coverage(
@@ -225,6 +227,7 @@ def test_a_hole_in_a_bowl_is_found_in_its_direction(tmp_path: Path) -> None:
     assert "from the mean direction of view" in str(found)
 
 
+@pytest.mark.slow
 def test_the_command_writes_figures_map_and_picture(holed: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert call("coverage", holed) == 0
     said = capfd.readouterr().out
@@ -270,6 +273,7 @@ def test_a_known_scale_gives_millimetres(tmp_path: Path) -> None:
     assert found.facts["unit"] == found.facts["along_unit"] == "mm"
 
 
+@pytest.mark.slow
 def test_an_assumed_lens_and_moving_tissue_are_a_caution(holed: Path, tmp_path: Path) -> None:
     moved = {"frames": 20, "measured": 30, "most": 3.0, "share": 0.5, "threshold": 0.1, "x": 0.5, "y": 0.5}
     assumed = {"camera": drawn_result().provenance["camera"] | {"origin": "assumed"}}
@@ -296,6 +300,7 @@ def write_truth(folder: Path, positions_mm: np.ndarray) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_result_is_measured_against_c3vds_coverage_mesh(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

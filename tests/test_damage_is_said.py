@@ -10,6 +10,8 @@ from front_door import call
 
 from scopemap.result.checksums import changed_files, write_checksums
 
+pytestmark = pytest.mark.slow
+
 COMMANDS = {
     "report": ("report", "RUN"),
     "export": ("export", "RUN", "--to", "ply", "--out", "OUT/a.ply"),

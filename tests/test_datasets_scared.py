@@ -340,6 +340,7 @@ def test_what_scared_cannot_read_is_one_sentence(spoil: Edit, message: str, keyf
     assert str(keyframe) in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

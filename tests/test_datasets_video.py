@@ -88,6 +88,7 @@ def test_pictures_are_turned_as_they_are_to_be_shown(
     assert all(one.shape == expected[0].shape for one in source.samples(4))
 
 
+@pytest.mark.slow
 def test_pictures_that_were_read_do_not_wait_for_the_garbage_collector(tmp_path: Path) -> None:
     source = VideoFile(encode(tmp_path / "v.mp4", [tissue(number, (160, 96)) for number in range(12)]))
     gc.collect()

@@ -127,6 +127,7 @@ def _shape_error(frame: Frame, factors: np.ndarray) -> float:
     return float(np.abs(off - np.median(off)).mean())
 
 
+@pytest.mark.slow
 def test_distorted_depth_of_a_plane_seen_from_six_poses_is_corrected() -> None:
     frames = [_bent(number) for number in range(6)]
     results = {}

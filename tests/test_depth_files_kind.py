@@ -83,6 +83,7 @@ INVERSE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", INVERSE)
 def test_the_first_frames_tell_inverse_depth(form: str, phantom: Path, pictures: Path, tmp_path: Path) -> None:
     depth, notices = prepared(pictures, phantom, write(phantom, tmp_path / "files", *INVERSE[form]))

@@ -41,6 +41,7 @@ def _figures(*arguments: object) -> dict:
     return json.loads(result.stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KNOWS_POSES)
 def test_true_poses_of_any_data_set_can_be_named(name: str, tmp_path: Path) -> None:
     folder = WRITERS[name](tmp_path / "input")

@@ -97,6 +97,7 @@ def run(*arguments: object, code: int = 0) -> Any:
     return result
 
 
+@pytest.mark.slow
 def test_the_command_takes_seconds_or_fit(tmp_path: Path) -> None:
     estimate = write_run(tmp_path / "run", seen(TIMES_S + 0.05, 0.05))
     given = (estimate, "--truth", write_c3vd(tmp_path / "truth", winding(TIMES_S).T_world_camera))

@@ -190,6 +190,7 @@ def test_lines_that_count_the_frames_of_a_part_are_said(frames: np.ndarray) -> N
     assert said(part, TRUTH) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbered", [True, False])
 @pytest.mark.parametrize(("late_s", "count"), [(0.5, 120), (-0.5, 120), (0.25, 60), (-0.05, 60), (1.3, 400)])
 def test_a_truth_by_a_late_clock_is_said(late_s: float, count: int, numbered: bool) -> None:

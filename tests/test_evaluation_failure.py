@@ -78,6 +78,7 @@ def test_frames_until_poses_are_contradicted(name: str) -> None:
     assert counts == sorted(counts)
 
 
+@pytest.mark.slow
 def test_standing_still_is_contradicted_in_a_slow_clip() -> None:
     """Flow over five frames stays below the limit: what has moved since an earlier frame tells."""
     path = [plane_scene.pose(at_mm=(plane_scene.SIX_PIXELS_MM / 6 * x, 0, 0)) for x in SLOW_PX]
@@ -142,6 +143,7 @@ def test_on_real_clips_the_truth_holds_longest_and_who_stands_still_or_answers_s
     assert max(counts.values()) <= 1
 
 
+@pytest.mark.slow
 def test_in_a_layout_of_scared_the_truth_holds_longest(tmp_path: Path) -> None:
     """Its video is compressed, its poses are those of the left eye and inverted."""
     frames = seen(write_tiny(tmp_path / "phantom", frames=30))

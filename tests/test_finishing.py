@@ -20,6 +20,8 @@ from scopemap.result.frame_table import FrameTable
 from scopemap.runner.estimators import create_estimators
 from scopemap.runner.submap_frames import tracked_frames
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = {"networks.flow": "dis", "networks.perceptual": "structure", "tracking.keyframe_every": 2}
 
 

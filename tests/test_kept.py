@@ -25,6 +25,8 @@ from scopemap.result.depth_maps import DepthWriter
 from scopemap.runner.estimators import create_estimators
 from scopemap.runner.run import Clock, Run
 
+pytestmark = pytest.mark.slow
+
 # They follow from what is kept, or are no frame's.
 NOT_KEPT = {
     "AlikeFeatures._kept",

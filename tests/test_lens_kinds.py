@@ -39,6 +39,7 @@ def _tested(kind: str, now: str = "pinhole", factor: float = 1.0) -> LensTest:
     return LensKinds(KINDS, KINDS[now]).better_than(lens_test(problem, solution), problem, solution)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["equidistant fisheye", "orthographic fisheye"])
 @pytest.mark.parametrize("factor", [1.0, 1.3])
 def test_a_fisheye_that_is_taken_for_a_pinhole_is_told(kind: str, factor: float) -> None:
@@ -48,6 +49,7 @@ def test_a_fisheye_that_is_taken_for_a_pinhole_is_told(kind: str, factor: float)
     assert found.contradicts
 
 
+@pytest.mark.slow
 def test_a_pinhole_stays_one() -> None:
     assert _tested("pinhole").kind == ""
     assert not _tested("pinhole").contradicts

@@ -23,6 +23,8 @@ from scopemap.runner.observers import RunStopped
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Run
 
+pytestmark = pytest.mark.slow
+
 LIGHT = {"depth.backend": "shading", "networks.flow": "none", "fusion.enabled": False}
 WIDER = LensTest(held_px=0.3, free_px=0.2, log_focal=-0.4, sigma=0.01)
 

@@ -44,6 +44,7 @@ def _off(pose: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     return float(rotation_angle_rad(off[:3, :3])), float(np.linalg.norm(off[:3, 3]))
 
 
+@pytest.mark.slow
 def test_a_revisited_place_is_found_with_its_relative_pose() -> None:
     finder = LoopFinder(MappingSettings(), recent=2)
     loops = [loop for number in range(COUNT) for loop in finder.add(_frame(number, factor=1.0 + 0.02 * number))]
@@ -76,6 +77,7 @@ def test_all_keyframes_of_two_maps_are_compared_at_the_end(candidates: int, monk
         assert off_mm < 1.0
 
 
+@pytest.mark.slow
 def test_memory_of_places_is_bounded_and_a_return_is_still_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scopemap.engine.mapping.loop_closure.MOST_SEARCHED", 6)
     finder, kept, loops = LoopFinder(MappingSettings(), recent=1), [], []
@@ -86,6 +88,7 @@ def test_memory_of_places_is_bounded_and_a_return_is_still_found(monkeypatch: py
     assert [(loop.past, loop.new) for loop in loops if loop.past == 0] == [(0, 17)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("map_number", "height_px"), [(0, 40), (1, 80)])
 def test_dirt_on_the_lens_closes_no_loop(map_number: int, height_px: int, monkeypatch: pytest.MonkeyPatch) -> None:
     dirt = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(height_px, 80, 3)), (0, 0), 0.9)
@@ -170,6 +173,7 @@ def test_one_false_loop_is_an_outlier() -> None:
     assert max(_off(a, b)[1] for a, b in zip(graph.T_world_camera, poses, strict=True)) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closing", [True, False])
 def test_the_back_end_closes_loops_if_enabled(closing: bool) -> None:
     tracked = _drifting()

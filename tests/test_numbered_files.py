@@ -171,6 +171,7 @@ def test_headers_that_lead_back_are_not_read_for_ever(tmp_path: Path) -> None:
 # ---- headers without limit
 
 
+@pytest.mark.slow
 def test_a_long_name_that_grows_is_refused(tmp_path: Path) -> None:
     """200 kB of archive that would become a name of 200 MB."""
     member = tarfile.TarInfo("././@LongLink")

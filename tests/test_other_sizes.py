@@ -58,6 +58,7 @@ def _codes(path: Path, **options: object) -> dict[str, Notice]:
     return {notice.code: notice for notice in sequence.warnings if isinstance(notice, Notice)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0, 7, 65])
 @pytest.mark.parametrize(
     "change",
@@ -81,6 +82,7 @@ def test_pictures_a_pixel_apart_are_used(at: int, change: Change, tmp_path: Path
     assert _codes(folder)["input-resized"].values == {"frames": 1, "size": "320x240", "first": f"{at:03d}.png"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odd", [{3}, {0, 1, 2}, {5, 60}])
 def test_pictures_of_another_size_are_left_out_and_named(odd: set[int], tmp_path: Path) -> None:
     folder = _folder(tmp_path / "images", 66, {number: lambda rgb: cv2.resize(rgb, (160, 120)) for number in odd})
@@ -133,6 +135,7 @@ def test_a_bag_leaves_them_out_too(tmp_path: Path) -> None:
     assert set(_codes(file)) == {"input-other-size"}
 
 
+@pytest.mark.slow
 def test_the_frame_table_names_them(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "images", 12, {4: lambda rgb: rgb[:100], 8: lambda rgb: rgb[:, :-1]})
     call("run", folder, "--out", tmp_path / "result", *FAST)

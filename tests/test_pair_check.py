@@ -52,11 +52,13 @@ def _warped(picture: np.ndarray, camera: PinholeCamera | OpenCvCamera, R: np.nda
     return cv2.remap(picture, *maps, cv2.INTER_LINEAR)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAIRS)
 def test_views_that_fit_are_believed(name: str) -> None:
     assert check_pair(PAIRS[name], _seen(PAIRS[name])) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bent", "shifted"])
 def test_views_that_are_rectified_already_are_refused(name: str) -> None:
     with pytest.raises(CalibrationError, match="the views are rectified already and pair of a drawing is not"):
@@ -71,6 +73,7 @@ def test_the_error_says_what_would_be_measured() -> None:
     assert wrong < 0.6 * right
 
 
+@pytest.mark.slow
 def test_rectified_views_with_their_own_calibration_are_believed() -> None:
     _, _, P, _ = BENT_PAIR.rectification((LEFT.width, LEFT.height))
     camera = replace(LEFT, fx=P[0, 0], fy=P[1, 1], cx=P[0, 2], cy=P[1, 2])
@@ -78,6 +81,7 @@ def test_rectified_views_with_their_own_calibration_are_believed() -> None:
     assert check_pair(StereoPair(camera, camera, beside(baseline), "rectified"), _rectified(BENT_PAIR)) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAIRS)
 def test_views_the_wrong_way_round_are_refused(name: str) -> None:
     with pytest.raises(CalibrationError, match="the views do not fit pair of a drawing"):
@@ -100,6 +104,7 @@ def test_views_without_texture_are_not_checked() -> None:
     assert "was not checked: its views have 0 points" in check_pair(PAIR, [(flat, flat)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", [write_scared, write_opencv])
 def test_a_run_is_refused_by_one_sentence(write: object, tmp_path: Path) -> None:
     (tmp_path / "views").mkdir()

@@ -15,6 +15,8 @@ from scopemap import Config, open_sequence, reconstruct
 from scopemap.engine.odometry import Step
 from scopemap.runner.estimators import create_estimators
 
+pytestmark = pytest.mark.slow
+
 FILE = Path(__file__).resolve().parents[1] / "examples" / "05_the_paper_frame_by_frame.py"
 EQUATIONS = 13
 MOST_LINES = 155

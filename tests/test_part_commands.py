@@ -15,6 +15,8 @@ from tiny_phantom import only_images, write_tiny
 from scopemap.result.result import Result
 from scopemap.runner.reread_frames import open_input, tracked_frames
 
+pytestmark = pytest.mark.slow
+
 Capture = pytest.CaptureFixture[str]
 FIRST, COUNT = 12, 9
 

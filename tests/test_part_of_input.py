@@ -21,6 +21,8 @@ from scopemap.result.result import Result
 from scopemap.result.verdict import verdict
 from scopemap.runner.reconstruct import reconstruct
 
+pytestmark = pytest.mark.slow
+
 FAST = ("--preset", "realtime")
 
 

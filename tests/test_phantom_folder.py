@@ -70,6 +70,7 @@ def test_meshes_lie_under_the_depth(folder: Path) -> None:
     assert np.linalg.norm(shift, axis=1).max() > 0.5
 
 
+@pytest.mark.slow
 def test_same_spec_writes_the_same_bytes_over_an_earlier_phantom(folder: Path, tmp_path: Path) -> None:
     write_phantom(PhantomSpec(frames=5, width=32, height=32), tmp_path / "again")
     write_phantom(SPEC, tmp_path / "again")

@@ -234,6 +234,7 @@ def _found(name: str, planted: Content, template: Path, entry: Path, folder: Pat
     return check(survey(sequence))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(WRITERS))
 def test_what_any_reader_reads_whole_is_not_called_damaged(name: str, tmp_path: Path) -> None:
     found = check(survey(open_sequence(WRITERS[name](tmp_path / "input"))))
@@ -241,6 +242,7 @@ def test_what_any_reader_reads_whole_is_not_called_damaged(name: str, tmp_path: 
     assert {finding.code for finding in found} & damaged == set(), found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_a_sound_copy_is_told_for_nothing(name: str, copies: Copies, tmp_path: Path) -> None:
     template, entry, sound = copies(name)

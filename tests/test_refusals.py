@@ -48,6 +48,7 @@ def test_the_world_starts_at_the_first_frame_with_depth(folder: Path, tmp_path: 
     assert status == ["lost", "lost", "initial"] + ["ok"] * (FRAMES - 3)
 
 
+@pytest.mark.slow
 def test_masked_pixels_are_not_linked(folder: Path) -> None:
     config = Config.load(settings={"networks.flow": "none", "networks.perceptual": "structure"})
     sequence = open_sequence(folder)

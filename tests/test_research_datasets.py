@@ -228,6 +228,7 @@ def test_several_sequences_are_named(write: Callable[..., Path], one: str, other
         open_sequence(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_a_calibration_beside_the_frames_wins_with_its_depth_scale(name: str, tmp_path: Path) -> None:
     case, folder = CASES[name], WRITERS[name](tmp_path / "s")

@@ -42,6 +42,8 @@ from scopemap.runner.observers import RunStopped
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.watched import RunWatch
 
+pytestmark = pytest.mark.slow
+
 TIMED = {"provenance.json", "SHA256SUMS"}
 
 

@@ -87,6 +87,7 @@ def _errors(shown: trimesh.Trimesh, x_mm: float = 0.0) -> np.ndarray:
     return np.abs(render_mesh(shown, FINE, _pose(x_mm)).rgb[120:360, 160:480] - wanted)
 
 
+@pytest.mark.slow
 def test_texture_shows_the_pattern_that_vertex_colours_cannot() -> None:
     mesh = _plane(30, FAR_MM)
     shown = _textured(mesh, _frames())
@@ -103,6 +104,7 @@ def test_triangles_keep_their_order_and_place() -> None:
     assert ((uv >= 0) & (uv <= 1)).all()
 
 
+@pytest.mark.slow
 def test_views_of_different_exposure_are_levelled() -> None:
     mesh, gains = _plane(30, FAR_MM), (0.7, 1.3)
     shown = _textured(mesh, _frames(gains), gains)
@@ -154,6 +156,7 @@ def test_a_surface_that_no_frame_shows_keeps_the_colours_of_its_vertices() -> No
     assert unlike[:, 320:].max() <= 3
 
 
+@pytest.mark.slow
 def test_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     mesh = _plane(30, FAR_MM)
     for name in ("one.glb", "two.glb"):
@@ -161,6 +164,7 @@ def test_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "one.glb").read_bytes() == (tmp_path / "two.glb").read_bytes()
 
 
+@pytest.mark.slow
 def test_glb_holds_the_texture(tmp_path: Path) -> None:
     mesh, file = _plane(30, FAR_MM), tmp_path / "mesh.glb"
     shown = _textured(mesh, _frames())
@@ -175,6 +179,7 @@ def test_glb_holds_the_texture(tmp_path: Path) -> None:
     assert read_textured(tmp_path / "none.glb") is None
 
 
+@pytest.mark.slow
 def test_obj_has_the_texture_beside_it(tmp_path: Path) -> None:
     mesh = _plane(30, FAR_MM)
     shown = _textured(mesh, _frames())

@@ -55,6 +55,7 @@ def _track_all(settings: TrackingSettings, frames: list[Frame]) -> list[np.ndarr
     return poses
 
 
+@pytest.mark.slow
 def test_alignment_finds_the_true_motion() -> None:
     frames, truth = _sequence()
     reference = build_pyramid(frames[0], SETTINGS, use_slope=True)

@@ -139,6 +139,7 @@ def test_leading_frames_without_stamps_are_not_repaired() -> None:
 NTSC = Fraction(30000, 1001)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["v.mp4", "v.mkv", "v.avi"])
 def test_29_97_frames_a_second_do_not_drift(name: str, tmp_path: Path) -> None:
     """Frame 20,000 is due after 667.3 s; a rate of 29.97 or 30 would be 0.7 ms or 0.67 s off there."""
