@@ -97,6 +97,8 @@ def stated_size(file: Path) -> tuple[int, int] | None:
     """Return (height, width), px, of an image by its header, as it is to be shown; None where that cannot be read."""
     from PIL import ExifTags, Image
 
+    if not file.is_file():  # a pipe would be waited for
+        return None
     try:
         with warnings.catch_warnings(), Image.open(file) as image:
             warnings.simplefilter("ignore")
