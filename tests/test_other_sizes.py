@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,10 +29,22 @@ EVERY = InputSettings(skip_duplicates=False)
 Change = Callable[[np.ndarray], np.ndarray]
 
 
-def _folder(folder: Path, count: int, odd: dict[int, Change]) -> Path:
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of pictures of one size."""
+    folder = tmp_path_factory.mktemp("images")
+    for number in range(66):
+        save(folder / f"{number:03d}.png", tissue(number))
+    return folder
+
+
+def _changed(images: Path, folder: Path, odd: dict[int, Change], count: int = 66) -> Path:
+    """So many of the pictures, some of them changed."""
     folder.mkdir()
-    for number in range(count):
-        save(folder / f"{number:03d}.png", odd.get(number, lambda rgb: rgb)(tissue(number)))
+    for file in sorted(images.iterdir())[:count]:
+        shutil.copy(file, folder)
+    for number, change in odd.items():
+        save(folder / f"{number:03d}.png", change(tissue(number)))
     return folder
 
 
@@ -69,8 +82,8 @@ def _codes(path: Path, **options: object) -> dict[str, Notice]:
         lambda rgb: cv2.copyMakeBorder(rgb, 0, 1, 0, 2, cv2.BORDER_REPLICATE),
     ],
 )
-def test_pictures_a_pixel_apart_are_used(at: int, change: Change, tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "images", 66, {at: change})
+def test_pictures_a_pixel_apart_are_used(at: int, change: Change, images: Path, tmp_path: Path) -> None:
+    folder = _changed(images, tmp_path / "images", {at: change})
     sequence = open_sequence(folder)
     frames = list(sequence.source.frames(slice(None)))
     assert (sequence.source.width, sequence.source.height) == (WIDTH, HEIGHT)
@@ -84,8 +97,8 @@ def test_pictures_a_pixel_apart_are_used(at: int, change: Change, tmp_path: Path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("odd", [{3}, {0, 1, 2}, {5, 60}])
-def test_pictures_of_another_size_are_left_out_and_named(odd: set[int], tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "images", 66, {number: lambda rgb: cv2.resize(rgb, (160, 120)) for number in odd})
+def test_pictures_of_another_size_are_left_out_and_named(odd: set[int], images: Path, tmp_path: Path) -> None:
+    folder = _changed(images, tmp_path / "images", {number: lambda rgb: cv2.resize(rgb, (160, 120)) for number in odd})
     sequence = open_sequence(folder)
     assert {frame.index for frame in sequence.source.frames(slice(None))} == set(range(66)) - odd
     assert {one.index: (one.name, one.kind) for one in sequence.skipped} == {n: (f"{n:03d}.png", "size") for n in odd}
@@ -97,10 +110,10 @@ def test_pictures_of_another_size_are_left_out_and_named(odd: set[int], tmp_path
     assert "input-other-size" not in _codes(folder, frames=slice(10, 50))
 
 
-def test_where_most_differ_it_is_an_error(tmp_path: Path) -> None:
+def test_where_most_differ_it_is_an_error(images: Path, tmp_path: Path) -> None:
     sizes = [(320, 240), (160, 120), (200, 150), (96, 80)]
     odd = {n: lambda rgb, n=n: cv2.resize(rgb, sizes[n % 4]) for n in range(40)}
-    folder = _folder(tmp_path / "images", 40, odd)
+    folder = _changed(images, tmp_path / "images", odd, count=40)
     with pytest.raises(InputError, match=r"no common size \(10 of 320x240 px, 10 of 160x120 px, .*give those of one"):
         open_sequence(folder)
 
@@ -136,8 +149,8 @@ def test_a_bag_leaves_them_out_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_frame_table_names_them(tmp_path: Path) -> None:
-    folder = _folder(tmp_path / "images", 12, {4: lambda rgb: rgb[:100], 8: lambda rgb: rgb[:, :-1]})
+def test_the_frame_table_names_them(images: Path, tmp_path: Path) -> None:
+    folder = _changed(images, tmp_path / "images", {4: lambda rgb: rgb[:100], 8: lambda rgb: rgb[:, :-1]}, count=12)
     call("run", folder, "--out", tmp_path / "result", *FAST)
     run, rows = Result(tmp_path / "result"), frame_rows(tmp_path / "result")
     assert (rows[4]["status"], rows[4]["reason"]) == ("skipped", "320x100 px, others are 320x240 px")
