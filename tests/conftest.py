@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -31,3 +32,11 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real data not found in {folder}; set SCOPEMAP_REAL_DATA to run this test")
     return folder
+
+
+@pytest.fixture
+def short_films(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Films of a surface that turns have 12 frames in place of 180."""
+    from scopemap.report import films
+
+    monkeypatch.setattr(films, "write_turntable", partial(films.write_turntable, frames=12))

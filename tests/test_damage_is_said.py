@@ -10,7 +10,7 @@ from front_door import call
 
 from scopemap.result.checksums import changed_files, write_checksums
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("short_films")]
 
 COMMANDS = {
     "report": ("report", "RUN"),

@@ -61,6 +61,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_films")
 @pytest.mark.parametrize("surface", SURFACES)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_each_command_ends_well(
