@@ -55,6 +55,7 @@ def test_a_measured_distance_becomes_the_reference_where_sizes_are_known(tmp_pat
         for pixel in ((24.0, 45.0), (28.0, 45.0)):
             click(shown, page, pixel)
         shown.until(lambda: len(read_measurements(folder)) == 1)
+        shown.element("Text", "Length of this line").value = "5"
         shown.press("Use as reference")
         assert "10 px are needed" in shown.window._error.content
         assert len(read_measurements(folder)) == 1

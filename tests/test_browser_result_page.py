@@ -191,9 +191,9 @@ def test_a_distance_is_measured_and_kept(tmp_path: Path) -> None:
     with shown_window() as shown:
         shown.show(page)
         assert shown.next_click == "A click shows which frames saw the place."
+        assert "Points" not in shown.labels("ButtonGroup")
         shown.choose("ButtonGroup", "Measure", "Distance")
         assert shown.next_click == "Distance: click on the 1st of 2 points."
-        assert "Points" not in shown.labels("ButtonGroup")
         click(shown, page, (20.0, 20.0))
         assert shown.next_click == "Distance: click on the 2nd of 2 points."
         assert "Points" in shown.labels("ButtonGroup")
@@ -251,13 +251,18 @@ def test_without_a_scale_two_points_become_the_reference(tmp_path: Path) -> None
         shown.choose("ButtonGroup", "Measure", "Distance")
         shown.press("Forget the reference")
         assert "Forget the reference" not in shown.labels()
+        assert "The reference is forgotten." in shown.words
         assert "/page/reference/words" not in shown.nodes
         for pixel in ((24.0, 45.0), (44.0, 45.0)):
             click(shown, page, pixel)
         shown.element("Text", "Length of this line").value = "five"
         shown.press("Use as reference")
-        assert "Type the length in mm, such as 2.5, or leave it empty." in shown.words
+        assert "Type the length in mm, such as 2.5." in shown.words
+        # Without a length it is not a reference by oversight.
         shown.element("Text", "Length of this line").value = ""
+        shown.press("Use as reference")
+        assert "If it is not known, press again" in shown.words
+        assert "/page/reference/words" not in shown.nodes
         shown.press("Use as reference")
         assert "Sizes are in multiples of your reference." in shown.words
         assert "by an earlier reference" in shown.words
@@ -271,7 +276,13 @@ def test_a_lesion_is_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureF
         shown.show(page)
         shown.choose("Slider", "Frame", 4)
         shown.choose("ButtonGroup", "Measure", "Lesion")
+        assert "the view is now that of frame 4" in shown.words
         corners = ((52.0, 26.0), (64.0, 26.0), (64.0, 38.0), (52.0, 38.0))
+        for pixel in corners:
+            click(shown, page, pixel)
+        # What takes points back stays in its place when there are none.
+        shown.choose("ButtonGroup", "Points", "Clear")
+        assert shown.element("ButtonGroup", "Points").visible
         for pixel in corners:
             click(shown, page, pixel)
         shown.choose("Text", "Name of the lesion", "polyp 1")

@@ -54,6 +54,7 @@ class LesionPart:
                 self._view.note("This frame has no pose in this submap: choose a tracked frame first.")
             else:
                 self._view.look_from_frame()
+                self._view.note(f"A lesion is outlined in one frame: the view is now that of frame {self._frame}.")
         self._show()
 
     def add(self, pick: SurfacePick) -> None:

@@ -29,6 +29,7 @@ _CHOOSE = "Choose what to measure."
 _UNKNOWN = "Sizes are unknown. Choose **Distance** and click on both ends of something whose length you know."
 _BACK = "Go to the reference"
 _ELSEWHERE = "Your reference is on the surface of {part}. “{back}”, in Measure, shows it; one set here replaces it."
+_EMPTY = "Type its length in mm. If it is not known, press again: other lengths are then multiples of it."
 _FEWEST = 3
 _PICKED = "/page/picked"
 _REFERRED = "/page/reference"
@@ -43,6 +44,7 @@ class MeasurePart:
         self._picks: list[SurfacePick] = []
         self._reference: Reference | None = None
         self._elsewhere: HandMeasure | None = None
+        self._is_told = False  # what a reference without a length is
         self._hint = gui.add_markdown("")
         self._back = window.on(gui.add_button(_BACK, visible=False), self._go_to_reference)
         modes = gui.add_button_group("Measure", get_args(Mode)[1:])
@@ -75,6 +77,7 @@ class MeasurePart:
         if self.mode == "Distance" and len(self._picks) == 2:
             self._picks = []
         self._picks.append(pick)
+        self._is_told = False
         self._show()
         if self.mode == "Distance" and len(self._picks) == 2 and self._is_known:
             self._measure()
@@ -85,7 +88,7 @@ class MeasurePart:
 
     def _choose(self, mode: str) -> None:
         self.mode = next(known for known in get_args(Mode) if known == mode)
-        self._picks = []
+        self._picks, self._is_told = [], False
         self._view.note("")
         self._lesion.begin(shown=self.mode == "Lesion")
         self._show()
@@ -117,9 +120,10 @@ class MeasurePart:
         self._view.window.job("measuring", work, then)
 
     def _use_as_reference(self) -> None:
-        length_mm = typed_number(self._length.value)
-        if self._length.value.strip() and not length_mm > 0:
-            self._view.note("Type the length in mm, such as 2.5, or leave it empty.")
+        length_mm, is_empty = typed_number(self._length.value), not self._length.value.strip()
+        if not (length_mm > 0 or (is_empty and self._is_told)):
+            self._is_told = is_empty
+            self._view.note(_EMPTY if is_empty else "Type the length in mm, such as 2.5.")
             return
         first, second = self._picks
         reference = Reference((first, second), length_mm if length_mm > 0 else None)
@@ -131,6 +135,7 @@ class MeasurePart:
     def _forget_reference(self) -> None:
         self._measured.keep_reference(None)
         self._refer_to(None)
+        self._view.note("The reference is forgotten.")
 
     def _refer_to(self, reference: Reference | None) -> None:
         """Use a reference, or none, and say what sizes are by it."""
@@ -178,7 +183,8 @@ class MeasurePart:
     def _say_mode(self) -> None:
         """Say what the next click does, and offer to take back where there is something."""
         count = self._lesion.count if self.mode == "Lesion" else len(self._picks)
-        self._points.visible = count > 0
+        # They stay where they are: what came up in their place was clicked instead.
+        self._points.visible = self.mode != "Look"
         self._view.clicks_are_for(self._next_click(count))
 
     def _next_click(self, count: int) -> str:

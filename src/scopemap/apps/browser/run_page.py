@@ -84,14 +84,15 @@ class RunPage:
         self._window = window
         gui.add_markdown(f"### {escaped(window.names.hidden(self._title))}")
         self._rarely = gui.add_html(f'<span id="{RUN_GOES_ON}"></span>')
-        self._words = gui.add_markdown("starting")
         self._bar = gui.add_progress_bar(0)
-        self._facts = gui.add_markdown("", visible=False)
-        self._live = [window.on(gui.add_button(name), call) for name, call in self._buttons.items()]
+        # Above the words, whose lines become more and fewer: a button that moves is missed.
         makes = "Makes a result of the frames so far." if self._makes_result else "Keeps what was tracked, to continue."
         stop = gui.add_button(_STOP, icon=_icon("PLAYER_STOP"), hint=makes)
         self._stop = window.on(stop, self._stop_run)
         self._add_ways_on()
+        self._live = [window.on(gui.add_button(name), call) for name, call in self._buttons.items()]
+        self._words = gui.add_markdown("starting")
+        self._facts = gui.add_markdown("", visible=False)
         self._picture = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Frame: unused parts dark, corners green")
         self._depth = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="Depth: red near, blue far")
         self._coverage = gui.add_image(np.zeros((8, 10, 3), np.uint8), label="What was not seen so far")
