@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import TypeVar
-
-from scopemap.result.checkpoint import SavedState
-
-_Owner = TypeVar("_Owner")
 
 # They hold times, or what holds times.
 NOT_COMPARED = {"provenance.json", "SHA256SUMS", "report.html", "frames/measures.csv"}
@@ -32,13 +27,3 @@ def compared_files(folder: Path) -> dict[str, bytes]:
     """The content of the files of a result that two equal runs have in common, by their names."""
     names = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
     return {name: path.read_bytes() for name, path in names.items() if name not in NOT_COMPARED}
-
-
-def through_checkpoint(folder: Path, owner: object, other: _Owner) -> _Owner:
-    """Another object with what an owner keeps, by way of a checkpoint in a folder."""
-    folder.mkdir()
-    written = SavedState(folder)
-    written.put("part", owner)
-    written.commit({"last": 1})
-    SavedState(folder).restore("part", other)
-    return other

@@ -11,7 +11,6 @@ import plane_scene
 import pytest
 from drawn_run import changed
 from plane_scene import CAMERA, EVERYWHERE
-from result_files import through_checkpoint
 from tiny_phantom import with_true_depth, write_tiny
 
 from scopemap import open_sequence, reconstruct
@@ -76,7 +75,7 @@ def _track(status: str, index: int = 0) -> Track:
     return Track(index, status, "", np.eye(4), 0)  # type: ignore[arg-type]
 
 
-def test_rotations_add_up_until_flow_ends_and_a_restored_follower_goes_on_alike(tmp_path: Path) -> None:
+def test_rotations_add_up_until_flow_ends_and_a_resumed_follower_goes_on_alike() -> None:
     third = SECOND @ plane_scene.pose(at_mm=(1.0, 1.0, 0.0), turn_rad=(0.0, 0.05, 0.0))
     follower = RotationFollower()
     tracked = follower.follow(_track("ok"), _small(FIRST), None)
@@ -84,9 +83,10 @@ def test_rotations_add_up_until_flow_ends_and_a_restored_follower_goes_on_alike(
     lost = follower.follow(_track("lost"), _small(SECOND), _seen(FIRST, SECOND))
     assert lost.rotation is not None
     assert _deg(lost.rotation @ TURN) < 0.1
-    restored = through_checkpoint(tmp_path / "state", follower, RotationFollower())
+    resumed = RotationFollower()
+    resumed.resume_after(lost, np.asarray(_small(SECOND).depth_mm))
     step = _track("lost"), _small(third), _seen(SECOND, third)
-    later, again = follower.follow(*step), restored.follow(*step)
+    later, again = follower.follow(*step), resumed.follow(*step)
     assert later.rotation is not None
     assert _deg(later.rotation.T @ (inverse(FIRST) @ third)[:3, :3]) < 0.2
     np.testing.assert_array_equal(later.rotation, again.rotation)

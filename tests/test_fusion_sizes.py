@@ -99,13 +99,14 @@ def test_rows_come_back_in_order_in_parts_and_without_those_forgotten(on_disk: b
 def test_a_store_that_lost_bytes_is_refused(tmp_path: Path) -> None:
     store = FrameStore(tmp_path, name="stored")
     store.put(wall(30.0))
-    store.reopen()
+    record = store.record()
+    store.put(wall(30.0, 1))
+    store.resume(record)
     assert [frame.index for frame in store.frames()] == [0]
     for file in ("frames", "frame_entries"):
         whole = (tmp_path / "stored" / file).read_bytes()
         (tmp_path / "stored" / file).write_bytes(whole[:-1])
-        store.reopen()
-        store._known = None
+        store.resume(record)
         with pytest.raises(InputError, match=rf"the stored frames are damaged \({file}\)"):
             list(store.frames())
         (tmp_path / "stored" / file).write_bytes(whole)

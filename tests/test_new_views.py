@@ -10,7 +10,6 @@ import pytest
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.new_views import NewViews
-from scopemap.engine.kept import restore, state_of
 
 CAMERA = PinholeCamera(fx=150.0, fy=150.0, cx=79.5, cy=63.5, width=160, height=128)
 
@@ -68,19 +67,3 @@ def test_every_third_frame_where_that_is_set() -> None:
 def test_a_frame_without_usable_depth_is_left_out_most_often() -> None:
     unknown = replace(seen(0), valid=np.zeros((CAMERA.height, CAMERA.width), bool))
     assert indices([unknown, seen(1), seen(2)]) == [1]
-
-
-def test_what_it_keeps_goes_on_alike() -> None:
-    frames = [seen(index, x_mm=0.3 * index) for index in range(24)]
-    first, other = NewViews(), NewViews()
-    for frame in frames[:12]:
-        first.chosen(frame)
-    arrays: list[np.ndarray] = []
-
-    def put(array: np.ndarray) -> dict[str, int]:
-        arrays.append(array.copy())
-        return {"array": len(arrays) - 1}
-
-    restore(other, state_of(first, put), lambda place, **_: arrays[place["array"]].copy())
-    later = [[frame.index for frame in views.among(frames[12:])] for views in (first, other)]
-    assert later[0] == later[1] != []

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from scopemap.engine.depth.anchor import AnchoredDepth
 from scopemap.engine.depth.estimate import DepthEstimator, PerceptualDistance
 from scopemap.engine.flow.estimator import FlowEstimator
-from scopemap.engine.kept import Kept
 from scopemap.engine.masking.masker import StoredMasks
 from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.engine.tracking.track import FrameTracker
@@ -18,12 +17,12 @@ from scopemap.engine.tracking.track import FrameTracker
 class Estimators:
     """The interchangeable parts that look at images; a flow is not thread-safe, so each thread has its own."""
 
-    depth: Kept[DepthEstimator]
-    anchor: Kept[AnchoredDepth]
+    depth: DepthEstimator
+    anchor: AnchoredDepth
     flow: FlowEstimator  # between successive frames
     corner_flow: FlowEstimator  # of the keyframe's corners, in tracking
     keyframe_flow: FlowEstimator  # between keyframes, in mapping
     perceptual: PerceptualDistance
-    masks: Kept[StoredMasks | None] = None
+    masks: StoredMasks | None = None
     features: FeatureDetector = field(default_factory=SiftFeatures)
     tracker: Callable[[], FrameTracker] | None = None  # makes what tracks in place of `Tracker`

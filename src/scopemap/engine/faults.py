@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from scopemap.engine.errors import ScopemapError
-from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 
 _MOST_FAULTS = 3  # by hand: frames that may fail
@@ -15,14 +15,20 @@ _MOST_FAULTS_SHARE = 0.05  # by hand: more are no accident
 class StageFaults:
     """The frames that one stage could not process; each stage has its own, as a part of the state that it changes."""
 
-    frames: Kept[int] = 0
-    failed: Kept[int] = 0
-    without_depth: Kept[int] = 0
-    first: Kept[tuple[int, str]] = (-1, "")
-    first_without_depth: Kept[int] = -1
-
     def __init__(self, stage: str) -> None:
         self._stage = stage
+        self.frames = self.failed = self.without_depth = 0
+        self.first, self.first_without_depth = (-1, ""), -1
+
+    def record(self) -> dict[str, Any]:
+        """Return the counts, and which were first, for `resume`, as JSON holds them."""
+        blind = {"without_depth": self.without_depth, "first_without_depth": self.first_without_depth}
+        return {"frames": self.frames, "failed": self.failed, "first": self.first} | blind
+
+    def resume(self, record: dict[str, Any]) -> None:
+        """Go on from a record."""
+        self.frames, self.failed, self.first = record["frames"], record["failed"], tuple(record["first"])
+        self.without_depth, self.first_without_depth = record["without_depth"], record["first_without_depth"]
 
     def has_no_depth(self, index: int) -> None:
         """Note a frame to which the network gave no depth."""

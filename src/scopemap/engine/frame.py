@@ -16,7 +16,6 @@ import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import check_shape
-from scopemap.engine.kept import Kept
 
 REGIONS = 6, 8  # by hand
 """Rows and columns of the regions of a picture whose tissue is looked at for motion of its own."""
@@ -133,9 +132,6 @@ class Truth:
 class Rows:
     """Rows of one numpy type, put in one after the other, packed: objects would take ten times as much memory."""
 
-    _count: Kept[int]
-    _bytes: Kept[np.ndarray]
-
     def __init__(self, kind: np.dtype) -> None:
         self._kind, self._count = kind, 0
         self._bytes = np.zeros((0, kind.itemsize), np.uint8)
@@ -162,8 +158,8 @@ class Rows:
 
     def parts(self) -> Iterator[np.ndarray]:
         """Yield all rows in parts, since in one piece those of a long clip would fill memory."""
-        for first in range(0, self._count, _ROWS_AT_ONCE):
-            yield self.read(first, min(_ROWS_AT_ONCE, self._count - first))
+        for first in range(0, len(self), _ROWS_AT_ONCE):
+            yield self.read(first, min(_ROWS_AT_ONCE, len(self) - first))
 
     def keep(self, kept: np.ndarray) -> None:
         """Forget the rows where `kept`, (N,) bool, is False."""

@@ -11,7 +11,7 @@ from scopemap.engine.config import Config
 from scopemap.engine.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.engine.faults import StageFaults
 from scopemap.engine.frame import Frame
-from scopemap.engine.kept import Kept
+from scopemap.engine.mapping.correction import KeyframeStep
 from scopemap.engine.mapping.local_adjustment import LocalAdjustment
 from scopemap.engine.mapping.mapper import Mapper
 from scopemap.engine.notices import Notice
@@ -19,14 +19,15 @@ from scopemap.engine.preprocessing import PreprocessedFrame, with_depth, with_un
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.relocalisation import RotationFollower
 from scopemap.engine.tracking.smoothing import Wema
-from scopemap.engine.tracking.track import FrameTracker, Track, motion_between
+from scopemap.engine.tracking.track import FrameTracker, ResumableTracker, Track, motion_between
 
 
 @dataclass(frozen=True)
 class Step:
     """All results for a frame: refined depth (at the network's size) and, unless lost, pose as tracked.
 
-    skipped : whether nothing was estimated of it.
+    skipped : whether nothing was estimated of it. measured : whether its depth is measured, not predicted. moved : of a
+    keyframe that was adjusted as it came, by how much; None elsewhere.
     """
 
     frame: Frame
@@ -34,6 +35,8 @@ class Step:
     raw_mm: np.ndarray
     refined: RefinedDepth
     skipped: bool = False
+    measured: bool = False
+    moved: KeyframeStep | None = None
 
     @property
     def row(self) -> dict[str, Any]:
@@ -52,15 +55,8 @@ class Odometry:
     local : adjusts keyframes of predicted depth as they come; None: they are as tracked.
     """
 
-    mapper: Kept[Mapper]
-    faults: Kept[StageFaults]
-    _tracker: Kept[FrameTracker]
-    _local: Kept[LocalAdjustment | None]
-    _mapis: Kept[Mapis]
-    _smooth: Kept[Wema]
-    _rotation: Kept[RotationFollower]
-    _last_track: Kept[Track | None] = None
-    _previous: Kept[tuple[Frame, Track] | None] = None  # tracked, no keyframe; the tracker may still promote it
+    _last_track: Track | None = None
+    _previous: tuple[Frame, Track] | None = None  # tracked, no keyframe; the tracker may still promote it
 
     def __init__(
         self, config: Config, tracker: FrameTracker, mapper: Mapper, local: LocalAdjustment | None = None
@@ -106,13 +102,15 @@ class Odometry:
         frame = replace(frame, nonrigidity=track.nonrigidity)
         if preprocessed.kind == "depth":  # disparity has a scale of its own in every frame
             frame = replace(frame, depth_scale=refined.scale)
+        moved = None
         if track.status != "lost":
-            track, frame = self._handed_on(track, frame, preprocessed)
+            track, frame, moved = self._handed_on(track, frame, preprocessed)
         if track.status == "lost":
             self._reset()
         else:
             frame = replace(frame, T_world_camera=self._smooth(track.T_world_camera))
-        return Step(frame, track, np.asarray(preprocessed.frame.depth_mm), refined)
+        raw_mm, measured = np.asarray(preprocessed.frame.depth_mm), preprocessed.kind == "measured"
+        return Step(frame, track, raw_mm, refined, measured=measured, moved=moved)
 
     def _lost(self, preprocessed: PreprocessedFrame, reason: str) -> Step:
         """Return the step of a frame that could not be tracked, without depth."""
@@ -130,6 +128,70 @@ class Odometry:
         unknown_mm = np.asarray(with_unknown_depth(preprocessed.small).depth_mm)
         refined, frame = RefinedDepth(unknown_mm, 1.0, 0.0, unknown_mm), preprocessed.frame
         return Step(frame, track, np.asarray(frame.depth_mm), refined, preprocessed.skipped)
+
+    def record(self) -> dict[str, Any]:
+        """Return what does not follow from the steps, for `resume`, as JSON holds it."""
+        return {"faults": self.faults.record(), "local": None if self._local is None else self._local.record()}
+
+    def resume(self, record: dict[str, Any]) -> None:
+        """Go on from a record; `replay` takes the steps until then, and `resume_after` the last of them."""
+        self.faults.resume(record["faults"])
+        if self._local is not None:
+            self._local.resume(record["local"])
+
+    def replay(self, step: Step) -> None:
+        """Take a step as it was made before the run was resumed, in order: nothing is estimated, tracked or adjusted.
+
+        Its frame is as handed on, `step.moved` without `before`. The tracker is a `ResumableTracker`.
+        """
+        track, last = step.track, self._last_track
+        frame = replace(step.frame, T_world_camera=track.T_world_camera)
+        assert isinstance(self._tracker, ResumableTracker)
+        if not step.skipped:
+            self._mapis.rescale(step.refined.scale)
+        self._tracker.replay(frame, track)
+        if track.decision.promotes_previous:
+            self._promote_previous()
+        if track.status == "lost" or (last is not None and last.map != track.map):
+            self._reset()
+        if track.status != "lost":
+            self._replay_handing_on(track, frame, step)
+            self._smooth(track.T_world_camera)
+        self.mapper.observe(track)
+        self._last_track = track
+
+    def undone(self, step: Step) -> Frame:
+        """Return the frame of a step with its depth as refined, before keyframes were adjusted."""
+        if self._local is None or step.measured or step.track.status == "lost":
+            return step.frame
+        return self._local.undone(step.frame, step.track.keyframe)
+
+    def resume_after(self, track: Track, small: Frame) -> None:
+        """Go on after the last step; small : its frame at the size of the depth estimate, with depth as refined."""
+        depth_mm = np.asarray(small.depth_mm)
+        self._rotation.resume_after(track, np.where(small.valid, depth_mm, np.nan))
+        if track.status != "lost":
+            self._mapis.resume_after(depth_mm, small.depth_sigma_mm)
+        if self._local is not None:
+            self._local.resume_window()
+
+    def _replay_handing_on(self, track: Track, frame: Frame, step: Step) -> None:
+        decision = track.decision
+        if step.measured and decision.kind == "none":
+            return
+        measured = step.measured and not self._mapis.needs_previous("measured")
+        can_use = self._tracker.update(frame, decision, measured=measured)
+        if step.measured:
+            return
+        if decision.kind == "none":
+            self._previous = (frame, track) if can_use else self._previous
+            return
+        moved = step.moved
+        if self._local is not None and moved is not None:
+            moved = self._local.replay(frame, track.keyframe, moved)
+        if can_use:
+            self.mapper.add_keyframe(frame, track, step=moved)
+            self.mapper.settle()  # else the keyframes that wait for the mapper fill memory
 
     def notices(self, map_number: int) -> list[Notice]:
         """Return what was adjusted of a map as it came; [] where nothing was."""
@@ -162,44 +224,46 @@ class Odometry:
                 self._local.take_over(frame.index, track.keyframe)
             self._previous = None
 
-    def _handed_on(self, track: Track, frame: Frame, preprocessed: PreprocessedFrame) -> tuple[Track, Frame]:
-        """Hand a tracked frame on as its track decided; return both, adjusted where keyframes are as they come.
+    def _handed_on(
+        self, track: Track, frame: Frame, preprocessed: PreprocessedFrame
+    ) -> tuple[Track, Frame, KeyframeStep | None]:
+        """Hand a tracked frame on as its track decided; return both, adjusted where keyframes are, and how.
 
         The first frame of a map that is refused as a keyframe is lost.
         """
         posed = replace(frame, T_world_camera=track.T_world_camera)
         hand_on = self._hand_on_measured if preprocessed.kind == "measured" else self._hand_on_predicted
-        posed, is_refused = hand_on(track, posed)
+        posed, is_refused, step = hand_on(track, posed)
         track, frame = replace(track, T_world_camera=_pose(posed)), replace(posed, T_world_camera=None)
         if track.status == "initial" and is_refused:
             unknown = preprocessed.depth_note or "too little of its depth is known to start from (black or constant?)"
             track = replace(track, status="lost", reason=unknown, cause=LossCause.OTHER)
-        return track, frame
+        return track, frame, step
 
-    def _hand_on_measured(self, track: Track, posed: Frame) -> tuple[Frame, bool]:
+    def _hand_on_measured(self, track: Track, posed: Frame) -> tuple[Frame, bool, None]:
         """Hand on a frame of measured depth, and return whether it is refused as a keyframe.
 
         Only the tracker takes it, and only keyframes: with measured depth tracking alone is better.
         """
         if track.decision.kind == "none":
-            return posed, False
+            return posed, False, None
         is_measured = not self._mapis.needs_previous("measured")  # else MAPIS has changed it
-        return posed, not self._tracker.update(posed, track.decision, measured=is_measured)
+        return posed, not self._tracker.update(posed, track.decision, measured=is_measured), None
 
-    def _hand_on_predicted(self, track: Track, posed: Frame) -> tuple[Frame, bool]:
-        """Hand on a frame of predicted depth; return it, adjusted, and whether it is refused as a keyframe."""
+    def _hand_on_predicted(self, track: Track, posed: Frame) -> tuple[Frame, bool, KeyframeStep | None]:
+        """Hand on a frame of predicted depth; return it, whether it is refused as a keyframe, and its step."""
         decision, local, matches, step = track.decision, self._local, None, None
         if decision.kind == "none":
             posed = posed if local is None else local.corrected(posed, track.keyframe)
             if self._tracker.update(posed, decision, measured=False):
                 self._previous = posed, track
-            return posed, False
+            return posed, False, None
         if local is not None:
             posed, matches, step = local.adjusted(posed, track.keyframe, track.map)
         if not self._tracker.update(posed, decision, measured=False):
-            return posed, True
+            return posed, True, step
         self.mapper.add_keyframe(posed, replace(track, T_world_camera=_pose(posed)), matches, step)
-        return posed, False
+        return posed, False, step
 
 
 def _pose(frame: Frame) -> np.ndarray:

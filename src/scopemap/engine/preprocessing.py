@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from scopemap.engine.config import Config
 from scopemap.engine.depth.anchor import depth_downscale
-from scopemap.engine.depth.estimate import DepthKind
+from scopemap.engine.depth.estimate import DepthKind, ScaleFixed
 from scopemap.engine.depth.mapis import DenseCorrespondence, DenseMatcher, Mapis
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.faults import StageFaults
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.warp import pull, resampled
-from scopemap.engine.kept import Kept
 from scopemap.engine.masking.masker import Masker, without_instruments
 from scopemap.engine.notices import Notice
 from scopemap.engine.tracking.causes import LossCause
@@ -48,13 +48,12 @@ class PreprocessedFrame:
 class DepthTurns:
     """Which frames the network looks at: one in `every`; flow propagates its depth to the frames in between."""
 
-    propagated: Kept[int] = 0
+    propagated = 0
     """How many frames got the depth of the one before."""
-    _since: Kept[int] = 0  # frames since the network looked
-    _kind: Kept[DepthKind | None] = None  # of the depth that can be propagated; None: there is none
+    _kind: DepthKind | None = None  # of the depth that can be propagated; None: there is none
 
     def __init__(self, every: int) -> None:
-        self._every = every
+        self._every, self._since = every, 0  # frames since the network looked
 
     def propagated_kind(self) -> DepthKind | None:
         """Return of which kind the depth is that the next frame gets from the one before; None: the network looks."""
@@ -81,20 +80,12 @@ class DepthTurns:
 class Preprocessing:
     """Masks frames and estimates their raw depth, in order, each once."""
 
-    _masker: Kept[Masker]
-    _quality: Kept[PictureQuality]
-    _texture: Kept[TextureMonitor]
-    _turns: Kept[DepthTurns]
-    estimators: Kept[Estimators]
-    faults: Kept[StageFaults]
-    skipped: Kept[Counter[str]]
-    """How many frames were skipped, by the cause of their loss."""
-
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._config, self.estimators = config, estimators
         self._masker, self._quality = Masker(config.mask, estimators.masks), PictureQuality()
         self._texture, self.faults = TextureMonitor(config.tracking), StageFaults("depth")
-        self.skipped = Counter()
+        self.skipped = Counter[str]()
+        """How many frames were skipped, by the cause of their loss."""
         from_files = config.depth.backend.startswith("files:") or config.mask.instruments == "auto"
         self._turns = DepthTurns(1 if from_files else config.depth.network_every)
         self._needs_previous = Mapis(config.mapis).needs_previous
@@ -105,6 +96,37 @@ class Preprocessing:
         causes = ", ".join(f"{count} {cause}" for cause, count in self.skipped.most_common())
         skipped = [Notice("frames-skipped", {"frames": self.skipped.total(), "causes": causes})] if causes else []
         return skipped + self._turns.notices
+
+    def record(self) -> dict[str, Any]:
+        """Return what does not follow from the frames that are stored, for `resume`: numbers and arrays by name."""
+        depth, quality = self.estimators.depth, list(self._quality.recent)
+        return {
+            "masks": self._masker.record(),
+            "anchor": self.estimators.anchor.record(),
+            "scale_mm": depth.scale_mm if isinstance(depth, ScaleFixed) else None,
+            "quality": quality,
+            "propagated": self._turns.propagated,
+            "skipped": dict(self.skipped),
+            "faults": self.faults.record(),
+        }
+
+    def resume(self, record: dict[str, Any]) -> None:
+        """Go on from a record."""
+        self._masker.resume(record["masks"])
+        self.estimators.anchor.resume(record["anchor"])
+        if isinstance(self.estimators.depth, ScaleFixed):
+            self.estimators.depth.scale_mm = record["scale_mm"]
+        self._quality.recent.extend(tuple(measures) for measures in record["quality"])
+        self._turns.propagated, self.skipped = record["propagated"], Counter(record["skipped"])
+        self.faults.resume(record["faults"])
+
+    def pass_over(self, index: int) -> None:
+        """Take the number of a frame that was estimated before the run was resumed."""
+        self._masker.pass_over(index)
+
+    def downscaled(self, frame: Frame) -> Frame:
+        """Return a frame at the size of the depth estimate."""
+        return frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
 
     def estimate(self, frame: Frame) -> PreprocessedFrame:
         """Mask a frame and estimate its raw depth; a frame with which that fails has no usable pixel, and is lost."""
@@ -123,7 +145,7 @@ class Preprocessing:
         if (loss := self._texture.too_little(frame)) is not None:
             return self._skipped(without_depth(frame), loss)
         frame = replace(frame, quality=self._quality(frame.rgb, frame.valid))
-        small = self._downscaled(frame)
+        small = self.downscaled(frame)
         if (kind := self._turns.propagated_kind()) is not None:
             frame, small = with_unknown_depth(frame), with_unknown_depth(small)
             return PreprocessedFrame(frame, small, kind, None, False, propagated=True)
@@ -157,25 +179,31 @@ class Preprocessing:
         self._masker.instruments(None)
         self._turns.interrupt()
         frame = replace(with_unknown_depth(frame), quality=LEAST_QUALITY)
-        small = with_unknown_depth(self._downscaled(frame))
+        small = with_unknown_depth(self.downscaled(frame))
         return PreprocessedFrame(frame, small, "measured", None, False, fault=fault)
-
-    def _downscaled(self, frame: Frame) -> Frame:
-        """Return a frame at the size of the depth estimate."""
-        return frame.downscaled(depth_downscale(self._config.depth, max(frame.valid.shape)))
 
 
 class Matching:
     """Finds the correspondence of each frame with the one before, where its depth is to be refined with it."""
 
-    _matcher: Kept[DenseMatcher]
-    _before: Kept[Frame | None] = None
-    faults: Kept[StageFaults]
+    _before: Frame | None = None
 
     def __init__(self, config: Config, estimators: Estimators) -> None:
         self._matcher = DenseMatcher(config.mapis, estimators.flow, estimators.perceptual)
         self._needs_previous = Mapis(config.mapis).needs_previous
         self.faults = StageFaults("flow")
+
+    def record(self) -> dict[str, Any]:
+        """Return what does not follow from the frames that are stored, for `resume`, as JSON holds it."""
+        return {"faults": self.faults.record()}
+
+    def resume(self, record: dict[str, Any]) -> None:
+        """Go on from a record."""
+        self.faults.resume(record["faults"])
+
+    def resume_after(self, small: Frame) -> None:
+        """Let the next frame be matched with this one, which is at the size of the depth estimate."""
+        self._matcher.match(small.rgb, small.valid, wanted=False)
 
     def match(self, estimated: PreprocessedFrame) -> PreprocessedFrame:
         """Add the correspondence of a frame with the one before, where its depth is to be refined with it."""

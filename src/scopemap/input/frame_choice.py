@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from scopemap.engine.errors import SettingsError
-from scopemap.engine.kept import Kept
 from scopemap.input.picture_difference import is_at_rest, is_repeat
 from scopemap.input.source import SkippedFrame, SourceFrame
 
@@ -29,7 +28,7 @@ class FrameChoice:
 
     fps: float | None = None
     skip_repeated: bool = False
-    skipped: Kept[dict[int, SkippedFrame]] = field(default_factory=dict)
+    skipped: dict[int, SkippedFrame] = field(default_factory=dict)
 
     def __call__(self, frames: Iterable[SourceFrame]) -> Iterator[SourceFrame]:
         """Yield the frames that are used; the first always is."""

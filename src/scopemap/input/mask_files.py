@@ -14,7 +14,6 @@ import numpy as np
 from scopemap.engine.cameras.rectification import Rectifier
 from scopemap.engine.config import MaskSettings
 from scopemap.engine.errors import InputError, SettingsError
-from scopemap.engine.kept import Kept
 from scopemap.engine.masking.masker import disc
 from scopemap.engine.notices import Notice
 from scopemap.input.decoding import frame_number, frames_later, read_decoded
@@ -72,11 +71,6 @@ class MaskFiles:
     Raises `InputError` where the folder does not exist, holds no such image, or two for one frame.
     """
 
-    _asked: Kept[set[int]]
-    _hidden: Kept[float]
-    _read_masks: Kept[int]
-    _level: Kept[int]
-
     def __init__(
         self,
         folder: Path,
@@ -91,7 +85,7 @@ class MaskFiles:
         self._by_name = bool(pictures) and decimal_numbers(list(self._files.values())) is not None
         self._later = frames_later(list(self._files), self._numbers)
         self._files = {number + self._later: file for number, file in self._files.items()}
-        self._asked, self._hidden, self._read_masks, self._level = set(), 0.0, 0, 0
+        self._asked, self._hidden, self._read_masks, self._level = set[int](), 0.0, 0, 0
 
     def covered(self, index: int) -> np.ndarray | None:
         """Return which pixels of the working camera are masked in the frame `index`, (H, W) bool; None without a file.

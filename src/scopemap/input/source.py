@@ -14,7 +14,6 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.rectification import DepthSensor
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import TruthQuality
-from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 from scopemap.input.camera_files.calibration import Calibration, fitted
 from scopemap.input.sampling import SampledPair, pairs_in_order
@@ -114,9 +113,9 @@ class Source:
     depth_sensor: DepthSensor | None = None
     camera_at_rest = False
     masks: Path | None = None
-    warnings: Kept[list[str | Notice]]
-    left_out: Kept[dict[int, SkippedFrame]]
-    resized: Kept[dict[int, str]]
+    warnings: list[str | Notice]
+    left_out: dict[int, SkippedFrame]
+    resized: dict[int, str]
 
     def __init__(self, path: Path) -> None:
         self.path = path

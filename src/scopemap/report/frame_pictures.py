@@ -15,7 +15,6 @@ import numpy as np
 
 from scopemap.engine.errors import reporting
 from scopemap.engine.frame import Rows
-from scopemap.engine.kept import Kept
 from scopemap.engine.odometry import Step
 from scopemap.result.result import Result
 
@@ -39,14 +38,9 @@ class FramePictures:
     since the frame before.
     """
 
-    _pictures: Kept[dict[int, tuple[bytes, bytes]]]
-    _measures: Kept[Rows]
-    _every: Kept[int] = 1
-    _count: Kept[int] = 0
-
     def __init__(self, *, timed: bool = True) -> None:
-        self._pictures = {}
-        self._measures = Rows(_MEASURE)
+        self._pictures = dict[int, tuple[bytes, bytes]]()
+        self._measures, self._every, self._count = Rows(_MEASURE), 1, 0
         self._timed, self._before = timed, time.perf_counter()
 
     def forget(self) -> None:
@@ -57,6 +51,13 @@ class FramePictures:
     def __call__(self, step: Step) -> None:
         """Put the frame of a step in: an observer for `reconstruct`."""
         self.put(step.frame.index, step.frame.rgb, step.frame.valid, step.frame.instruments)
+
+    def again(self, step: Step) -> None:
+        """Put the frame of a step in that was made before the run was resumed: its time is not known any more."""
+        if not step.skipped:
+            timed, self._timed = self._timed, False
+            self(step)
+            self._timed = timed
 
     def put(self, index: int, rgb: np.ndarray, valid: np.ndarray, instruments: np.ndarray | None = None) -> None:
         """Measure a frame, its picture (H, W, 3) uint8, usable pixels, instruments (H, W) bool; keep some."""

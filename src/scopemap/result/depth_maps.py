@@ -11,7 +11,6 @@ import numpy as np
 
 from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.frame import Frame
-from scopemap.engine.kept import Kept
 from scopemap.input.decoding import read_decoded, write_encoded
 
 DEPTH_SCALE_MM = 0.01
@@ -32,8 +31,6 @@ class DepthWriter:
     largest_mm : depth that must be representable; it makes the unit coarser than `DEPTH_SCALE_MM` where necessary.
     Raises `InputError` where nothing can be written.
     """
-
-    _histogram: Kept[np.ndarray]
 
     def __init__(self, folder: Path, largest_mm: float = 0.0) -> None:
         self._folder, self._sigma_folder = (Path(folder) / name for name in ("depth", "depth_sigma"))

@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scopemap.engine.errors import InputError, reporting
-from scopemap.engine.frame import Rows, RowTable
-from scopemap.engine.kept import Kept
+from scopemap.engine.frame import RowTable
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.input.source import SkippedFrame
 from scopemap.input.trajectory.trajectory import OTHER_MAP, ROTATION_ONLY, SKIPPED, STATUSES, TRACKED, Trajectory
@@ -223,13 +222,13 @@ class GrowingFrameTable:
     table : where they are kept; as objects those of hours of video would take hundreds of megabytes.
     """
 
-    last_index: Kept[int] = -1
-    """Number of the last frame, -1 before the first."""
-    _rows: Kept[Rows]
-    _texts: Kept[Rows]
-
     def __init__(self, table: RowTable) -> None:
         self._rows, self._texts = table("frame_table", _STORED), table("frame_texts", np.dtype(np.uint8))
+
+    @property
+    def last_index(self) -> int:
+        """Number of the last frame, -1 before the first."""
+        return int(self._rows.read(len(self) - 1, 1)["index"][0]) if len(self) else -1
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -246,7 +245,6 @@ class GrowingFrameTable:
         stored["text"] = len(self._texts) + np.cumsum([0, *map(len, texts)])
         self._texts.append(np.frombuffer(b"".join(texts), np.uint8))
         self._rows.append(stored)
-        self.last_index = int(one["index"][0])
 
     def read(self) -> FrameTable:
         """Return all rows."""

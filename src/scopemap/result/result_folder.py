@@ -17,7 +17,7 @@ except ImportError:  # Windows, where a file that is open cannot be removed
     fcntl = None  # type: ignore[assignment]
 
 from scopemap.engine.errors import InputError
-from scopemap.result.checkpoint import CHECKPOINT, discard_checkpoint, has_checkpoint
+from scopemap.result.checkpoint import CHECKPOINT, CHECKPOINT_NEW, discard_checkpoint, has_checkpoint
 
 UNFINISHED = ".unfinished"
 """Folder within a result's folder, in which a run writes until it is finished."""
@@ -31,7 +31,7 @@ STORED = "stored_frames"
 VIEW = "view"
 """Folder there with what can be seen of the run while it goes on; it is not of the result."""
 
-NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT, VIEW)
+NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT, CHECKPOINT_NEW, VIEW)
 """Files and folders there that a run needs to go on, and that go with the folder."""
 
 _REPLACED = "replaced"

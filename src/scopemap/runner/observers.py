@@ -14,11 +14,17 @@ Observer = Callable[[Step], bool | None]
 
 
 @runtime_checkable
-class KeptObserver(Protocol):
-    """An `Observer` that is resumed with a run, by what it marks as `Kept`, and saved with the result."""
+class LastingObserver(Protocol):
+    """An `Observer` that sees all frames where a run is resumed, too, and is saved with the result."""
 
     def __call__(self, step: Step) -> bool | None:
         """Take a step."""
+
+    def again(self, step: Step) -> None:
+        """Take a step that was made before the run was resumed, its frame as stored: colours to a few levels.
+
+        Of a frame that was skipped there is no picture.
+        """
 
     def save(self, run: Path) -> None:
         """Write what was observed to the folder of the result."""

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from scopemap.engine.config import Config
 from scopemap.engine.fusion.frame_store import FrameStore
-from scopemap.engine.kept import Kept, kept
 from scopemap.engine.notices import Notice
 from scopemap.engine.pipeline import Pipeline
-from scopemap.engine.tracking.track import FrameTracker
+from scopemap.engine.tracking.track import FrameTracker, ResumableTracker
 from scopemap.input.frame_choice import selection_text, slice_of
 from scopemap.input.sequence import Sequence
-from scopemap.result.checkpoint import SavedState, discard_checkpoint
+from scopemap.result.checkpoint import discard_checkpoint, read_checkpoint
 from scopemap.result.checksums import write_checksums
 from scopemap.result.depth_maps import DepthWriter
 from scopemap.result.result import Result
@@ -24,14 +23,21 @@ from scopemap.result.result_folder import NOT_OF_THE_RESULT, STORED, check_resul
 from scopemap.result.run_input import stated_input
 from scopemap.result.verdict import state_verdict
 from scopemap.result.wording import facts_of_notices
-from scopemap.runner.checkpoints import Checkpoints, can_resume, identity_of, input_changes
+from scopemap.runner.checkpoints import (
+    Checkpoints,
+    can_resume,
+    identity_of,
+    input_changes,
+    said_as_json,
+    said_of_json,
+)
 from scopemap.runner.estimators import largest_depth_mm
 from scopemap.runner.lens_of_motion import MOST_PASSES, OtherLens, lens_of_motion, lenses_of
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.observers import (
     FinalFrameObserver,
     FrameWriter,
-    KeptObserver,
+    LastingObserver,
     Observer,
     Progress,
     RestartedObserver,
@@ -42,8 +48,6 @@ from scopemap.runner.run import Clock, Run
 
 if TYPE_CHECKING:
     from scopemap.report.depth_figures import DepthPreviews
-
-_NO_STORE = "or set mapping.method=none and fusion.voxel_mm: then no frame is stored"
 
 
 def reconstruct(
@@ -58,9 +62,10 @@ def reconstruct(
 ) -> Result:
     """Turn a sequence, or a video, into poses, depth and a surface.
 
-    A run of the same input, settings and versions that was killed in `out` is resumed from its checkpoint, to the same
-    result; if that is damaged the run starts again, which a notice reports. So it does where a `tracker` of your own
-    keeps nothing (`Kept`). Observers of the kind `KeptObserver` are resumed and saved with it.
+    A run of the same input, settings and versions that was killed in `out` is resumed: from the frames that it has
+    stored, to the same result within noise. If these are damaged the run starts again, which a notice reports. So it
+    does where a `tracker` of your own is no `ResumableTracker`. Observers of the kind `LastingObserver` take the stored
+    frames again, and are saved with the result.
 
     Where nobody has given the lens and the motion of all keyframes fits another focal length clearly better, the run
     begins again at its first frame with that one, at most twice; it does not with a `tracker`. Observers then see the
@@ -152,17 +157,33 @@ class _DepthPictures:
 
 @dataclass
 class _PassStart:
-    """What a pass begins with that the call does not name; kept with its checkpoint, for a later pass to be resumed.
+    """What a pass begins with that the call does not name; written with its checkpoint, for it to be resumed.
 
     number : 1 for the first. lens : of the sequence in place of its own. config : settings as resolved by the pass
     before, JSON. warnings : of the source until then. notices : of the run until then.
     """
 
-    number: Kept[int] = 1
-    lens: Kept[OtherLens | None] = None
-    config: Kept[str] = ""
-    warnings: Kept[list[str | Notice]] = field(default_factory=list)
-    notices: Kept[list[Notice]] = field(default_factory=list)
+    number: int = 1
+    lens: OtherLens | None = None
+    config: str = ""
+    warnings: list[str | Notice] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)
+
+    @classmethod
+    def of_record(cls, record: dict[str, Any]) -> _PassStart:
+        """Return what `record` was made of; {} : of no checkpoint."""
+        if not record:
+            return cls()
+        lens, (warnings, notices) = record["lens"], record["said"]
+        found = None if lens is None else OtherLens(lens[0], lens[1], lens[2], tuple(lens[3]))
+        said: list[Any] = said_of_json(notices)
+        return cls(record["number"], found, record["config"], said_of_json(warnings), said)
+
+    def record(self) -> dict[str, Any]:
+        """Return it as JSON holds it."""
+        lens = None if self.lens is None else astuple(self.lens)
+        said = said_as_json(self.warnings), said_as_json(self.notices)
+        return {"number": self.number, "lens": lens, "config": self.config, "said": said}
 
 
 @dataclass(frozen=True)
@@ -191,20 +212,19 @@ class _Passes:
     notices: list[Notice]
 
     @property
-    def lasting(self) -> tuple[KeptObserver, ...]:
+    def lasting(self) -> tuple[LastingObserver, ...]:
         """The observers that are resumed and saved with the run."""
-        return tuple(observer for observer in self.observers if isinstance(observer, KeptObserver))
+        return tuple(observer for observer in self.observers if isinstance(observer, LastingObserver))
 
     def result(self, sequence: Sequence) -> tuple[Result, _DepthPictures | None]:
         """Return the result of the last pass, and what has written its depth."""
-        passes, start = self, _PassStart()
-        if self.folder is not None and (saved := SavedState(self.folder)).facts:
-            saved.restore("pass", start)
-            if start.lens is not None:
-                sequence.source.warnings[:] = start.warnings
-                sequence = start.lens.seen_by(sequence)
-                passes = replace(self, config=Config.model_validate_json(start.config))
-                self.notices[:] = start.notices
+        passes, saved = self, {} if self.folder is None else read_checkpoint(self.folder)
+        start = _PassStart.of_record(saved.get("start", {}))
+        if start.lens is not None:
+            sequence.source.warnings[:] = start.warnings
+            sequence = start.lens.seen_by(sequence)
+            passes = replace(self, config=Config.model_validate_json(start.config))
+            self.notices[:] = start.notices
         while isinstance(found := passes._pass(sequence, start), _Again):
             # What was decided before the first frame stays decided.
             sequence, passes = found.lens.seen_by(sequence), replace(self, config=found.config)
@@ -224,7 +244,7 @@ class _Passes:
     def _pass(self, sequence: Sequence, start: _PassStart) -> tuple[Result, _DepthPictures | None] | _Again:
         """Return the result of a sequence, and what has written its depth; or what to begin again with."""
         folder = self.folder
-        store = FrameStore(folder, _NO_STORE, "" if folder is None else STORED)
+        store = FrameStore(folder, "" if folder is None else STORED)
         sequence, config, estimators, prepared = prepare(sequence, self.config, self.clock.timed, self.progress)
         self.notices.extend(prepared)
         writers: tuple[FrameWriter, ...] = ()
@@ -244,9 +264,8 @@ class _Passes:
             pipeline.mapper.try_lenses(lenses_of(sequence, config, again=start.number > 1))
             run = Run(sequence, pipeline, self.clock, writers, self.progress, self.plan)
             states = None
-            if folder is not None and (self.tracker is None or kept(self.tracker.__class__)):
-                others = {f"observer {number}": observer for number, observer in enumerate(self.lasting)}
-                states = Checkpoints(folder, self.identity, run, {"pass": start, **others})
+            if folder is not None and isinstance(self.tracker, ResumableTracker | None):
+                states = Checkpoints(folder, self.identity, run, start.record(), self.lasting)
             run.track(self.observers, states)
             # A tracker of the caller cannot begin again, and who stops a run waits for its end.
             if start.number < MOST_PASSES and self.tracker is None and not run.stopped:

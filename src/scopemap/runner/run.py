@@ -16,7 +16,6 @@ from numba.core.event import TimingListener, register
 from scopemap.engine.finishing import Execution
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.frame_store import SpreadFrames
-from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.judge import LensTest
 from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
@@ -38,26 +37,29 @@ _END = object()
 
 
 class RunStates(Protocol):
-    """Writes the state of a run as it goes, that of each stage after the same frame, as `Checkpoints` does."""
+    """Writes checkpoints of a run as it goes, with each stage as it was after the same frame, as `Checkpoints` does."""
 
     @property
     def exist(self) -> bool:
-        """Whether there is a state to resume from."""
+        """Whether there is a checkpoint to resume from."""
 
     def restore(self) -> tuple[int, bool]:
-        """Bring the run to the state that was committed last; return the last frame and whether it was that of all."""
+        """Bring the run to where the checkpoint was made; return the last frame and whether it was that of all."""
+
+    def take(self, step: Step) -> None:
+        """Take each step of the run, in order."""
 
     def due(self) -> bool:
-        """Return whether the frame that is read now should be one after which the state is written."""
+        """Return whether the frame that is read now should be one after which a checkpoint is written."""
 
     def keep(self, stage: str) -> None:
-        """Write the state of a stage, called in its thread."""
+        """Make the record of a stage, called in its thread."""
 
     def commit(self, last: int) -> None:
-        """Write the rest; the state is now that after the frame `last`."""
+        """Write the checkpoint after the frame `last`."""
 
     def commit_all(self, last: int, *, stopped: bool, complete: bool) -> None:
-        """Write the state after the last frame that was read, when no stage is at work.
+        """Write the checkpoint after the last frame that was read, when no stage is at work.
 
         stopped : the run ends with it. complete : no further frame follows.
         """
@@ -68,9 +70,9 @@ class KeptMaps:
     """Which maps and frames a run without an end keeps, by its limits; `forgotten` counts frames."""
 
     limits: Limits = field(default_factory=Limits)
-    map: Kept[int] = 0
-    frames_of_map: Kept[Counter[int]] = field(default_factory=Counter)
-    forgotten: Kept[int] = 0
+    map: int = 0
+    frames_of_map: Counter[int] = field(default_factory=Counter)
+    forgotten: int = 0
 
     def beyond(self, track: Track, *, is_full: bool) -> list[int]:
         """Count a frame, and return the numbers of the maps whose surface is to be forgotten."""
@@ -96,15 +98,15 @@ class Run:
     writers: tuple[FrameWriter, ...] = ()
     progress: Progress = lambda doing, done, total: None
     plan: MemoryPlan = field(default_factory=MemoryPlan)
-    kept_maps: Kept[KeptMaps] = field(default_factory=KeptMaps)
+    kept_maps: KeptMaps = field(default_factory=KeptMaps)
     stopped: bool = False
     interrupted: bool = False
     resumed_after: int | None = None
-    frames: Kept[GrowingFrameTable] = field(init=False)
-    checked: Kept[dict[int, SpreadFrames]] = field(default_factory=lambda: defaultdict(SpreadFrames))
+    frames: GrowingFrameTable = field(init=False)
+    checked: dict[int, SpreadFrames] = field(default_factory=lambda: defaultdict(SpreadFrames))
 
     def __post_init__(self) -> None:
-        self.frames = GrowingFrameTable(self.pipeline.fusion.store.table)
+        self.frames = GrowingFrameTable(self.pipeline.fusion.store.lasting_table)
         self.pipeline.fusion.coarser_beyond = self.plan.blocks
         self.pipeline.fusion.most_blocks = self.kept_maps.limits.blocks
         self.pipeline.mapper.limit(self.plan.observations)
@@ -119,11 +121,13 @@ class Run:
         frames, stop = iter(()) if complete else self._until_stopped(last), None
         for step in overlapped(frames, self.pipeline, self.clock, self.plan.ahead, states):
             self.take(step)
+            if states is not None:
+                states.take(step)
             for observer in observers:
                 try:
                     self.stopped = bool(observer(step)) or self.stopped
                 except RunStopped as asked:
-                    # Frames that are on their way are tracked: the state is that after a frame.
+                    # Frames that are on their way are tracked: the checkpoint is that after a frame.
                     self.stopped, stop = True, asked
         if states is not None and len(self.frames) and not complete and (stop or not self.interrupted):
             states.commit_all(self.frames.last_index, stopped=stop is not None, complete=not self.interrupted)
@@ -133,13 +137,7 @@ class Run:
     def take(self, step: Step) -> None:
         """Collect the results of a step, and forget what is beyond the limits."""
         fusion, limits = self.pipeline.fusion, self.kept_maps.limits
-        if not fusion.at_end:
-            for write in self.writers:
-                write(step.frame)
-        # Stored frames are checked as corrected, unless they become too many.
-        if fusion.at_once and (not fusion.at_end or limits != Limits()):
-            in_memory = fusion.at_end or limits.maps is not None
-            self.checked[step.track.map].put(step.frame, None if in_memory else fusion.store)
+        self.replay(step)
         self.frames.append(step.row)
         is_beyond = limits.exceeded(frames=len(self.frames), stored=len(fusion.store))
         if fusion.at_end and fusion.at_once and is_beyond:
@@ -152,6 +150,17 @@ class Run:
             older = self.frames.thin()
             self.pipeline.mapper.forget(older)
             self.kept_maps.forgotten += len(older)
+
+    def replay(self, step: Step) -> None:
+        """Collect the results of a step whose row is there: it was made before the run was resumed."""
+        fusion, limits = self.pipeline.fusion, self.kept_maps.limits
+        if not fusion.at_end:
+            for write in self.writers:
+                write(step.frame)
+        # Stored frames are checked as corrected, unless they become too many.
+        if fusion.at_once and (not fusion.at_end or limits != Limits()):
+            in_memory = fusion.at_end or limits.maps is not None
+            self.checked[step.track.map].put(step.frame, None if in_memory else fusion.store)
 
     def _until_stopped(self, after: int) -> Iterator[Frame]:
         """Yield the frames after one until an observer asks for a stop."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, transform
-from scopemap.engine.kept import Kept
 from scopemap.result.run_view import SeenMap
 
 _POINTS_OF_A_FRAME = 600  # by hand: every 18th pixel or so of the working size in each direction
@@ -26,17 +25,13 @@ class SeenPieces:
     count : points that were taken so far; fewer are shown, the more there are. keyframes : their numbers.
     """
 
-    count: Kept[int] = 0
-    keyframes: Kept[set[int]]
-    _poses: Kept[dict[int, np.ndarray]]
-    _points: Kept[dict[int, tuple[np.ndarray, np.ndarray]]]
-    _earlier: Kept[SeenBefore]
-    _T_shown_world: Kept[np.ndarray | None] = None
-    _last: Kept[np.ndarray | None] = None
-    _every: Kept[int] = 1
+    _T_shown_world: np.ndarray | None = None
+    _last: np.ndarray | None = None
 
     def __init__(self) -> None:
-        self.keyframes, self._poses, self._points, self._earlier = set(), {}, {}, SeenBefore()
+        self.count, self._every, self._earlier = 0, 1, SeenBefore()
+        self.keyframes, self._poses = set[int](), dict[int, np.ndarray]()
+        self._points = dict[int, tuple[np.ndarray, np.ndarray]]()
 
     @property
     def is_sparse(self) -> bool:
@@ -102,11 +97,8 @@ class SeenPieces:
 class SeenBefore:
     """Poses and points, as they are shown, of frames in pieces that have ended."""
 
-    points: Kept[dict[int, np.ndarray]]
-    _poses: Kept[dict[int, np.ndarray]]
-
     def __init__(self) -> None:
-        self.points, self._poses = {}, {}
+        self.points, self._poses = dict[int, np.ndarray](), dict[int, np.ndarray]()
 
     def put(self, poses: dict[int, np.ndarray], points: dict[int, np.ndarray]) -> None:
         """Add those of a piece."""

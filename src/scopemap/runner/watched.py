@@ -17,7 +17,6 @@ import numpy as np
 
 from scopemap.engine.flow.corners import detect_corners
 from scopemap.engine.frame import Frame
-from scopemap.engine.kept import Kept
 from scopemap.engine.odometry import Step
 from scopemap.report.depth_figures import colour_depth
 from scopemap.report.frame_pictures import shrunk
@@ -54,9 +53,6 @@ class RunWatch:
     and what else is shown, by name; drawn : the map of what was not seen so far, PNG, b"": none.
     """
 
-    _pieces: Kept[SeenPieces]
-    _map_of: Kept[dict[int, int]]
-
     def __init__(
         self,
         out: Path | None,
@@ -75,7 +71,7 @@ class RunWatch:
         self._words, self._done, self._frames = "preparing", 0, 0
         self._step: Step | None = None
         self._pieces = SeenPieces()
-        self._map_of = {}
+        self._map_of = dict[int, int]()
         self._final_map: int | None = None
         self._pointed_s, self._drawn_s, self._written = 0.0, 0.0, 0
         self._look, self._looked_s = 0, -_LOOKED_S
@@ -94,20 +90,31 @@ class RunWatch:
 
     def __call__(self, step: Step) -> None:
         """Take a step: an observer for `reconstruct`."""
-        now, frame, track = time.monotonic(), step.frame, step.track
+        now = time.monotonic()
         with self._lock:
             self._progress.add(step)
             self._words, self._done, self._frames = "tracking", self._progress.done, self._total or 0
-            if next(reversed(self._map_of.values()), track.map) != track.map:
-                self._pieces.begin()
-            self._step = step
-            if frame.T_world_camera is None:
-                return
-            self._map_of[frame.index] = track.map
-            self._pieces.keyframes.add(track.keyframe)
             is_due = now - self._pointed_s > _POINTS_EVERY_S
-            self._pointed_s = now if is_due else self._pointed_s
-            self._pieces.put(frame, with_points=is_due)
+            if self._take(step, with_points=is_due) and is_due:
+                self._pointed_s = now
+
+    def again(self, step: Step) -> None:
+        """Take a step that was made before the run was resumed."""
+        with self._lock:
+            self._take(step, with_points=True)
+
+    def _take(self, step: Step, *, with_points: bool) -> bool:
+        """Take a step; return whether its frame has a pose."""
+        frame, track = step.frame, step.track
+        if next(reversed(self._map_of.values()), track.map) != track.map:
+            self._pieces.begin()
+        self._step = step
+        if frame.T_world_camera is None:
+            return False
+        self._map_of[frame.index] = track.map
+        self._pieces.keyframes.add(track.keyframe)
+        self._pieces.put(frame, with_points=with_points)
+        return True
 
     def forget(self) -> None:
         """Begin anew: what a run has shown stays until its frames come again, what a live stream has shown goes."""

@@ -5,8 +5,8 @@ With Depth Pro as the anchor of disparity: equation 1 of arXiv 2508.11282 (MAPIS
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from scopemap.engine.depth.estimate import DepthEstimate, DepthEstimator, DepthK
 from scopemap.engine.depth.pseudo_stereo import AffineDisparity, fit_affine_disparity, fit_baseline_lbfgsb
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.frame import Frame
-from scopemap.engine.kept import Kept
 
 # A frame with a smaller share of pixels that have both an estimate and an anchor is skipped.
 _MIN_SHARE = 0.02  # by hand
@@ -66,19 +65,29 @@ class AnchoredDepth:
     scale_is_known : whether it is measured, or anchored to a range or by Depth Pro. is_stated : whether to a range.
     """
 
-    reference: Kept[DepthEstimator]
-    conversion: Kept[AffineDisparity | DepthScale | None] = None
-    description: Kept[str] = "not anchored: no usable frame yet"
-    scale_is_known: Kept[bool] = False
-    is_measured: Kept[bool] = False
-    is_stated: Kept[bool] = False
-    just_fitted: Kept[bool] = False
+    conversion: AffineDisparity | DepthScale | None = None
+    description = "not anchored: no usable frame yet"
+    scale_is_known = False
+    is_measured = False
+    is_stated = False
+    just_fitted = False
     """Whether the last frame determined the conversion, so that its depth needs no scale from earlier frames."""
 
     def __init__(self, settings: DepthSettings, reference: DepthEstimator) -> None:
         _check_range(settings)
         self._settings = settings
         self.reference = reference
+
+    def record(self) -> dict[str, Any]:
+        """Return the conversion and what is known of it, for `resume`, as JSON holds it."""
+        facts = self.description, self.scale_is_known, self.is_measured, self.is_stated
+        return {"facts": facts, "conversion": None if self.conversion is None else asdict(self.conversion)}
+
+    def resume(self, record: dict[str, Any]) -> None:
+        """Go on from a record."""
+        self.description, self.scale_is_known, self.is_measured, self.is_stated = record["facts"]
+        if (found := record["conversion"]) is not None:
+            self.conversion = AffineDisparity(**found) if "shift" in found else DepthScale(**found)
 
     def metric(self, estimate: DepthEstimate, frame: Frame) -> MetricDepth:
         """Return metric depth (H, W) float32, mm, NaN = unknown, with its standard deviation where it is estimated.

@@ -55,6 +55,13 @@ class DepthEstimator(Protocol):
 
 
 @runtime_checkable
+class ScaleFixed(Protocol):
+    """An estimator that fixes its scale, mm, on the first usable frame (None until then), for a resumed run, too."""
+
+    scale_mm: float | None
+
+
+@runtime_checkable
 class Releasable(Protocol):
     """A network whose memory can be had back; Depth Pro holds 4 GB, and serves the anchor alone."""
 

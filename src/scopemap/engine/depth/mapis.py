@@ -20,7 +20,6 @@ from scopemap.engine.errors import check_shape
 from scopemap.engine.flow.estimator import FlowEstimator, pair_flow
 from scopemap.engine.geometry.uncertainty import blended_sigma, by_variance, faded_sigma, relative_sigma
 from scopemap.engine.geometry.warp import bilateral_filtered, moved_depth, pull
-from scopemap.engine.kept import Kept
 
 # Share of the image that must be known in both depths for a scale to be fitted; across a cut 0.06 is so by chance.
 _MIN_OVERLAP = 0.2
@@ -51,7 +50,7 @@ class DenseCorrespondence:
 class DenseMatcher:
     """Matches masked images, in order, with the previous one."""
 
-    _previous: Kept[tuple[np.ndarray, np.ndarray] | None] = None
+    _previous: tuple[np.ndarray, np.ndarray] | None = None
 
     def __init__(self, settings: MapisSettings, flow: FlowEstimator, perceptual: PerceptualDistance) -> None:
         self._settings, self._flow, self._perceptual = settings, flow, perceptual
@@ -103,11 +102,10 @@ class _Propagated(NamedTuple):
 class Mapis:
     """Refines the raw depth of frames in order (equations 2 to 4); `reset` starts a new chain after a lost frame."""
 
-    _propagated: Kept[_Propagated | None] = None
-    _scale: Kept[float] = 1.0
+    _propagated: _Propagated | None = None
 
     def __init__(self, settings: MapisSettings) -> None:
-        self.settings = settings
+        self.settings, self._scale = settings, 1.0
 
     def refine(
         self,
@@ -156,6 +154,10 @@ class Mapis:
     def rescale(self, scale: float) -> None:
         """Let the next frame start with a scale that is known."""
         self._propagated, self._scale = None, scale
+
+    def resume_after(self, depth_mm: np.ndarray, sigma_mm: np.ndarray | None) -> None:
+        """Go on after a frame that was refined before the run was resumed: its depth (H, W) mm, and sigma of that."""
+        self._propagated = _Propagated(depth_mm, relative_sigma(depth_mm, sigma_mm))
 
     def _scales(self, kind: DepthKind) -> bool:
         frame_scale = self.settings.frame_scale

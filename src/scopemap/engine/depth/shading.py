@@ -10,7 +10,6 @@ from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.depth.guided import filled, guided_filter
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.srgb import LINEAR
-from scopemap.engine.kept import Kept
 
 # Of what is by trial: on the real frames of `scopemap_bench.scripts.depth_without_download`.
 _EXPONENT = 0.6  # by trial: distance = k * brightness^-exponent; an inverse square gives 0.5
@@ -40,8 +39,8 @@ class ShadingDepth:
     `settings.shading_median_mm`, and kept from then on, so that depth shrinks as the camera approaches.
     """
 
-    _scale_mm: Kept[float | None] = None
-
+    scale_mm: float | None = None
+    """k; None until it is fixed."""
     name = "shading"
 
     def __init__(self, settings: DepthSettings) -> None:
@@ -55,11 +54,11 @@ class ShadingDepth:
         """
         unit_z = 1 / np.linalg.norm(frame.camera.rays, axis=-1)
         distance = _relative_distance(frame, unit_z)
-        if self._scale_mm is None:
+        if self.scale_mm is None:
             seen = distance[frame.valid & np.isfinite(distance)]
             if seen.size >= _MIN_SHARE * distance.size:
-                self._scale_mm = self._settings.shading_median_mm / float(np.median(seen))
-        scale_mm = np.nan if self._scale_mm is None else self._scale_mm
+                self.scale_mm = self._settings.shading_median_mm / float(np.median(seen))
+        scale_mm = np.nan if self.scale_mm is None else self.scale_mm
         return DepthEstimate((scale_mm * distance * unit_z).astype(np.float32), "depth")
 
     def provenance(self) -> dict[str, str]:

@@ -15,7 +15,6 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.warp import bilinear
-from scopemap.engine.kept import Kept
 
 _CORNER_BLOCK_PX = 5  # by hand: window of a corner's strength
 _BORDER_PX = 3  # by hand: corners keep so far from what is masked
@@ -80,15 +79,11 @@ class Correspondences2D3D:
 class KeyframeMatcher:
     """Matches the corners of a keyframe with depth in other frames, by forward-backward consistent flow."""
 
-    _keyframe: Kept[Frame | None] = None
-    _flows: Kept[FlowPair | None] = None
-    _patterns: Kept[np.ndarray]
-    _usual_coverage: Kept[float] = 1.0
-    _corners: Kept[np.ndarray]
-    _points_mm: Kept[np.ndarray]
+    _keyframe: Frame | None = None
+    _flows: FlowPair | None = None
 
     def __init__(self, flow: FlowEstimator) -> None:
-        self.flow = flow
+        self.flow, self._usual_coverage = flow, 1.0
         self._small = np.zeros((0, 0, 3), np.uint8)  # the keyframe's picture at the size that was matched last
         self._patterns = np.zeros((0, 0), np.uint8)
         self._corners = np.zeros((0, 2), dtype=int)

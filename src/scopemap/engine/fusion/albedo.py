@@ -20,7 +20,6 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.fusion.tsdf import BLOCK, MeasuredSurface, TsdfCamera, VoxelBlocks, measure_surface
 from scopemap.engine.geometry.kernels import kernel
-from scopemap.engine.kept import Kept
 
 _COSINE_POWER = 0.1  # fitted with the next two on three real clips and two phantoms (docs/method.md, Fusion)
 _DISTANCE_POWER = 0.8  # fitted: -0.71 to -0.95 in each; sRGB and an inverse square give 0.9
@@ -43,11 +42,10 @@ _GREY = np.array([0.299, 0.587, 0.114], np.float32)  # luma of ITU-R BT.601
 class AlbedoPainter:
     """Turns the frames that are fused, in order, into pictures of albedo in one exposure."""
 
-    _log_level: Kept[float | None] = None
-    _median_levels: Kept[list[float]]
+    _log_level: float | None = None
 
     def __init__(self) -> None:
-        self._median_levels = []
+        self._median_levels = list[float]()
 
     @property
     def median_level(self) -> float | None:

@@ -7,6 +7,7 @@ import tempfile
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from threading import Lock
@@ -18,7 +19,6 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.frame import REGIONS, Frame, Rows
-from scopemap.engine.kept import Kept
 
 # ln of millimetres in 16 bits: 0.0001 mm (standard deviations are small) to 34 m in steps of 0.03 %; 0 = unknown.
 _LOG_STEP = 3e-4
@@ -55,12 +55,9 @@ class StoredFile:
     Raises `InputError` where the folder is full or read-only, and where what is read is not what was put in.
     """
 
-    name: Kept[str]
-    size: Kept[int] = 0
-    crc: Kept[int] = 0
-
     def __init__(self, store: FrameStore, name: str) -> None:
         self.name, self._store = name, store
+        self.size = self.crc = 0
         self._file: IO[bytes] | None = None
 
     def append(self, content: bytes) -> None:
@@ -100,8 +97,14 @@ class StoredFile:
         if self._file is not None:
             os.fsync(self._file.fileno())
 
-    def reopen(self) -> None:
-        """Open the file that this one was restored from; what was put in later is cut off."""
+    @property
+    def state(self) -> dict[str, Any]:
+        """What `reopen` takes, as JSON holds it."""
+        return {"name": self.name, "size": self.size, "crc": self.crc}
+
+    def reopen(self, state: Mapping[str, Any]) -> None:
+        """Go on with the file as it was in a state; what was put in later is cut off."""
+        self.size, self.crc = int(state["size"]), int(state["crc"])
         if self.size:
             self._file = self._store.opened(self.name, "r+b")
             self._file.truncate(self.size)
@@ -114,7 +117,7 @@ class StoredFile:
 
 
 def check_stored(folder: Path, files: Iterable[Mapping[str, Any]]) -> None:
-    """Raise `InputError` unless a store's folder holds these files: name, size and crc of each `StoredFile`.
+    """Raise `InputError` unless a store's folder holds the files of these states of `StoredFile`s.
 
     What follows after `size` bytes does not count.
     """
@@ -133,23 +136,28 @@ def check_stored(folder: Path, files: Iterable[Mapping[str, Any]]) -> None:
 class StoredRows(Rows):
     """Rows in a file of a frame store, which is created with the first; one thread at a time may use them."""
 
-    _file: Kept[StoredFile]
-
     def __init__(self, kind: np.dtype, file: StoredFile) -> None:
         super().__init__(kind)
         self._file = file
 
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self._file.size // self._kind.itemsize
+
     def append(self, rows: np.ndarray) -> None:
         """Put rows (n,) of the kind in. Raises `InputError` where the folder is full or read-only."""
-        if not self._count:
-            self._file.clear()  # `keep` puts all in again
         self._file.append(self._raw(rows).tobytes())
-        self._count += len(rows)
 
     def read(self, first: int = 0, count: int | None = None) -> np.ndarray:
         """Return `count` rows from the row `first` on; None: all. Raises `InputError` where they are damaged."""
-        size = (self._count - first if count is None else count) * self._kind.itemsize
+        size = (len(self) - first if count is None else count) * self._kind.itemsize
         return np.frombuffer(bytearray(self._file.read(first * self._kind.itemsize, size)), self._kind)
+
+    def keep(self, kept: np.ndarray) -> None:
+        """Forget the rows where `kept`, (N,) bool, is False."""
+        rows = self.read()[kept]
+        self._file.clear()
+        self.append(rows)
 
     def parts(self) -> Iterator[np.ndarray]:
         """Yield all rows in parts. Raises `InputError` after the last one where they are damaged."""
@@ -163,22 +171,16 @@ class StoredRows(Rows):
 class FrameStore:
     """Stores frames with depth in one file, which is created with the first frame, and tables in files beside it.
 
-    folder : where these are; None: the system's temporary folder. advice : what else helps where that is full.
-    name : of a folder in it for the files, which then stay when the store is closed, for a run to resume; "": they are
-    deleted then.
+    folder : where these are; None: the system's temporary folder. name : of a folder in it for the files, which then
+    stay when the store is closed, for a run to resume; "": they are deleted then.
     """
 
-    _images: Kept[StoredFile]
-    _entries: Kept[StoredRows]
-    _cameras: Kept[list[PinholeCamera]]
-
-    def __init__(self, folder: Path | None = None, advice: str = "", name: str = "") -> None:
+    def __init__(self, folder: Path | None = None, name: str = "") -> None:
         self._folder, self._name = Path(tempfile.gettempdir() if folder is None else folder), name
-        self._advice = f", {advice}" if advice else ""
         self._images = StoredFile(self, "frames")
-        self._files = [self._images]
-        self._entries = self.table("frame_entries", _ENTRY)
-        self._cameras = []
+        self._files, self._lasting = [self._images], [self._images]
+        self._entries = self.lasting_table("frame_entries", _ENTRY)
+        self._cameras = list[PinholeCamera]()
         self._known: tuple[np.ndarray, dict[int, int]] | None = None
         self._reading = Lock()
 
@@ -190,6 +192,12 @@ class FrameStore:
         """Return new rows of a kind in a file of that name."""
         self._files.append(StoredFile(self, name))
         return StoredRows(kind, self._files[-1])
+
+    def lasting_table(self, name: str, kind: np.dtype) -> StoredRows:
+        """Return new rows as `table` does, which a resumed run has again, as it has the frames."""
+        rows = self.table(name, kind)
+        self._lasting.append(self._files[-1])
+        return rows
 
     def put(self, frame: Frame) -> None:
         """Store a frame. Raises `InputError` where the folder is full or read-only."""
@@ -229,7 +237,7 @@ class FrameStore:
             yield
         except OSError as error:
             raise InputError(
-                f"cannot store frames in {self._folder}: {error.strerror or error}; free space there{self._advice}"
+                f"cannot store frames in {self._folder}: {error.strerror or error}; free space there"
             ) from None
 
     def opened(self, name: str, mode: str) -> IO[bytes]:
@@ -239,15 +247,23 @@ class FrameStore:
         (self._folder / self._name).mkdir(exist_ok=True)
         return (self._folder / self._name / name).open(mode)
 
-    def sync(self) -> None:
-        """Have the disk hold what was stored. Raises `OSError` where it cannot."""
-        for file in self._files:
-            file.sync()
+    def record(self) -> dict[str, Any]:
+        """Have the disk hold the frames and the lasting tables, and return what `resume` takes, as JSON holds it.
 
-    def reopen(self) -> None:
-        """Open the files of the store that this one was restored from; what was put in later is cut off."""
-        for file in self._files:
-            file.reopen()
+        Raises `OSError` where the disk cannot.
+        """
+        for file in self._lasting:
+            file.sync()
+        return {"files": [file.state for file in self._lasting], "cameras": [asdict(one) for one in self._cameras]}
+
+    def resume(self, record: Mapping[str, Any]) -> None:
+        """Take frames and lasting tables as they were when a record was made; what was put in later is cut off.
+
+        They are those of a store in the same folder, which had the same lasting tables. Raises `OSError`.
+        """
+        for file, state in zip(self._lasting, record["files"], strict=True):
+            file.reopen(state)
+        self._cameras, self._known = [PinholeCamera(**camera) for camera in record["cameras"]], None
 
     def __contains__(self, index: int) -> bool:
         """Return whether the frame with this number is stored."""
@@ -319,19 +335,16 @@ class FrameStore:
 class SpreadFrames:
     """Every n-th of the frames with a pose that are put in, at most `_MOST_SPREAD`; n doubles as they grow more."""
 
-    _kept: Kept[list[Frame | int]]
-    _every: Kept[int] = 1
-    _count: Kept[int] = 0
-
     def __init__(self) -> None:
-        self._kept = []
+        self._kept = list[Frame | int]()
+        self._every, self._count = 1, 0
 
     def put(self, frame: Frame, store: FrameStore | None = None) -> None:
         """Keep or skip a frame; store : where it is kept, as those of many maps fill the memory."""
         if frame.T_world_camera is None:
             return
         if self._count % self._every == 0:
-            if store is not None:
+            if store is not None and frame.index not in store:
                 store.put(frame)
             self._kept.append(frame if store is None else frame.index)
         self._count += 1

@@ -14,7 +14,6 @@ import numpy as np
 
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import transform
-from scopemap.engine.kept import Kept
 
 # The first three were chosen on frames of the real clips that were kept out of fusion, as the largest with which
 # coverage, depth and SSIM of these stay (`scopemap evaluate --against-video`). Step between directions, unit vectors.
@@ -39,12 +38,8 @@ class NewViews:
     choice does not depend on the scale. every : choose every n-th frame instead; 0: by views.
     """
 
-    _views: Kept[np.ndarray]
-    _quality: Kept[np.ndarray]
-    _since: Kept[int]  # frames since the one that was chosen last
-
     def __init__(self, every: int = 0) -> None:
-        self._every, self._since = every, max(every - 1, 0)
+        self._every, self._since = every, max(every - 1, 0)  # frames since the one that was chosen last
         self._views, self._quality = np.zeros(_SLOTS, np.int64), np.zeros(_SLOTS, np.float32)
 
     def chosen(self, frame: Frame, world: int = 0) -> Frame | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass
@@ -33,7 +32,6 @@ from scopemap.engine.fusion.tsdf import (
 )
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.geometry.uncertainty import depth_trust
-from scopemap.engine.kept import Kept
 from scopemap.engine.notices import Notice
 
 # Below this cosine a slanted wall cannot be distinguished from a depth edge, with weights or without.
@@ -55,7 +53,6 @@ _VOXELS_PER_MAX_DEPTH = 200  # by hand
 _MASKED_COLOUR = 0.01  # by hand
 _SURROUNDINGS = 1 / 12  # by hand
 _EVERY_PX = 4  # by hand, for time
-_ANY_DEPTH_MM = 60.0  # guard: of a volume whose parameters are not known yet
 # No endoscope resolves less; memory would be spent on noise.
 _MIN_VOXEL_MM = 0.01  # by hand
 
@@ -100,11 +97,6 @@ def steepest_cosine(settings: FusionSettings) -> float:
 
 class TsdfVolume:
     """An unbounded truncated signed distance field; `ValueError` where the parameters do not set `voxel_mm`."""
-
-    parameters: Kept[TsdfParameters]
-    finest_mm: Kept[float]
-    _blocks: Kept[VoxelBlocks]
-    _painter: Kept[AlbedoPainter | None]
 
     def __init__(self, settings: FusionSettings, parameters: TsdfParameters | None = None) -> None:
         self.settings = settings
@@ -223,14 +215,12 @@ class SurfaceFusion:
     corrected : whether frames are corrected after the last one.
     """
 
-    store: Kept[FrameStore]
-    _volumes: Kept[dict[int, TsdfVolume]]
-    _views: Kept[NewViews]
-
     def __init__(self, settings: FusionSettings, store: FrameStore, *, corrected: bool) -> None:
         self.settings, self.store = settings, store
         self.at_end = corrected or (settings.enabled and settings.voxel_mm is None)
         """Whether frames are stored, and fused after the last one."""
+        self.keeps_frames = False
+        """Whether frames that are fused at once are stored, too: a run that is resumed takes them from there."""
         self.shown = False
         """Whether the surface so far is looked at: frames are then fused at once, too, and anew after the last one."""
         self.most_blocks: int | None = None
@@ -238,8 +228,7 @@ class SurfaceFusion:
         None: no limit."""
         self.coarser_beyond: int | None = None
         """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
-        # Those of a run that is resumed are made here, and then get the parameters that they had.
-        self._volumes = defaultdict(lambda: TsdfVolume(settings, choose_parameters(settings, _ANY_DEPTH_MM)))
+        self._volumes = dict[int, TsdfVolume]()
         self._views = NewViews(settings.every)
 
     @property
@@ -268,8 +257,12 @@ class SurfaceFusion:
 
     def put(self, frame: Frame, map_number: int = 0) -> None:
         """Store a frame, and fuse it in its map's volume if it has a pose and `NewViews` chooses it; or one of both."""
-        if self.at_end:
+        if self.at_end or self.keeps_frames:
             self.store.put(frame)
+        self.replay(frame, map_number)
+
+    def replay(self, frame: Frame, map_number: int = 0) -> None:
+        """Take a frame that is stored as `put` takes it: it is fused at once where frames are."""
         if not self.at_once or frame.T_world_camera is None or self.is_full:
             return
         if (chosen := self._views.chosen(frame, map_number)) is not None:

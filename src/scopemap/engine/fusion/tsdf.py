@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from scopemap.engine.geometry.kernels import inner_kernel, kernel
-from scopemap.engine.kept import Kept
 
 BLOCK = 8  # voxels along an edge of a block: 8, as Niessner et al. 2013 hash them
 # 21 bits of a key for each block coordinate.
@@ -335,13 +334,10 @@ def _integrate_blocks(
 class VoxelBlocks:
     """Blocks of 8^3 voxels by the key of their coordinate; slot 0 of `voxels` is always an empty block."""
 
-    voxels: Kept[Voxels]
-    _slots: Kept[dict[int, int]]
-
     def __init__(self) -> None:
         self.voxels = _zeros(_FIRST_CAPACITY)
         # A dict finds the few thousand blocks of a frame in under a millisecond; a compiled hash table gains nothing.
-        self._slots = {}
+        self._slots = dict[int, int]()
 
     def __len__(self) -> int:
         return len(self._slots)

@@ -51,6 +51,17 @@ class KeyframeCorrection(NamedTuple):
         log = np.float32(self.log_scale) + self.log_factor(np.asarray(frame.depth_mm))
         return _with_depth_times(frame, np.exp(log, dtype=np.float32))
 
+    def undone(self, frame: Frame) -> Frame:
+        """Return a corrected frame with its depth, and the standard deviation of that, as estimated."""
+        log = np.float32(self.log_scale) + self.log_factor_before(np.asarray(frame.depth_mm))
+        return _with_depth_times(frame, np.exp(-log, dtype=np.float32))
+
+    def log_factor_before(self, corrected_mm: np.ndarray) -> np.ndarray | np.float32:
+        """Return ln of the field's factor (H, W) by which depth (H, W) mm was corrected; 0 without a field."""
+        if self.field is None:
+            return np.float32(0)
+        return self.field.log_factor_before(corrected_mm * np.exp(np.float32(-self.log_scale)))
+
     def log_factor(self, depth_mm: np.ndarray) -> np.ndarray | np.float32:
         """Return ln of the field's factor (H, W) of depth (H, W) mm as estimated; 0 without a field."""
         return np.float32(0) if self.field is None else self.field.log_factor(depth_mm)
@@ -79,8 +90,8 @@ class KeyframeStep(NamedTuple):
         """
         if self.before.field is None and self.after.field is None:
             return np.float32(0)
+        log = self.before.log_factor_before(depth_mm)
         estimated_mm = depth_mm * np.exp(np.float32(-self.before.log_scale))
-        log = np.float32(0) if self.before.field is None else self.before.field.log_factor_before(estimated_mm)
         return self.after.log_factor(estimated_mm * np.exp(-log)) - log
 
 

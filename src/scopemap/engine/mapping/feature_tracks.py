@@ -29,10 +29,9 @@ from scopemap.engine.flow.corners import (
     small_flow_size,
 )
 from scopemap.engine.flow.estimator import FlowEstimator, FlowPair
-from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, RowTable, rows_in_memory
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.geometry.uncertainty import relative_sigma
-from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_problem import Observations, Points
 from scopemap.engine.mapping.loop_closure import MOST_RECENT, Loop
 
@@ -108,11 +107,7 @@ class FeatureTracks:
     gaps : how many keyframes before it these are.
     """
 
-    keyframe_count: Kept[int] = 0
-    _recent: Kept[dict[int, deque[_FlowKeyframe]]]
-    _points: Kept[Rows]
-    _matches: Kept[Rows]
-    _camera: Kept[PinholeCamera | None] = None
+    _camera: PinholeCamera | None = None
 
     def __init__(
         self,
@@ -121,7 +116,7 @@ class FeatureTracks:
         gaps: Collection[int] = KEYFRAME_GAPS,
     ) -> None:
         self._flow, self._gaps = flow, gaps
-        self._recent = {}
+        self._recent, self.keyframe_count = dict[int, deque[_FlowKeyframe]](), 0
         self._points, self._matches = table("points", _POINT), table("observations", _MATCH)
 
     def add(self, keyframe: Frame, map_number: int = 0, known: KeyframeMatches | None = None) -> KeyframeMatches:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse
-from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.bundle_adjustment import BundleSolution, adjust
 from scopemap.engine.mapping.bundle_problem import (
     CORRELATED,
@@ -70,19 +69,13 @@ class LocalAdjustment:
     settings : with `local_window`, keyframes that are adjusted together. flow : between keyframes, in one thread.
     """
 
-    _tracks: Kept[FeatureTracks]
-    _window: Kept[deque[_WindowKeyframe]]
-    _corrections: Kept[dict[int, KeyframeCorrection]]
-    _adjusted: Kept[Counter[int]]
-    _refused: Kept[Counter[int]]
-    _is_determined: Kept[bool] = False
-    _shapes: Kept[dict[int, ShapeTest]]
-
     def __init__(self, settings: MappingSettings, flow: FlowEstimator) -> None:
         self._settings, self._flow = settings, flow
         self._tracks = FeatureTracks(flow, gaps=_GAPS)
-        self._window = deque(maxlen=settings.local_window)
-        self._corrections, self._shapes = {}, {}
+        self._window = deque[_WindowKeyframe](maxlen=settings.local_window)
+        self._corrections, self._shapes = dict[int, KeyframeCorrection](), dict[int, ShapeTest]()
+        self._is_determined = False
+        self._replayed = deque[tuple[Frame, int]](maxlen=settings.local_window)  # keyframes, and their references
         self._adjusted, self._refused = Counter[int](), Counter[int]()
 
     def corrected(self, frame: Frame, reference: int) -> Frame:
@@ -113,14 +106,49 @@ class LocalAdjustment:
             else:
                 self._adjusted[map_number] += 1
                 correction = self._update(points, found, keyframe.camera)
-        self._corrections[keyframe.index] = correction
-        while len(self._corrections) > _REMEMBERED:
-            del self._corrections[next(iter(self._corrections))]
+        self._remember(keyframe.index, correction)
         T_camera_world = self._window[-1].T_camera_world
         moved = correction.corrected(replace(keyframe, T_world_camera=inverse(T_camera_world)))
         arrived = T_camera_world @ np.asarray(keyframe.T_world_camera)
         step = KeyframeStep(arrived, self._correction(reference), correction)
         return AdjustedKeyframe(moved, matches, step)
+
+    def record(self) -> dict[str, Any]:
+        """Return what was adjusted of each map, for `resume`, as JSON holds it."""
+        return {"adjusted": dict(self._adjusted), "refused": dict(self._refused), "shapes": dict(self._shapes)}
+
+    def resume(self, record: dict[str, Any]) -> None:
+        """Go on from a record, with a new window."""
+        self._adjusted, self._refused = (
+            Counter({int(number): count for number, count in record[name].items()}) for name in ("adjusted", "refused")
+        )
+        self._shapes = {int(number): ShapeTest(*shape) for number, shape in record["shapes"].items()}
+
+    def replay(self, keyframe: Frame, reference: int, step: KeyframeStep) -> KeyframeStep:
+        """Take a keyframe as it was adjusted before the run was resumed, and its step, but for `step.before`.
+
+        Returns all of the step. reference : as `adjusted` takes it.
+        """
+        before = self._correction(reference)
+        self._remember(keyframe.index, step.after)
+        self._replayed.append((keyframe, reference))
+        return step._replace(before=before)
+
+    def resume_window(self) -> None:
+        """Make the window of the keyframes that were replayed last."""
+        for keyframe, reference in self._replayed:
+            if reference not in {number for one in self._window for number in (one.frame, one.reference)}:
+                self._begin()
+            correction = self._correction(keyframe.index)
+            self._take(correction.undone(keyframe), reference)
+            last = self._window[-1]
+            log_depth = last.log_depth + correction.log_scale - last.log_scale
+            self._window[-1] = last._replace(log_scale=correction.log_scale, log_depth=log_depth)
+        self._replayed.clear()
+
+    def undone(self, frame: Frame, reference: int) -> Frame:
+        """Return a frame that was handed on, tracked against the keyframe of `reference`, with depth as estimated."""
+        return self._correction(frame.index if frame.index in self._corrections else reference).undone(frame)
 
     def take_over(self, index: int, reference: int) -> None:
         """Have frames be tracked against frame `index` too, which was tracked against the keyframe of `reference`."""
@@ -151,6 +179,11 @@ class LocalAdjustment:
 
     def _correction(self, reference: int) -> KeyframeCorrection:
         return self._corrections.get(reference, KeyframeCorrection())
+
+    def _remember(self, index: int, correction: KeyframeCorrection) -> None:
+        self._corrections[index] = correction
+        while len(self._corrections) > _REMEMBERED:
+            del self._corrections[next(iter(self._corrections))]
 
     def _take(self, keyframe: Frame, reference: int, known: KeyframeMatches | None = None) -> KeyframeMatches:
         """Put a keyframe in the window, as aligned; return its matches. known : what was matched of it before."""

@@ -18,10 +18,9 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.corners import usable_pixels
-from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, RowTable, rows_in_memory
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.geometry.se3 import transform
-from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.features import (
     FeatureDetector,
     Features,
@@ -121,14 +120,7 @@ class LoopFinder:
     no loop is sought.
     """
 
-    _features: Kept[dict[int, _KeptFeatures]]
-    _rows: Kept[Rows]
-    _views: Kept[Rows]
-    _map_of: Kept[dict[int, int]]
-    _count: Kept[int] = 0
-    _every: Kept[int] = 1
-    _loops_to: Kept[defaultdict[int, list[int]]]
-    _camera: Kept[PinholeCamera | None] = None
+    _camera: PinholeCamera | None = None
 
     def __init__(
         self,
@@ -141,8 +133,9 @@ class LoopFinder:
         self._strongest = _STRONGEST_VALUES // self._detector.descriptor_size
         self._min_inliers, self._recent = settings.min_loop_inliers, recent
         self._rows, self._views = table("features", self._kind), table("views", VIEW)
-        self._features, self._map_of = {}, {}
-        self._loops_to = defaultdict(list)
+        self._features, self._map_of = dict[int, _KeptFeatures](), dict[int, int]()
+        self._loops_to = defaultdict[int, list[int]](list)
+        self._count, self._every = 0, 1
 
     @property
     def _kind(self) -> np.dtype:

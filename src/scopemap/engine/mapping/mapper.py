@@ -16,9 +16,8 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import MappingSettings
 from scopemap.engine.flow.estimator import FlowEstimator
-from scopemap.engine.frame import Frame, Rows, RowTable, rows_in_memory
+from scopemap.engine.frame import Frame, RowTable, rows_in_memory
 from scopemap.engine.geometry.se3 import inverse
-from scopemap.engine.kept import Kept
 from scopemap.engine.mapping.correction import KeyframeStep, TrackedPose
 from scopemap.engine.mapping.depth_correction import depth_grid
 from scopemap.engine.mapping.feature_tracks import FeatureTracks, KeyframeMatches
@@ -57,16 +56,8 @@ class Backend:
     observations until the last keyframe. anchored : as `scale_by_network` takes it.
     """
 
-    _frames: Kept[list[int]]
-    _tracked: Kept[list[TrackedPose]]
-    _steps: Kept[list[KeyframeStep]]
-    _log_scales: Kept[list[float]]
-    _depths_mm: Kept[Rows]
-    _grid_shape: Kept[tuple[int, int]] = (0, 0)
-    _tracks: Kept[FeatureTracks]
-    _finder: Kept[LoopFinder | None]
-    _loops: Kept[Rows]
-    _camera: Kept[PinholeCamera | None] = None
+    _grid_shape: tuple[int, int] = (0, 0)
+    _camera: PinholeCamera | None = None
 
     def __init__(
         self,
@@ -77,7 +68,8 @@ class Backend:
         anchored: bool = False,
     ) -> None:
         self._settings, self._anchored = settings, anchored
-        self._frames, self._tracked, self._steps, self._log_scales = [], [], [], []
+        self._frames, self._tracked = list[int](), list[TrackedPose]()
+        self._steps, self._log_scales = list[KeyframeStep](), list[float]()
         self._depths_mm, self._loops = table("depth_grids", np.dtype(np.float32)), table("loops", LOOP)
         self._tracks = FeatureTracks(flow, table)
         self._finder = LoopFinder(settings, table, features) if settings.min_loop_inliers > 0 else None
@@ -205,11 +197,7 @@ class Mapper:
     anchored : as `scale_by_network` takes it.
     """
 
-    _backend: Kept[Backend | None]
-    _rows: Kept[Rows]
-    _last: Kept[tuple[int, TrackedPose] | None] = None
-    _lost_frames: Kept[int] = 0
-    _relocalised: Kept[set[tuple[Part, Part]]]
+    _last: tuple[int, TrackedPose] | None = None
 
     def __init__(
         self,
@@ -223,7 +211,7 @@ class Mapper:
         self._backend = Backend(settings, flow, table, features, anchored) if links else None
         self._rows = table("tracked_poses", _TRACKED)
         self._tracked: dict[int, TrackedPose] = {}
-        self._relocalised = set()
+        self._relocalised, self._lost_frames = set[tuple[Part, Part]](), 0
         # What follows changes after the last frame.
         self._changed: dict[int, TrackedPose] = {}
         self._extended: set[int] = set()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 from scopemap.engine.config import MaskSettings
 from scopemap.engine.frame import Frame, is_constant, percentiles
-from scopemap.engine.kept import Kept
 from scopemap.engine.masking.overlays import OverlayFinder
 from scopemap.engine.notices import Notice
 
@@ -45,19 +44,20 @@ class FieldOfView:
     as far from pixels that the rectification could not fill, but not from the image's own edge.
     """
 
-    _lit: Kept[np.ndarray | None] = None
-    _field: Kept[np.ndarray | None] = None
+    lit: np.ndarray | None = None
+    """What was lit in any frame so far, (H, W) bool; None before the first."""
+    _field: np.ndarray | None = None
 
     def __call__(self, lit: np.ndarray, rectified: np.ndarray) -> np.ndarray:
         """Return the field of view, (H, W) bool, and learn from this frame; lit, rectified : (H, W) bool."""
         # Single bright pixels are noise of the coding in the black surround.
         lit = cv2.morphologyEx((lit & rectified).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-        known = self._lit
-        if known is not None and self._field is not None and known.shape == lit.shape:
-            if not (lit & ~known).any():
+        known = self.lit
+        if known is not None and known.shape == lit.shape:
+            if self._field is not None and not (lit & ~known).any():
                 return self._field
             lit |= known
-        self._lit = lit
+        self.lit = lit
         self._field = cv2.erode((hull_of_largest(lit) & rectified).astype(np.uint8), disc(BORDER_PX)).astype(bool)
         return self._field
 
@@ -94,15 +94,28 @@ class StoredMasks(Protocol):
 class Masker:
     """Narrows `Frame.valid` to usable tissue, in the field of view of all frames so far and outside of mask `files`."""
 
-    _field: Kept[FieldOfView]
-    _overlays: Kept[OverlayFinder | None]
-    _from_file: Kept[bool] = False
-    _instruments: Kept[np.ndarray | None] = None
+    _instruments: np.ndarray | None = None
 
     def __init__(self, settings: MaskSettings, files: StoredMasks | None = None) -> None:
         self.settings, self._files = settings, files
-        self._field = FieldOfView()
+        self._field, self._from_file = FieldOfView(), False
         self._overlays = None if settings.has("no-overlays") else OverlayFinder()
+
+    def record(self) -> dict[str, Any]:
+        """Return what all frames so far have shown, for `resume`: numbers and arrays by name."""
+        overlays = None if self._overlays is None else self._overlays.record()
+        return {"lit": self._field.lit, "overlays": overlays}
+
+    def resume(self, record: dict[str, Any]) -> None:
+        """Go on from a record. Masks of frames that are not read again are read by `pass_over`."""
+        self._field.lit = record["lit"]
+        if self._overlays is not None:
+            self._overlays.resume(record["overlays"])
+
+    def pass_over(self, index: int) -> None:
+        """Take the number of a frame that was masked before the run was resumed: its mask file counts."""
+        if self._files is not None:
+            self._files.covered(index)
 
     def __call__(self, frame: Frame) -> Frame:
         """Return the frame with `valid` False also outside the field of view, at highlights, overlays, bad exposure.

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import cv2
 import numpy as np
-
-from scopemap.engine.kept import Kept
 
 # The green channel: red tissue is dark there, so both white and black text have contrast.
 _CHANNEL = 1
@@ -75,14 +74,8 @@ class OverlayFinder:
     overlays whose content changes all the time, are not found.
     """
 
-    count: Kept[int] = 0
-    _last: Kept[np.ndarray]
-    _mean: Kept[np.ndarray]
-    _change: Kept[np.ndarray]
-    _calm_change: Kept[np.ndarray]
-    _found: Kept[_Found | None] = None
-
     def __init__(self) -> None:
+        self.count, self._found = 0, cast(_Found | None, None)
         self._last = np.zeros((0, 0), np.float32)
         self._mean, self._change, self._calm_change = self._last, self._last, self._last
 
@@ -104,6 +97,19 @@ class OverlayFinder:
             if self.count >= _MIN_COUNT and self.count % _LOOK_EVERY == 0:
                 self._found = self._overlays(level, field if outside is None else field | outside)
         return None if self._found is None else self._found.shown(level)
+
+    def record(self) -> dict[str, Any]:
+        """Return what was learnt from all images so far, for `resume`: numbers and arrays by name."""
+        means = {"mean": self._mean, "change": self._change, "calm_change": self._calm_change}
+        copies = {name: values.copy() for name, values in means.items()}  # they go on changing
+        found = None if self._found is None else vars(self._found)
+        return {"count": self.count, "last": self._last, "found": found} | copies
+
+    def resume(self, record: dict[str, Any]) -> None:
+        """Go on from a record."""
+        self.count, self._last, self._mean = record["count"], record["last"], record["mean"]
+        self._change, self._calm_change = record["change"], record["calm_change"]
+        self._found = None if record["found"] is None else _Found(**record["found"])
 
     def _learn(self, level: np.ndarray) -> None:
         self.count += 1

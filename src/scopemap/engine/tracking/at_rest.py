@@ -8,7 +8,6 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.flow.corners import KeyframeMatcher
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
-from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.corner_pose import nonrigidity
 from scopemap.engine.tracking.track import FrameTracker, KeyframeDecision, Track
 from scopemap.engine.tracking.usable import too_few_pixels
@@ -21,12 +20,10 @@ class CameraAtRest(FrameTracker):
     measured.
     """
 
-    _matcher: Kept[KeyframeMatcher | None]
-    _keyframe: Kept[int | None] = None
-    _frames_since_keyframe: Kept[int] = 0
+    _keyframe: int | None = None
 
     def __init__(self, settings: TrackingSettings, flow: FlowEstimator) -> None:
-        self._settings = settings
+        self._settings, self._frames_since_keyframe = settings, 0
         self._matcher = None if flow.name == "none" else KeyframeMatcher(flow)
 
     def track(self, frame: Frame) -> Track:
@@ -45,6 +42,10 @@ class CameraAtRest(FrameTracker):
         is_due = self._frames_since_keyframe >= self._settings.keyframe_every
         decision = KeyframeDecision("new", "its corners are found anew") if is_due else KeyframeDecision()
         return Track(frame.index, "ok", "", here, self._keyframe, nonrigidity=moving, decision=decision)
+
+    def replay(self, frame: Frame, track: Track) -> None:
+        """Count a frame that was tracked before the run was resumed, in place of `track`."""
+        self._frames_since_keyframe += 1
 
     def update(self, frame: Frame, decision: KeyframeDecision, *, measured: bool) -> bool:
         """Follow the corners of a new keyframe from now on; False for others, or with too little known depth."""

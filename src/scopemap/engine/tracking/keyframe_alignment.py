@@ -11,7 +11,6 @@ from scopemap.engine.flow.corners import KeyframeMatcher
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, mean_near, orthonormalised, rotation_angle_rad
-from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.corner_pose import nonrigidity, pose_from_correspondences, reprojection_error_px
 from scopemap.engine.tracking.features import RelativePose
@@ -60,13 +59,8 @@ class Keyframe:
 class MotionModel:
     """Constant motion: the pose tracked last, (4, 4) in the world of `map`, the step to it, frames lost since."""
 
-    map: Kept[int] = 0
-    _maps: Kept[int] = 1
-    T_world_last: Kept[np.ndarray]
-    _T_step: Kept[np.ndarray]
-    frames_lost: Kept[int] = 0
-
     def __init__(self) -> None:
+        self.map, self._maps, self.frames_lost = 0, 1, 0
         self.T_world_last, self._T_step = np.eye(4), np.eye(4)
 
     def predictions(self) -> list[np.ndarray]:
@@ -99,8 +93,6 @@ class KeyframeAligner:
     flow : matches the corners; None: they are not used. motion : where alignments start, and from where a pose may not
     jump.
     """
-
-    _matcher: Kept[KeyframeMatcher | None]
 
     def __init__(self, settings: TrackingSettings, flow: FlowEstimator | None, motion: MotionModel) -> None:
         self._settings, self.flow, self._motion = settings, flow, motion

@@ -14,7 +14,6 @@ from scopemap.engine.depth.mapis import DenseCorrespondence
 from scopemap.engine.flow.corners import Correspondences2D3D
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, transform
-from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.corner_pose import pose_from_correspondences, reprojection_error_px
 from scopemap.engine.tracking.features import (
     FeatureDetector,
@@ -96,8 +95,13 @@ class RotationFollower:
     little, or does not fit, the rotation is lost, too.
     """
 
-    _depth_mm: Kept[np.ndarray | None] = None
-    _rotation: Kept[np.ndarray | None] = None
+    _depth_mm: np.ndarray | None = None
+    _rotation: np.ndarray | None = None
+
+    def resume_after(self, track: Track, depth_mm: np.ndarray) -> None:
+        """Go on after a frame that was followed before the run was resumed; depth_mm : (h, w), at the flow's size."""
+        self._depth_mm = depth_mm
+        self._rotation = np.eye(3) if track.status != "lost" else track.rotation
 
     def follow(self, track: Track, frame: Frame, correspondence: DenseCorrespondence | None) -> Track:
         """Return the track of each frame, in order, with its rotation where it is lost and followed, by raw depth."""
@@ -134,16 +138,17 @@ def rotation_by_flow(
 class Relocaliser:
     """Recent keyframes of the current map and of other maps, in which a lost camera is searched."""
 
-    _keyframes: Kept[deque[Keyframe]]
-    _of_other_maps: Kept[deque[Keyframe]]
-    _frames_of_map: Kept[Counter[int]]
-
     def __init__(self, settings: TrackingSettings, detector: FeatureDetector) -> None:
         self.settings, self.detector = settings, detector
-        self._keyframes = deque(maxlen=settings.relocalisation_keyframes)
-        self._of_other_maps = deque(maxlen=2 * settings.relocalisation_keyframes)
+        self._keyframes = deque[Keyframe](maxlen=settings.relocalisation_keyframes)
+        self._of_other_maps = deque[Keyframe](maxlen=2 * settings.relocalisation_keyframes)
         self._features: dict[int, Features] = {}
-        self._frames_of_map = Counter()
+        self._frames_of_map = Counter[int]()
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """The keyframes in which a lost camera is searched."""
+        return [*self._keyframes, *self._of_other_maps]
 
     def add(self, keyframe: Keyframe) -> None:
         """Add a keyframe of the current map."""

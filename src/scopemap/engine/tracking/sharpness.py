@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from scopemap.engine.geometry.local_contrast import local_mean
-from scopemap.engine.kept import Kept
 
 _FINE = 1 / 320  # by hand: of the picture's width: standard deviations of the two blurs
 _COARSE = 4 / 320  # by hand
@@ -27,10 +26,8 @@ _LEAST_MEASURES = np.array([1e-6, 1e-6, 0.02])
 class SharpnessMonitor:
     """Compares the sharpness of frames, in order, with the median of the last 30, unsharp ones included."""
 
-    _recent: Kept[deque[float]]
-
     def __init__(self) -> None:
-        self._recent = deque(maxlen=_FRAMES)
+        self._recent = deque[float](maxlen=_FRAMES)
 
     def relative_sharpness(self, rgb: np.ndarray, valid: np.ndarray) -> float:
         """Return the sharpness of an image as a share of the median before it; 1 for the first."""
@@ -48,10 +45,9 @@ class PictureQuality:
     the clear frames lack, too, as a video without colours lacks saturation, does not count.
     """
 
-    _recent: Kept[deque[tuple[float, float, float]]]
-
     def __init__(self) -> None:
-        self._recent = deque(maxlen=_NEIGHBOURS)
+        self.recent = deque[tuple[float, float, float]](maxlen=_NEIGHBOURS)
+        """Measures of these frames."""
 
     def __call__(self, rgb: np.ndarray, valid: np.ndarray) -> float:
         """Return the quality, 0.01..1, of an image (H, W, 3) uint8 with valid pixels (H, W) bool."""
@@ -64,8 +60,8 @@ class PictureQuality:
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if factor < 0.5 else cv2.INTER_LINEAR)
         valid = cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         found = sharpness(rgb, valid), share, _saturation(rgb, valid)
-        self._recent.append(found)
-        clear = np.percentile(self._recent, _CLEAR_PERCENTILE, axis=0)
+        self.recent.append(found)
+        clear = np.percentile(self.recent, _CLEAR_PERCENTILE, axis=0)
         shares = np.where(clear < _LEAST_MEASURES, 1.0, np.minimum(found / np.maximum(clear, _LEAST_MEASURES), 1.0))
         return max(float(shares.prod()), LEAST_QUALITY)
 

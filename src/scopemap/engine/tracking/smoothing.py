@@ -11,7 +11,6 @@ import numpy as np
 
 from scopemap.engine.config import SmoothingSettings
 from scopemap.engine.geometry.se3 import mean_near
-from scopemap.engine.kept import Kept
 
 WEIGHTS = (0.6, 0.3, 0.1)  # plausible, not searched; the paper gives none: alpha, beta and gamma
 OMEGA = 0.1  # plausible, not searched; the paper gives none: frames count from 0
@@ -20,12 +19,9 @@ OMEGA = 0.1  # plausible, not searched; the paper gives none: frames count from 
 class Wema:
     """Weighted exponential moving average of three poses (equation 13); no effect where `settings.method` is "none"."""
 
-    _past: Kept[list[np.ndarray]]
-    _count: Kept[int] = 0
-
     def __init__(self, settings: SmoothingSettings) -> None:
-        self.settings = settings
-        self._past = []
+        self.settings, self._count = settings, 0
+        self._past = list[np.ndarray]()
 
     def __call__(self, T_world_camera: np.ndarray) -> np.ndarray:
         """Return the smoothed pose; the first two, also after `reset`, have too short a past and stay as they are."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -137,6 +137,18 @@ class FrameTracker(Protocol):
 
         measured : whether the depth is measured, not predicted; then only keyframes are given. Return whether the frame
         can be used so: a new keyframe needs depth, and not every tracker uses frames that are none.
+        """
+
+
+@runtime_checkable
+class ResumableTracker(FrameTracker, Protocol):
+    """A `FrameTracker` with which a run that was killed is resumed: it takes the frames tracked before once more."""
+
+    def replay(self, frame: Frame, track: Track) -> None:
+        """Take a frame with its refined `depth_mm` as it was tracked, in place of `track`, in order.
+
+        `update` follows as it did, with the pose of the track. Frames that the tracker has not seen, because nothing
+        was estimated of them, come without a usable pixel.
         """
 
 

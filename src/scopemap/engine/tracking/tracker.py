@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from scopemap.engine.config import TrackingSettings
+from scopemap.engine.errors import InputError
 from scopemap.engine.flow.estimator import FlowEstimator
 from scopemap.engine.frame import Frame
-from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad
-from scopemap.engine.kept import Kept
+from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.features import FeatureDetector, SiftFeatures
 from scopemap.engine.tracking.keyframe_alignment import (
@@ -24,6 +24,7 @@ from scopemap.engine.tracking.keyframe_alignment import (
     MotionModel,
     is_obscured,
 )
+from scopemap.engine.tracking.keyframe_choice import KeyframeChoice
 from scopemap.engine.tracking.pyramid import build_pyramid
 from scopemap.engine.tracking.relocalisation import Relocaliser, depth_ratio, is_close_up, nearer_keyframe
 from scopemap.engine.tracking.residuals import View
@@ -36,15 +37,11 @@ _EARLIER_KEYFRAMES = 64  # by hand: of the current map, that are searched for on
 # By hand: with the keyframe in which features find a frame: with less the pose hangs on a corner of it.
 _FOUND_OVERLAP = 0.25
 _WEAK_COVERAGE = 0.15  # by hand: of a pose that is compared with one by features
-_KEYFRAME_COVERAGE = 0.3  # by hand: a frame in which fewer corners are matched becomes a keyframe
 # By hand: of an earlier keyframe's corners that must be matched for it to be tracked against again.
 _REVISITED_COVERAGE = 0.5
-_PATIENCE = 3  # by hand: frames that a keyframe waits longer where the picture is not clear
-# A camera that has moved less since the keyframe, rad and translation over depth, needs no other one: its views
-# triangulate nothing, and their errors are alike. Chosen on cecum_t1_a (C3VD): 0.02 left out some where it is slow.
-_MIN_KEYFRAME_MOTION = 0.01
 _SEARCHED_FAST = 3  # by hand: of a camera lost for longer every n-th frame is searched, where tracking is fast
-_CLEAR = 0.8  # by hand: of the best quality since the keyframe: below it the next one waits
+# Pictures that show no structure say nothing of how long the camera has been lost.
+_OBSCURED = (LossCause.TOO_DARK, LossCause.OVEREXPOSED, LossCause.VIEW_COVERED, LossCause.UNSHARP)
 _UNCONFIRMED = "no features confirm the pose after a wall filled the picture"
 
 
@@ -53,54 +50,6 @@ class _Failure(NamedTuple):
 
     loss: TrackingLoss
     is_obscured: bool
-
-
-class KeyframeChoice:
-    """When the next keyframe is due: by frames and motion since the last one, and by how well they still fit it."""
-
-    frames_since: Kept[int] = 0
-    _quality: Kept[float] = 0.0
-    _best_quality: Kept[float] = 0.0
-    _first_agreement: Kept[float | None] = None
-    _depth_mm: Kept[float] = 1.0
-
-    def __init__(self, settings: TrackingSettings) -> None:
-        self._settings = settings
-
-    def see(self, frame: Frame) -> None:
-        """Count a frame."""
-        self.frames_since += 1
-        self._quality, self._best_quality = frame.quality, max(frame.quality, self._best_quality)
-
-    def accept(self, alignment: Alignment) -> None:
-        """Take the alignment of a tracked frame with the current keyframe."""
-        if self._first_agreement is None:
-            self._first_agreement = alignment.agreement
-
-    def change(self, depth_mm: float) -> None:
-        """Take another keyframe, of this mean depth, as the current one."""
-        self._first_agreement, self._depth_mm = None, depth_mm
-
-    def begin(self) -> None:
-        """Begin with a new keyframe."""
-        self.frames_since, self._best_quality = 0, 0.0
-
-    def reason(self, alignment: Alignment) -> str:
-        """Return why a frame with this alignment should become a keyframe; "" where it need not."""
-        settings = self._settings
-        waits = settings.keyframes_wait and self._quality < _CLEAR * self._best_quality
-        if self.frames_since >= settings.keyframe_every + (_PATIENCE if waits else 0) and self._has_moved(alignment):
-            return f"{self.frames_since} frames after the last keyframe"
-        if alignment.agreement < settings.min_keyframe_agreement * (self._first_agreement or 0.0):
-            return "the keyframe fits less well than at first"
-        return "few corners of the keyframe are matched" if alignment.coverage < _KEYFRAME_COVERAGE else ""
-
-    def _has_moved(self, alignment: Alignment) -> bool:
-        if not self._settings.keyframes_wait:
-            return True
-        T = alignment.motion.T_current_reference
-        moved = rotation_angle_rad(T[:3, :3]) + np.linalg.norm(T[:3, 3]) / self._depth_mm
-        return bool(moved >= _MIN_KEYFRAME_MOTION)
 
 
 class Tracker(FrameTracker):
@@ -120,18 +69,8 @@ class Tracker(FrameTracker):
     - after it was tracked, where features match the next frame with it alone: that one's track promotes it
     """
 
-    _motion: Kept[MotionModel]
-    _aligner: Kept[KeyframeAligner]
-    _relocaliser: Kept[Relocaliser]
-    _earlier_keyframes: Kept[deque[Frame]]
-    _choice: Kept[KeyframeChoice]
-    _sharpness: Kept[SharpnessMonitor]
-    _keyframe: Kept[Keyframe | None] = None
-    _last: Kept[Frame | None] = None
-    _sharp_frames_lost: Kept[int] = 0
-    _is_unsharp: Kept[bool] = False
-    _after_close_up: Kept[bool] = False
-    _is_revisited: Kept[bool] = False
+    _keyframe: Keyframe | None = None
+    _last: Frame | None = None
 
     def __init__(
         self, settings: TrackingSettings, flow: FlowEstimator | None = None, features: FeatureDetector | None = None
@@ -142,9 +81,10 @@ class Tracker(FrameTracker):
         self._motion = MotionModel()
         self._aligner = KeyframeAligner(settings, flow, self._motion)
         self._relocaliser = Relocaliser(settings, features or SiftFeatures())
-        self._earlier_keyframes = deque(maxlen=_EARLIER_KEYFRAMES)
+        self._earlier_keyframes = deque[Frame](maxlen=_EARLIER_KEYFRAMES)
         self._choice = KeyframeChoice(settings)
-        self._sharpness = SharpnessMonitor()
+        self._sharpness, self._sharp_frames_lost = SharpnessMonitor(), 0
+        self._is_unsharp = self._after_close_up = self._is_revisited = False
 
     def track(self, frame: Frame) -> Track:
         """Return the frame's pose relative to the first usable frame of its map, or the reason why there is none."""
@@ -236,6 +176,45 @@ class Tracker(FrameTracker):
         self._earlier_keyframes.append(replace(frame, depth_sigma_mm=None))
         self._choice.begin()
         return True
+
+    def replay(self, frame: Frame, track: Track) -> None:
+        """Take a frame as it was tracked before the run was resumed, in place of `track`: nothing is aligned."""
+        self._choice.see(frame)
+        if too_few_pixels(frame, self.settings) is None:
+            sharpness = self._sharpness.relative_sharpness(frame.rgb, frame.valid)
+            self._is_unsharp = sharpness < self._min_sharpness
+        if track.status == "lost":
+            self._motion.frames_lost += 1
+            self._sharp_frames_lost = 0 if track.cause in _OBSCURED else self._sharp_frames_lost + 1
+            self._after_close_up |= track.cause == LossCause.CONTACT
+        elif track.status == "initial":
+            if self._keyframe is not None:
+                self._new_map(frame)
+        else:
+            self._replay_pose(frame, track)
+
+    def _replay_pose(self, frame: Frame, track: Track) -> None:
+        keyframe = self._known_keyframe(track.keyframe)
+        if track.decision.promotes_previous:
+            self._relocaliser.add(keyframe)
+            self._choice.frames_since = 1
+        if keyframe is not self._keyframe:
+            self._use_keyframe(keyframe)
+        self._aligner.set_keyframe(keyframe, frame, inverse(track.T_world_camera) @ keyframe.T_world_camera)
+        self._follow(keyframe.map, track.T_world_camera, track.inlier_share * track.overlap)
+
+    def _known_keyframe(self, number: int) -> Keyframe:
+        """Return the keyframe of the frame with this number, which is the current one, one of those before, or due."""
+        current = self._keyframe
+        assert current is not None
+        known = [current, *self._relocaliser.keyframes]
+        frames = [*self._earlier_keyframes, *([] if self._last is None else [self._last])]
+        found = next((one for one in known if one.frame.index == number), None)
+        frame = next((one for one in frames if one.index == number), None)
+        made = self._keyframe_of(frame, current.measured) if found is None and frame is not None else found
+        if made is None:
+            raise InputError(f"the keyframe {number}, which frames were tracked against, is not among those before")
+        return made
 
     def _against_earlier_keyframe(self, frame: Frame, alignment: Alignment) -> Alignment:
         """Return the alignment with an earlier keyframe where one is nearer than the current one, which it replaces."""
@@ -329,17 +308,21 @@ class Tracker(FrameTracker):
         keyframe = self._keyframe
         assert keyframe is not None
         T_world_camera = keyframe.pose_by(alignment)
-        if keyframe.map != self._motion.map:
-            self._motion.enter_map(keyframe.map, T_world_camera)
-            self._forget_map()
         ratio = depth_ratio(keyframe, frame, T_world_camera) if self._after_close_up else float("nan")
-        self._after_close_up, self._sharp_frames_lost = False, 0
-        self._motion.follow(T_world_camera)
-        self._relocaliser.count(keyframe.map)
-        self._choice.accept(alignment)
+        self._follow(keyframe.map, T_world_camera, alignment.agreement)
         decision = self._decide(alignment, found_by_features=found_by_features)
         track = Track(frame.index, "ok", "", T_world_camera, keyframe.frame.index, decision=decision)
         return replace(_fitted(track, keyframe, alignment), depth_ratio=ratio)
+
+    def _follow(self, map_number: int, T_world_camera: np.ndarray, agreement: float) -> None:
+        """Go on from an accepted pose in the world of a map, which has this agreement with the current keyframe."""
+        if map_number != self._motion.map:
+            self._motion.enter_map(map_number, T_world_camera)
+            self._forget_map()
+        self._after_close_up, self._sharp_frames_lost = False, 0
+        self._motion.follow(T_world_camera)
+        self._relocaliser.count(map_number)
+        self._choice.accept(agreement)
 
     def _decide(self, alignment: Alignment, *, found_by_features: bool) -> KeyframeDecision:
         """Return whether a frame with this accepted alignment becomes a keyframe."""

@@ -8,7 +8,6 @@ import numpy as np
 
 from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame, percentiles
-from scopemap.engine.kept import Kept
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.keyframe_alignment import MIN_TEXTURE
 from scopemap.engine.tracking.pyramid import texture
@@ -45,10 +44,8 @@ def covered_by(instruments: np.ndarray, frame: Frame, settings: TrackingSettings
 class TextureMonitor:
     """Finds where frames, in order, have shown too little texture for some time."""
 
-    _low_texture: Kept[int] = 0  # frames in a row
-
     def __init__(self, settings: TrackingSettings) -> None:
-        self._settings = settings
+        self._settings, self._low_texture = settings, 0  # frames in a row
 
     def too_little(self, frame: Frame) -> TrackingLoss | None:
         """Return that this frame and those before it have too little texture; None: it is worth trying."""
