@@ -8,7 +8,7 @@ setup:
 	pip install -c constraints.txt -e '.[dev,docs]' -e bench pre-commit
 	pre-commit install
 
-# The quick tests; `make test TESTS=tests` runs all of them, `make test TESTS=tests/test_flow.py` one file.
+# The quick tests; `make test TESTS=tests` runs all of them, `make test TESTS=tests/engine/flow/test_flow.py` one file.
 test:
 	pytest $(TESTS) -n 2 --dist loadfile
 

@@ -2,7 +2,7 @@
 
     python examples/05_the_paper_frame_by_frame.py [FRAMES]
 
-`reconstruct(FRAMES, "paper-strict")` gives the same depth and poses: tests/test_paper_frame_by_frame.py. Where the
+`reconstruct(FRAMES, "paper-strict")` gives the same depth and poses: test_paper_frame_by_frame.py. Where the
 paper contradicts itself, docs/method.md says which reading is followed. Without arguments a tiny phantom takes the
 place of FRAMES, its true disparity that of Depth Anything, shading that of Depth Pro, DIS that of RAFT, and structural
 similarity that of LPIPS: no weights are needed.

@@ -19,7 +19,7 @@ NOT_DETERMINED = "not determined"
 _LIMIT_RAD = float(np.radians(0.5))
 # The bound in units of ATE over the path's extent. Of 500 drawn odometries along tubes and lines whose relative poses
 # err, by noise and by a bias, the turn was within two of these in 97 %, within three in more than 99 %. A unit is no
-# standard deviation: turns by errors that drift are mostly less, by white errors far less (tests/test_turn.py).
+# standard deviation: turns by errors that drift are mostly less, by white errors far less (test_turn.py).
 _UNITS = 3.0
 
 

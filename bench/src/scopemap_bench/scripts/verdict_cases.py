@@ -26,7 +26,7 @@ DIFFICULT: dict[str, Words] = {
     "faint texture": ("--set", "texture=0.25"),
 }
 # C3VD's recorded poses are ahead of the pictures of trans_t2_a, s: `scopemap evaluate --time-offset fit` on a run with
-# the data set's own lens; the pictures themselves say two frames (tests/test_evaluation_clock.py). One for all runs of
+# the data set's own lens; the pictures themselves say two frames (test_evaluation_clock.py). One for all runs of
 # the clip, since the clock is the recording's.
 _TRANS_CLOCK_S = -0.072
 # Hamlyn's own lens for rectified01, px (its intrinsics.txt).
