@@ -53,7 +53,7 @@ class _Module:
     @property
     def is_command(self) -> bool:
         """Whether it is part of the command line, which prints and exits."""
-        return self.name.startswith(("cli/", "terminal/")) or self.name.endswith("/command.py")
+        return self.name.startswith(("cli/", "terminal/")) or self.name.endswith("command.py")
 
     def functions(self) -> Iterator[Function]:
         return (node for node in self.nodes if isinstance(node, Function))

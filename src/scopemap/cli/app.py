@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 
 from scopemap.apps.batch.command import batch
 from scopemap.apps.browser.command import app as window_app
+from scopemap.apps.browser.view_command import view
 from scopemap.apps.calibrate.command import calibrate
 from scopemap.apps.coverage.command import coverage
 from scopemap.apps.demo.command import demo
@@ -32,7 +33,6 @@ from scopemap.apps.models import command as models
 from scopemap.apps.report.command import report
 from scopemap.apps.run.command import run
 from scopemap.apps.verify.command import verify
-from scopemap.apps.view.command import view
 from scopemap.engine.errors import ScopemapError
 from scopemap.input.plugins import plugins
 

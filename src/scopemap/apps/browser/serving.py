@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import http
-import importlib.util
 import io
 import mimetypes
 import re
@@ -16,6 +15,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from scopemap.engine.errors import InputError
+from scopemap.terminal.window_beside import check_installed
 
 LOOPBACK = "127.0.0.1"
 _OWN_NAMES = {LOOPBACK, "localhost", "[::1]", "::1"}
@@ -66,13 +66,6 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
 }
-NOT_INSTALLED = "the window in the browser needs viser: pip install 'scopemap[app]'"
-
-
-def check_installed() -> None:
-    """Raise `InputError` where viser is not installed."""
-    if importlib.util.find_spec("viser") is None:
-        raise InputError(NOT_INSTALLED)
 
 
 def start_server(port: int = 0, host: str = LOOPBACK, files: Mapping[str, Path] | None = None) -> Any:

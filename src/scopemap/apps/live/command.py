@@ -162,7 +162,7 @@ def _seen_in(
         threading.Thread(target=_listen, args=(actions,), name="lines", daemon=True).start()
         yield view_folder(out)
     elif in_app:
-        from scopemap.apps.browser.beside import window_beside
+        from scopemap.terminal.window_beside import window_beside
 
         with TemporaryDirectory(prefix="scopemap-live-") as folder:
             arguments = ("--live", "--port", str(port))
@@ -174,7 +174,7 @@ def _seen_in(
 
 def _listen(actions: Mapping[str, Callable[[], None]]) -> None:
     """Call the actions whose names come by standard input, and stop where it ends: nobody watches any more."""
-    from scopemap.apps.browser.beside import lines_of_input
+    from scopemap.terminal.window_beside import lines_of_input
 
     for line in lines_of_input():
         actions.get(line.strip(), lambda: None)()

@@ -202,8 +202,8 @@ def run(
 
 def _window(out: Path) -> AbstractContextManager[None]:
     """Return the context of a window that shows the run, whose button to stop is Ctrl-C."""
-    from scopemap.apps.browser.beside import window_beside
     from scopemap.result.run_view import view_folder
+    from scopemap.terminal.window_beside import window_beside
 
     stop = {"stop": partial(os.kill, os.getpid(), signal.SIGINT)}
     return window_beside(out, view_folder(out), stop, say=partial(typer.echo, err=True))

@@ -72,8 +72,8 @@ def view(
     from scopemap.apps.browser.command import serve
     from scopemap.apps.browser.compare_page import ComparePage
     from scopemap.apps.browser.result_page import ResultPage
-    from scopemap.apps.browser.serving import check_installed
     from scopemap.apps.browser.window import BrowserWindow
+    from scopemap.terminal.window_beside import check_installed
 
     check_installed()
     page = ResultPage(run) if compare is None else ComparePage(run, compare)
