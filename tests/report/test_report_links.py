@@ -15,11 +15,10 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.report.page import keep_measurements, write_report
-from tests.report.test_report_browser import CHROMIUM, Opened, chromium
+from tests.report.test_report_browser import Opened, chromium, pytestmark  # noqa: F401
 from tests.support.drawn_run import CAMERA, IN_RESULT, draw_run, pose_of, tube
 from tests.support.front_door import call
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (Debian: apt-get install chromium)")
 HAND = (0x10, 0x10, 0x10)
 
 

@@ -21,11 +21,11 @@ from scopemap.engine.errors import InputError
 STAND_IN = """#!{python}
 import pathlib, shutil, signal, sys, time
 source, out = pathlib.Path(sys.argv[4]), pathlib.Path(sys.argv[6])
-kept = out / ".unfinished" / "checkpoint"
-has_begun = kept.is_dir()
-kept.mkdir(parents=True, exist_ok=True)
+kept = out / ".unfinished" / "checkpoint.npz"
+has_begun = kept.is_file()
+kept.parent.mkdir(parents=True, exist_ok=True)
 def stopped(*_):
-    (kept / "state.json").write_text("{{}}")
+    kept.write_bytes(b"")
     sys.exit(130)
 signal.signal(signal.SIGINT, signal.SIG_IGN if source.stem == "long_deaf" else stopped)
 print("started", flush=True)

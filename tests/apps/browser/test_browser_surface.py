@@ -201,6 +201,7 @@ def test_a_frame_with_something_in_front_did_not_see_it(tmp_path: Path) -> None:
     assert FRAME in [sight.frame for sight in frames_that_saw(surface, [pick])]
 
 
+@pytest.mark.slow
 def test_coverage_has_form_and_borders_around_what_was_not_seen(tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="viser is not installed: pip install 'scopemap[app]'")
     folder = draw_run(tmp_path)

@@ -195,6 +195,7 @@ def test_the_options_of_a_run(tmp_path: Path) -> None:
     assert 500 < len(trimesh.load(tmp_path / "run" / "mesh.ply", process=False).faces) <= 900
 
 
+@pytest.mark.slow
 def test_a_run_whose_frames_have_no_surface_ends_with_an_empty_mesh(tmp_path: Path) -> None:
     phantom = write_tiny(tmp_path / "phantom", frames=4)
     config = Config.load(

@@ -80,6 +80,7 @@ def test_a_picture_without_a_usable_pixel_has_the_least_worth_and_is_no_measure_
     assert quality(TISSUE, EVERYWHERE) == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("weighted", "mean_mm"), [(True, 4 * 0.1 / 3.1), (False, 1.0)])
 def test_an_unclear_frame_moves_the_surface_little(weighted: bool, mean_mm: float) -> None:
     """Three frames see the plane where it is; the depth of an unclear one is 4 mm off."""
@@ -93,6 +94,7 @@ def test_an_unclear_frame_moves_the_surface_little(weighted: bool, mean_mm: floa
     assert np.median(off_mm) == pytest.approx(mean_mm, rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_unclear_frame_waits_for_a_clear_one_to_become_the_keyframe_but_not_for_long() -> None:
     assert keyframes([1.0] * 8) == [0, 3, 6]
     assert keyframes([1.0, 1.0, 1.0, 0.5, 0.5, 0.9, 1.0, 1.0]) == [0, 5]
