@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scopemap.report.page import write_comparison, write_report
+from scopemap.report.page import keep_measurements, write_comparison, write_report
 from scopemap.result.result import Result
 from tests.support.drawn_run import FRAMES, IN_FIRST_MAP, IN_RESULT, draw_run, draw_textured_run, drawn_result, pose_of
 
@@ -151,6 +152,24 @@ def test_reasons_are_in_plain_words_with_options_in_a_small_line(browser: Any, t
     for reason in reasons:
         assert not any(word in reason.inner_text().split("\n")[0] for word in ("--", ".csv"))
     assert opened.complaints == []
+
+
+def test_sizes_by_a_reference_that_was_forgotten_are_marked(browser: Any, tmp_path: Path) -> None:
+    folder = draw_run(tmp_path)
+    corners, by_own = [[[20.0, 20.0], [60.0, 44.0]], None], [[[24.0, 45.0], [40.0, 45.0]], 5.0]
+    found = [{"what": "straight", "value": 18.2, "low": 16.0, "high": 21.0, "unit": "mm"}]
+    both = [
+        {"folder": ".", "frame": 4, "points": corners[0], "reference": ends, "reference_mm": length_mm}
+        | {"found": found, "command": "", "world": [[0.0, 0.0, 40.0], [5.0, 0.0, 40.0]]}
+        for ends, length_mm in (corners[1:] * 2, by_own)
+    ]
+    keep_measurements(folder, json.dumps(both).encode())
+    opened = Opened(browser, write_report(folder)[0])
+    rows = opened.page.locator("#measured tbody tr")
+    assert rows.nth(0).inner_text().startswith("1. Distance, frame 4\t")
+    assert rows.nth(1).locator("th").inner_text() == "2. Distance, frame 4 by an earlier reference"
+    assert rows.locator("nth=0").get_attribute("class") in (None, "")
+    assert rows.nth(1).get_attribute("class") == "earlier"
 
 
 def test_the_slider_moves_frame_and_frustum(browser: Any, report: Path) -> None:

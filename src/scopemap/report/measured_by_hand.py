@@ -7,11 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.result.result import Result
 
 MEASUREMENTS = "measurements.json"
+EARLIER = "by an earlier reference"
+"""What is said beside sizes whose reference was changed or forgotten."""
+_SAME_PX = 0.15
+"""Pixels are kept in tenths."""
 _SIZES = re.compile(r"Sizes .*$")
 """What a verdict's advice says of sizes: its end."""
 
@@ -78,3 +84,32 @@ def advice_by_reference(advice: str, kept: Sequence[dict[str, Any]]) -> str:
     """Return a verdict's advice, with sizes by the reference that is kept for the result itself; as it is for none."""
     known = [one for one in kept if one["kind"] == "reference" and one["folder"] == "."]
     return advice_with_sizes(advice, sizes_by(known[-1]["reference_mm"])) if known else advice
+
+
+def is_reference(run: Result, frame: int, pixels: np.ndarray, ends: np.ndarray) -> bool:
+    """Return whether pixels (2, 2) of a frame are those of two places (2, 3) of a submap; False without a pose."""
+    tracked = run.tracked
+    pose = tracked["T_world_camera"][tracked["index"] == frame]
+    if not len(pose):
+        return False
+    return bool((np.abs(run.camera.project(transform(inverse(pose[0]), ends)) - pixels) < _SAME_PX).all())
+
+
+def earlier_references(run: Result, measured: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> list[bool]:
+    """Return for each of what was measured in a whole result whether its reference is not the one that is kept.
+
+    measured, kept : as `read_measurements` returns them; of `kept` the references count.
+    """
+    submaps = {folder_in_whole(one): one for one in run.submaps}
+    references = {one["folder"]: one for one in kept if one["kind"] == "reference" and len(one["world"]) == 2}
+
+    def is_earlier(one: dict[str, Any]) -> bool:
+        if one["kind"] == "reference" or one["reference"] is None:
+            return False
+        now, submap = references.get(one["folder"]), submaps.get(one["folder"])
+        if now is None or submap is None or now["reference_mm"] != one["reference_mm"]:
+            return True
+        frame = one["frame"] if one["reference_frame"] is None else one["reference_frame"]
+        return not is_reference(submap, frame, np.array(one["reference"]), np.array(now["world"]))
+
+    return [is_earlier(one) for one in measured]

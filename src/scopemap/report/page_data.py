@@ -16,7 +16,7 @@ from scopemap.engine.errors import ScopemapError
 from scopemap.engine.geometry.align import align_trajectories
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap.report.facts import PicturedFrame, ReportFacts
-from scopemap.report.measured_by_hand import advice_by_reference, read_measurements
+from scopemap.report.measured_by_hand import advice_by_reference, earlier_references, read_measurements
 from scopemap.report.plain_step import plain_step
 from scopemap.report.shown_maps import MapOnPage, opening_row, shown_map_numbers
 from scopemap.report.shown_mesh import SeenFrame, base64_of, mesh_data, textured_surface
@@ -79,12 +79,16 @@ def page_data(facts: ReportFacts, *, name: str = "", share: float = 1.0) -> dict
 
 
 def by_hand_data(run: Result) -> dict[str, Any]:
-    """Return what of `page_data` changes with what is measured by hand: that, and the verdict with what sizes are."""
+    """Return what of `page_data` changes with what is measured by hand: that, and the verdict with what sizes are.
+
+    `by_earlier_reference`: rows of the measurements whose reference was changed or forgotten.
+    """
     found, kept = verdict(run), read_measurements(run.folder)
     advice = advice_by_reference(found.advice, kept)
     reasons = [asdict(reason) | {"plain_step": plain_step(reason.next_step)} for reason in found.reasons]
     shown = asdict(found) | {"word": found.word, "advice": advice, "reasons": reasons}
-    return {"verdict": shown, "measurements": kept}
+    earlier = [number for number, is_so in enumerate(earlier_references(run, kept, kept)) if is_so]
+    return {"verdict": shown, "measurements": kept, "by_earlier_reference": earlier}
 
 
 def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:

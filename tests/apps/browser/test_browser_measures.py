@@ -23,11 +23,12 @@ from scopemap.apps.browser.lesion_part import lesion_by_hand
 from scopemap.apps.browser.measured_list import measured_words, short, with_interval
 from scopemap.apps.browser.seen_by import corners_in
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
-from scopemap.apps.measure.hand_measure import HandMeasure, add_measurement, kept_measures
+from scopemap.apps.measure.hand_measure import HandMeasure, add_measurement, kept_measures, remove_reference
 from scopemap.apps.measure.measure import Measure
 from scopemap.engine.errors import InputError
 from scopemap.report.measured_by_hand import read_measurements
 from scopemap.report.page import write_report
+from scopemap.report.page_data import by_hand_data
 from scopemap.result.result import Result
 from tests.support.drawn_run import CAMERA, FRAMES, draw_run, pose_of
 from tests.support.front_door import call
@@ -186,6 +187,32 @@ def test_the_report_has_what_is_kept_at_once(tmp_path: Path) -> None:
     patched = page.read_bytes()
     write_report(folder)
     assert page.read_bytes() == patched
+
+
+def test_sizes_by_another_reference_than_the_kept_one_are_marked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = draw_run(tmp_path)
+    surface = ShownSurface(Result(folder))
+    points, (first, second) = picked(surface, (20.0, 20.0), (60.0, 44.0)), picked(surface, (24.0, 45.0), (40.0, 45.0))
+    reference = Reference((first, second), 5.0)
+    add_measurement(folder, measure_by_hand(surface, points, reference))
+
+    def is_marked() -> bool:
+        assert call("measure", folder) == 0
+        said = "by an earlier reference" in capsys.readouterr().out
+        assert by_hand_data(Result(folder))["by_earlier_reference"] == [0] * said
+        return said
+
+    assert is_marked()
+    add_measurement(folder, reference_as_kept(surface, reference))
+    assert not is_marked()
+    # Of another length, and at another place.
+    for other in (Reference((first, second), 4.0), Reference((first, points[0]), 5.0)):
+        add_measurement(folder, reference_as_kept(surface, other))
+        assert is_marked()
+    remove_reference(folder, ".")
+    assert is_marked()
 
 
 def test_the_outline_of_a_lesion_is_in_the_pixels_of_its_frame(tmp_path: Path) -> None:

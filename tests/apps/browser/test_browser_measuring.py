@@ -68,3 +68,15 @@ def test_a_measured_distance_becomes_the_reference_where_sizes_are_known(tmp_pat
         click(shown, page, (20.0, 20.0))
         click(shown, page, (60.0, 44.0))
         shown.until(lambda: "--reference-mm 5" in shown.words)
+        # Sizes by a reference that was forgotten say so, on the surface and in the table.
+        shown.until(lambda: shown.nodes["/page/measured/2/words"].text.endswith(") mm"))
+        shown.press("Forget the reference")
+        assert shown.nodes["/page/measured/2/words"].text.endswith(") mm, by an earlier reference")
+        assert shown.nodes["/page/measured/1/words"].text.endswith(") mm")
+        shown.press("Download as a table")
+        rows = list(csv.DictReader(io.StringIO(shown.sent["measurements.csv"].decode())))
+        assert {(row["number"], row["note"]) for row in rows} == {
+            ("1", ""),
+            ("2", ""),
+            ("3", "by an earlier reference"),
+        }

@@ -8,17 +8,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from scopemap.apps.browser.seen_by import Sight, corners_in, frames_that_saw, pose_of
+from scopemap.apps.browser.seen_by import Sight, frames_that_saw, pose_of
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
 from scopemap.apps.measure.hand_measure import HandMeasure, rounded
 from scopemap.apps.measure.measure import check_reference, measure
 from scopemap.engine.errors import InputError
-from scopemap.report.measured_by_hand import folder_in_whole
+from scopemap.report.measured_by_hand import folder_in_whole, is_reference
 from scopemap.result.result import Result
 
 _MOST_TRIED = 4
-_SAME_PX = 0.15
-"""Pixels are kept in tenths."""
 _STEPS = 16
 """Parts of a line along the surface between two places."""
 _LIFT = 0.01
@@ -92,11 +90,11 @@ def is_by(surface: ShownSurface, one: HandMeasure, reference: Reference | None) 
     if one.reference is None:
         return True
     frame = one.frame if one.reference_frame is None else one.reference_frame
-    is_here = one.folder == folder_in_whole(surface.run) and frame in surface.run.tracked["index"]
+    is_here = one.folder == folder_in_whole(surface.run)
     if reference is None or reference.length_mm != one.reference_mm or not is_here:
         return False
-    ends = corners_in(surface, frame, list(reference.picks))
-    return bool((np.abs(ends - one.reference) < _SAME_PX).all())
+    ends = np.array([surface.position(pick) for pick in reference.picks])
+    return is_reference(surface.run, frame, one.reference, ends)
 
 
 def measure_by_hand(

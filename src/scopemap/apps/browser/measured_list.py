@@ -30,7 +30,13 @@ from scopemap.apps.measure.hand_measure import (
     remove_reference,
 )
 from scopemap.apps.measure.measure import Measure
-from scopemap.report.measured_by_hand import MEASUREMENTS, folder_in_whole
+from scopemap.report.measured_by_hand import (
+    EARLIER,
+    MEASUREMENTS,
+    earlier_references,
+    folder_in_whole,
+    read_measurements,
+)
 
 _KEPT = "/page/measured"
 _SHORT = {"mm": "mm", "mm2": "mm²", "times the reference": "x", "times the reference's square": "x²"}
@@ -100,7 +106,9 @@ class MeasuredList:
 
     def _send(self, client: Any) -> None:
         """Send what is listed as a table to the browser that asked for it."""
-        content = as_csv([listed.one for listed in self._all]).encode()
+        whole, listed = self._view.whole, [each.one for each in self._all]
+        earlier = earlier_references(whole, [one.as_json for one in listed], read_measurements(whole.folder))
+        content = as_csv(listed, earlier).encode()
         client.send_file_download(Path(MEASUREMENTS).with_suffix(".csv").name, content, save_immediately=True)
 
     def _is_here(self, listed: _Listed) -> bool:
@@ -113,7 +121,7 @@ class MeasuredList:
     def _note(self, listed: _Listed) -> str:
         if not self._is_here(listed):
             return f" *on the surface of {part_words(self._view.whole, listed.one)}*"
-        return " *by an earlier reference*" if self._is_earlier(listed) else ""
+        return f" *{EARLIER}*" if self._is_earlier(listed) else ""
 
     def _draw(self) -> None:
         view = self._view
@@ -126,9 +134,11 @@ class MeasuredList:
                 continue
             if listed.line is None:
                 listed = self._all[place] = replace(listed, line=line_on_surface(view.surface, one.frame, one.world))
-            colour = PALE if self._is_earlier(listed) else INK
+            is_earlier = self._is_earlier(listed)
+            colour = PALE if is_earlier else INK
             name, size_mm = f"{_KEPT}/{place}", view.surface.size_mm
             words = ": ".join(filter(None, (one.name, with_interval(one.found[0]))))
+            words += f", {EARLIER}" if is_earlier else ""
             draw_marks(view.window.scene, name, one.world, size_mm, words, colour, listed.line)
 
     def _remove(self, gone: _Listed) -> None:

@@ -123,7 +123,13 @@ def _show_kept(run: Path, pictures: Path | None, export: Path | None, as_json: b
     """Show what was measured by hand on a run or a submap, and export it."""
     from scopemap.apps.measure.findings import FINDING_ENDINGS, write_findings
     from scopemap.apps.measure.hand_measure import findings_of, kept_measures
-    from scopemap.report.measured_by_hand import MEASUREMENTS, folder_in_whole
+    from scopemap.report.measured_by_hand import (
+        EARLIER,
+        MEASUREMENTS,
+        earlier_references,
+        folder_in_whole,
+        read_measurements,
+    )
     from scopemap.result.result import Result
 
     if pictures is not None:
@@ -140,8 +146,10 @@ def _show_kept(run: Path, pictures: Path | None, export: Path | None, as_json: b
     if as_json:
         typer.echo(json.dumps([one.as_json for one in kept], indent=2))
         return
-    for one in kept:
-        typer.echo("\n  ".join(filter(None, (str(one), one.command(str(whole))))))
+    earlier = earlier_references(Result(whole), [one.as_json for one in kept], read_measurements(whole))
+    for one, is_earlier in zip(kept, earlier, strict=True):
+        said = f"{one}, {EARLIER}" if is_earlier else str(one)
+        typer.echo("\n  ".join(filter(None, (said, one.command(str(whole))))))
 
 
 def _facts(one: Measure) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from scopemap.apps.measure.measure import Measure
 from scopemap.apps.measure.surface_finding import SurfaceFinding
-from scopemap.report.measured_by_hand import checked_measurements, read_measurements
+from scopemap.report.measured_by_hand import EARLIER, checked_measurements, read_measurements
 from scopemap.report.page import keep_measurements
 from scopemap.result.json_numbers import without_nan
 
@@ -148,17 +148,21 @@ def remove_reference(folder: Path, of: str) -> None:
         _write(folder, left)
 
 
-def as_csv(kept: Sequence[HandMeasure]) -> str:
-    """Return what was measured as a table, a row for each figure, of three digits; references have none."""
+def as_csv(measured: Sequence[HandMeasure], earlier: Sequence[bool]) -> str:
+    """Return what was measured as a table, a row for each figure, of three digits.
+
+    measured : without references. earlier : for each whether its reference was changed or forgotten since.
+    """
     text = io.StringIO(newline="")
     table = csv.writer(text)
-    table.writerow(("number", "name", "folder", "frame", "what", "value", "low", "high", "unit", "pixels"))
-    for number, one in enumerate((one for one in kept if one.kind != "reference"), start=1):
+    table.writerow(("number", "name", "folder", "frame", "what", "value", "low", "high", "unit", "pixels", "note"))
+    for number, (one, is_earlier) in enumerate(zip(measured, earlier, strict=True), start=1):
+        note = EARLIER if is_earlier else ""
         for found in one.found:
             known = (found.value, found.low, found.high)
             figures = [f"{float(f'{value:.3g}'):.15g}" if np.isfinite(value) else "" for value in known]
             where = (one.name, one.folder, one.frame)
-            table.writerow((number, *where, found.what, *figures, found.unit, pixels_in_words(one.pixels)))
+            table.writerow((number, *where, found.what, *figures, found.unit, pixels_in_words(one.pixels), note))
     return text.getvalue()
 
 

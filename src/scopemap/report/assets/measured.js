@@ -31,12 +31,14 @@ function tableRows(one) {
   const figures = figuresOf(one), button = document.createElement("button"), head = document.createElement("th");
   button.type = "button";
   button.textContent = `${numberOf(one)}${titleOf(one)}, frame ${one.frame}`;
+  const isEarlier = run.by_earlier_reference.includes(run.measurements.indexOf(one));
   button.disabled = rowOf(one) < 0; // measured before the result was made again
   button.addEventListener("click", () => (setRow(rowOf(one)), element("surface").scrollIntoView({ block: "nearest" })));
   Object.assign(head, { scope: "rowgroup", rowSpan: figures.length });
-  head.append(button);
+  head.append(button, ...(isEarlier ? [" by an earlier reference"] : []));
   return figures.map((cells, k) => {
     const line = document.createElement("tr");
+    line.classList.toggle("earlier", isEarlier);
     if (k === 0) line.append(head);
     line.append(...cells.map((text) => Object.assign(document.createElement("td"), { textContent: text })));
     return line;
