@@ -159,12 +159,21 @@ def test_blind_spots_are_listed_and_shown(browser: Any, tmp_path: Path) -> None:
     assert not Opened(browser, page).page.locator("#coverage").is_visible()
     assert call("coverage", tmp_path) == 0
     facts, opened = json.loads((tmp_path / "coverage" / "coverage.json").read_text()), Opened(browser, page)
-    assert opened.text("#coverage-share").startswith(
-        f"Not seen: {100 * facts['total']['share']:.0f} % (90 % interval: "
-    )
-    assert opened.page.locator("#coverage-map").evaluate("image => image.naturalWidth") == 900
+    assert opened.text("#coverage-share") == facts["statement"]
+    largest = min(100.0, 100 * facts["blind_spots"][0]["area"] / (facts["total"]["share"] * facts["total"]["area"]))
+    first = opened.page.locator("#spot-list button").first.inner_text()
+    assert first.startswith(f"1. {largest:.0f} % of what was not seen, at ")
+    assert "unit" not in first  # the scale is unknown
+    assert opened.page.locator("#spot-words").is_visible()
+    assert opened.page.locator("#coverage-map").evaluate("image => image.naturalWidth") == 960
     row, before = facts["blind_spots"][0]["frame"], opened.picture("#scene")
     opened.page.locator("#spot-list button").first.click()
     opened.wait("shown", str(row))
     assert np.abs(opened.picture("#scene") - before).max() > 100  # a cross on the surface
     assert opened.complaints == []
+    # Of a cavity without blind spots no list is offered, and no colon is named.
+    facts |= {"kind": "cavity", "blind_spots": []}
+    (tmp_path / "coverage" / "coverage.json").write_text(json.dumps(facts))
+    opened = Opened(browser, write_report(tmp_path)[0])
+    assert not opened.page.locator("#spot-words").is_visible()
+    assert "synthetic cavities" in opened.text("#coverage-basis")

@@ -135,9 +135,9 @@ def _coverage(run: Result) -> dict[str, Any] | None:
 
 
 class _NotSeen(BaseModel):
+    start: float
+    end: float
     share: float
-    low: float
-    high: float
     area: float
 
 
@@ -153,7 +153,7 @@ class _Spot(BaseModel):
 class _Covered(BaseModel):
     kind: str
     unit: str
-    caution: str = ""
+    statement: str
     total: _NotSeen
     blind_spots: list[_Spot]
 

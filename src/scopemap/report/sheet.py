@@ -140,7 +140,9 @@ class Plot:
         up = (points[:, 1] - self.y[0]) / (self.y[1] - self.y[0])
         return np.column_stack([left + across * width, top + (1 - up) * height])
 
-    def frame(self, x_label: str = "", y_label: str = "", *, x_numbers: bool = True, size: int = 11) -> None:
+    def frame(
+        self, x_label: str = "", y_label: str = "", *, x_numbers: bool = True, y_numbers: bool = True, size: int = 11
+    ) -> None:
         """Draw a grid with its values, and the names of the axes, around the inside."""
         left, top, width, height = self.box
         right, bottom = left + width, top + height
@@ -149,7 +151,7 @@ class Plot:
             self.sheet.line(np.array([[at, top], [at, bottom]]), FAINT)
             if x_numbers:
                 self.sheet.text((at, bottom + 4), f"{value:g}", size, SOFT, "ma")
-        for value in ticks(*sorted(self.y)):
+        for value in ticks(*sorted(self.y)) if y_numbers else []:
             at = self.place(np.array([[self.x[0], value]]))[0, 1]
             self.sheet.line(np.array([[left, at], [right, at]]), FAINT)
             self.sheet.text((left - 5, at), f"{value:g}", size, SOFT, "rm")

@@ -18,9 +18,8 @@ from scopemap.apps.browser.files_part import export_place
 from scopemap.apps.browser.marks import CLICKED
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.runs import BrowserRun
-from scopemap.apps.browser.unseen_part import unseen_words
 from scopemap.apps.browser.workspace import Workspace
-from scopemap.apps.coverage.coverage import BLIND, CAUTION, coverage
+from scopemap.apps.coverage.coverage import CAUTION, NO_SPOT, coverage
 from scopemap.engine.notices import Notice
 from scopemap.report.measured_by_hand import read_measurements
 from scopemap.report.page import PAGE, page_to_send, write_report
@@ -313,8 +312,11 @@ def test_from_a_frame_dragging_turns_about_what_it_sees(tmp_path: Path) -> None:
 
 def test_a_share_that_may_be_far_too_large_is_said_with_its_caution(tmp_path: Path) -> None:
     found = coverage(draw_run(tmp_path))
-    assert CAUTION not in unseen_words(found)
-    assert unseen_words(replace(found, caution=CAUTION)) == f"{unseen_words(found)} {CAUTION}"
+    assert CAUTION not in found.statement
+    said, count = found.statement.split("There ")
+    assert replace(found, caution=CAUTION).statement == f"{said}{CAUTION} There {count}"
+    assert count == f"are {len(found.spots)} blind spots."
+    assert replace(found, spots=[]).statement == f"{said}{NO_SPOT}"
 
 
 def test_blind_spots_are_those_of_the_command(tmp_path: Path) -> None:
@@ -326,7 +328,7 @@ def test_blind_spots_are_those_of_the_command(tmp_path: Path) -> None:
         shown.show(ResultPage(folder))
         shown.press("What was not seen")
         shown.until(lambda: "was not seen, estimated (90 % interval" in shown.words)
-        assert f"{100 * facts['total']['share']:.0f} % of the wall" in shown.words
+        assert facts["statement"] in shown.words
         # What the window found is kept as by the command.
         assert json.loads((folder / "coverage" / "coverage.json").read_text()) == facts
         spots = [label for label in shown.labels() if label[0].isdigit()]
@@ -335,7 +337,7 @@ def test_blind_spots_are_those_of_the_command(tmp_path: Path) -> None:
         assert f"seen from frame {facts['blind_spots'][0]['frame']}" in shown.words
         # It is looked at where a face was not seen, the nearest one to the spot's middle.
         found = coverage(folder)
-        hidden = found.surface.triangles_center[np.nan_to_num(found.unseen) > BLIND]
+        hidden = found.surface.triangles_center[found.unseen_faces]
         apart = np.linalg.norm(hidden - facts["blind_spots"][0]["position_mm"], axis=1)
         np.testing.assert_allclose(shown.window.server.initial_camera.look_at, hidden[apart.argmin()], rtol=1e-6)
         # Its border is outlined: each of its corners is of a face that was not seen.

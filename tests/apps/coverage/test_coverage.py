@@ -127,6 +127,11 @@ def test_the_map_has_the_hole_and_its_table(holed: Path, tmp_path: Path) -> None
     rows, columns = np.nonzero(chart.spot == 1)
     assert (chart.classes[rows, columns] == NOT_SEEN).all()
     assert np.abs(columns - HOLE_CLOCK * 3 + 0.5).max() < 6
+    # The surface has the classes of the map: a class that is on one is on the other.
+    assert set(np.unique(found.classes)) == set(np.unique(chart.classes)) | {0}
+    assert found.unseen_faces[
+        np.linalg.norm(found.surface.triangles_center - found.spots[0].position_mm, axis=1).argmin()
+    ]
     hidden = np.nansum(chart.area * chart.unseen) / np.nansum(chart.area)
     assert hidden == pytest.approx(found.total.share, abs=0.02)
     chart.write(tmp_path / "map.csv")
@@ -239,7 +244,17 @@ def test_the_command_writes_figures_map_and_picture(holed: Path, capfd: pytest.C
     share = (colours[:, 0] > 150) & (colours[:, 1] < 60)
     assert 0 < share.mean() < 0.5  # the hole is red
     facts = json.loads((holed / "coverage" / "coverage.json").read_text())
-    assert set(facts) == {"kind", "unit", "along_unit", "scale", "caution", "total", "segments", "blind_spots"}
+    assert set(facts) == {
+        "kind",
+        "unit",
+        "along_unit",
+        "scale",
+        "statement",
+        "caution",
+        "total",
+        "segments",
+        "blind_spots",
+    }
     assert (facts["kind"], facts["unit"], len(facts["blind_spots"]) > 0) == ("lumen", "unit", True)
     picture = cv2.imread(str(holed / "coverage" / "map.png"))
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10

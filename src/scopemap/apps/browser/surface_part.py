@@ -16,7 +16,7 @@ from scopemap.apps.browser.surface_colours import Colouring, colourings, in_reli
 from scopemap.apps.browser.unlit_mesh import unlit_glb, unlit_textured_glb
 from scopemap.apps.browser.unseen_part import unseen_borders
 from scopemap.engine.geometry.rendering import vertex_colours
-from scopemap.report.coverage_picture import COLOURS
+from scopemap.report.coverage_picture import legend_of
 from scopemap.report.pale_parts import faded
 from scopemap.report.shown_mesh import simplified
 from scopemap.report.video_parts import video_parts
@@ -38,8 +38,9 @@ _MOST_FACES = 200_000
 _MOST_SUBMAPS = 100
 _CLOSED = (
     "Gaps of the surface are closed, but not the open ends of a lumen. Where you see the grey background, nothing was "
-    "examined. White lines: the borders of what was probably not seen."
+    "examined."
 )
+_BORDERED = "White lines: the borders of what was probably not seen."
 
 
 @dataclass(frozen=True)
@@ -112,10 +113,8 @@ class SurfacePart:
         part = found.painted.submesh([np.flatnonzero(np.isfinite(found.unseen))], append=True, repair=False)
         assert isinstance(part, trimesh.Trimesh)
         painted = simplified(part, _MOST_FACES)
-        seen, _, hidden = COLOURS
-        legend = {name: COLOURS[name] for name in (seen, hidden)}
-        self._legend.content, self._legend.visible = words_html(legend), True
-        self._words.content = _CLOSED
+        self._legend.content, self._legend.visible = words_html(legend_of(found.classes)), True
+        self._words.content = f"{_CLOSED} {_BORDERED}" if found.unseen_faces.any() else _CLOSED
         cameras = self._view.run.tracked["T_world_camera"][:, :3, 3]
         colours = np.asarray(vertex_colours(painted)[:, :3])
         self._covered = _Covered(painted, colours, facing_of(painted, cameras), unseen_borders(found, cameras))

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 _MOST_LISTED = 20
 _LEAST_SHARE = 0.05
 """Of what was not seen: smaller spots are folded away."""
+_MAPS = {
+    "lumen": "The wall cut open at 12 o'clock: along it, and by clock direction",
+    "cavity": "The wall as the camera looks at it, its mean direction of view in the middle",
+}
+"""What the map is, by the kind of the space."""
 _MARK = "/page/blind_spot"
 _INK = (255, 190, 11)
 _LIFT = 0.01
@@ -61,25 +66,25 @@ class UnseenPart:
     def _list(self, found: Coverage) -> None:
         self._clear()
         shown = found.spots[:_MOST_LISTED]
-        count = "1 blind spot" if len(found.spots) == 1 else f"{len(found.spots)} blind spots"
-        largest = f", the largest {len(shown)}:" if len(found.spots) > len(shown) else "."
-        self._words.content = escaped(f"{unseen_words(found)} {count}{largest}")
+        largest = f" The largest {len(shown)}:" if len(found.spots) > len(shown) else ""
+        self._words.content = escaped(f"{found.statement}{largest}")
         large = [spot for spot in shown if share_of(found, spot) >= _LEAST_SHARE]
         small = shown[len(large) :]
         self._outer.visible = self._place.visible = True
         with self._place:
-            self._view.window.gui.add_image(map_picture(found), label="Unrolled: where, and by what clock direction")
+            self._view.window.gui.add_image(map_picture(found), label=_MAPS[found.layout.kind])
             self._add(found, large, 1)
             if small:
                 with self._view.window.gui.add_folder(f"{len(small)} smaller", expand_by_default=False):
                     self._add(found, small, len(large) + 1)
 
     def _add(self, found: Coverage, spots: Sequence[BlindSpot], first: int) -> None:
-        along, unit = found.facts["along_unit"], "mm²" if found.unit == "mm" else "square units (scale unknown)"
+        along = found.facts["along_unit"]
         for number, spot in enumerate(spots, first):
             share = f"{100 * share_of(found, spot):.2g}"
             label = f"{number}. near frame {spot.frame}, {share} % of what was not seen"
-            hint = f"{np.format_float_positional(float(f'{spot.area:.3g}'), trim='-')} {unit} {spot.where(along)}"
+            area = f"{np.format_float_positional(float(f'{spot.area:.3g}'), trim='-')} mm² "
+            hint = f"{area if found.unit == 'mm' else ''}{spot.where(along)}"
             button = self._view.window.gui.add_button(label, hint=hint, color="gray")
             self._view.window.on(button, self._fly, number, spot, found)
 
@@ -94,23 +99,13 @@ class UnseenPart:
         view.note(f"Blind spot {number}, seen from frame {spot.frame}, the nearest.")
 
 
-def unseen_words(found: Coverage) -> str:
-    """Return which share of what was not seen, with its interval, in a sentence, and what makes it doubtful."""
-    low, share, high = (f"{100 * value:.0f}" for value in (found.total.low, found.total.share, found.total.high))
-    what = "of the wall between the first and the last place that was examined"
-    if found.layout.kind != "lumen":
-        what = "of the wall in the directions that were examined"
-    said = f"{share} % {what} was not seen, estimated (90 % interval {low} to {high} %)."
-    return f"{said} {found.caution}" if found.caution else said
-
-
 def share_of(found: Coverage, spot: BlindSpot) -> float:
     """Return the share of a blind spot in all that was not seen, 0 to 1."""
     return min(1.0, spot.area / max(found.total.share * found.total.area, 1e-12))
 
 
 def map_picture(found: Coverage) -> np.ndarray:
-    """Return the unrolled map of what was not seen, (H, W, 3) uint8."""
+    """Return the map of what was not seen, (H, W, 3) uint8."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "map.png"
         found.draw(file)

@@ -23,7 +23,7 @@ from scopemap.apps.coverage.unseen import Views, features, unseen_probability, v
 from scopemap.apps.measure.measure import Measure
 from scopemap.apps.measure.surface_finding import SurfaceFinding
 from scopemap.engine.errors import InputError, reporting
-from scopemap.report.coverage_picture import COLOURS, OUTSIDE, draw_coverage
+from scopemap.report.coverage_picture import COLOURS, OUTSIDE, DrawnMap, draw_coverage
 from scopemap.report.sheet import rgb_of
 from scopemap.result.frame_table import FrameTable
 from scopemap.result.json_numbers import without_nan
@@ -43,6 +43,7 @@ SEEN_BADLY = 2
 NOT_SEEN = 3
 """Classes of the map: seen; from afar or obliquely only; probably not seen. 0 is outside of what was examined."""
 CAUTION = "The lens is assumed and tissue moves: much of this may have been seen."
+NO_SPOT = "There is no blind spot: the share sums small probabilities over the wall."
 _MISLEADING = frozenset({"camera-assumed", "tissue-moves"})
 """Reasons of the verdict that together make a share far too large, as on one real colonoscopy."""
 _GOOD_COSINE = 0.5
@@ -137,8 +138,8 @@ class Coverage:
     distances on the centreline of a lumen from the beginning of the examined part, or degrees from a cavity's mean
     direction of view; 12 o'clock is up in the first picture. spots : the largest first. surface : the closed mesh.
     unseen : (F,) probability that no frame saw a face, by its features (F, 6); NaN outside of what was examined.
-    layout : where points are on the map; first : its row that is the map's first. caution : why the share may be far
-    too large, as a sentence; "": nothing says so.
+    layout : where points are on the map; first : its row that is the map's first. classes : (F,) uint8, that of the
+    map's bin in which a face is. caution : why the share may be far too large, as a sentence; "": nothing says so.
     """
 
     unit: str
@@ -152,6 +153,7 @@ class Coverage:
     features: np.ndarray
     layout: Layout
     first: int
+    classes: np.ndarray
     caution: str = ""
 
     @property
@@ -161,7 +163,7 @@ class Coverage:
         shares = {"total": self.total._asdict(), "segments": [segment._asdict() for segment in self.segments]}
         spots = [asdict(spot) for spot in self.spots]
         known = {"kind": self.layout.kind, "unit": self.unit, "along_unit": along, "scale": self.scale}
-        known |= {"caution": self.caution}
+        known |= {"statement": self.statement, "caution": self.caution}
         return known | shares | {"blind_spots": spots}
 
     @property
@@ -175,6 +177,17 @@ class Coverage:
         """The share not seen with its interval, as the end of a sentence."""
         low, share, high = (f"{100 * value:.0f}" for value in (self.total.low, self.total.share, self.total.high))
         return f"{share} % was not seen, with a probability of 90 % between {low} and {high} %: an estimate."
+
+    @property
+    def statement(self) -> str:
+        """The share not seen with its interval, what makes it doubtful, and how many blind spots there are."""
+        low, share, high = (f"{100 * value:.0f}" for value in (self.total.low, self.total.share, self.total.high))
+        what = "between the first and the last place that was examined"
+        if self.layout.kind != "lumen":
+            what = "in the directions that were examined"
+        said = f"{share} % of the wall {what} was not seen, estimated (90 % interval {low} to {high} %)."
+        count = "There is 1 blind spot." if len(self.spots) == 1 else f"There are {len(self.spots)} blind spots."
+        return " ".join(filter(None, (said, self.caution, count if self.spots else NO_SPOT)))
 
     def __str__(self) -> str:
         """The figures in a few lines: the whole, the segments, and the largest blind spots."""
@@ -203,18 +216,15 @@ class Coverage:
 
     def draw(self, file: Path) -> None:
         """Draw the map as an image; raises `InputError` where it cannot be written."""
-        label = f"along the centreline, {self.unit}" if self.layout.kind == "lumen" else "from the mean view, degrees"
         spots = [(spot.along, spot.clock) for spot in self.spots[:_SHOWN]]
-        ends = self.total.start, self.total.end
+        ends, (along, _) = (self.total.start, self.total.end), self._units
         title = f"not seen: {_percent(self.total)}, estimated"
-        draw_coverage(self.map.classes, self.map.frames, ends, label, spots, title, file)
+        draw_coverage(DrawnMap(self.layout.kind, along, self.map.classes, self.map.frames, ends, spots, title), file)
 
     @property
     def painted(self) -> trimesh.Trimesh:
         """The closed surface, its faces in the map's colours, grey outside of what was examined."""
-        seen, _, hidden = map(rgb_of, COLOURS.values())
-        colours = np.full((len(self.unseen), 3), rgb_of(OUTSIDE), np.uint8)
-        colours[self.unseen <= BLIND], colours[self.unseen > BLIND] = seen, hidden
+        colours = np.array([rgb_of(OUTSIDE), *map(rgb_of, COLOURS.values())], np.uint8)[self.classes]
         return trimesh.Trimesh(self.surface.vertices, self.surface.faces, face_colors=colours, process=False)
 
     def save(self, folder: Path) -> None:
@@ -229,8 +239,8 @@ class Coverage:
 
     @property
     def unseen_faces(self) -> np.ndarray:
-        """Which faces (F,) of the closed surface were probably not seen."""
-        found: np.ndarray = np.nan_to_num(self.unseen) > BLIND
+        """Which faces (F,) of the closed surface were probably not seen, as the map has it."""
+        found: np.ndarray = self.classes == NOT_SEEN
         return found
 
 
@@ -238,7 +248,7 @@ def coverage(result: Result | Path | str) -> Coverage:
     """Return which share of the tissue of a result, or of a submap in `maps/N`, no frame saw, and where.
 
     `total` and `segments` are shares with intervals of 90 %, `spots` the blind spots, the largest first, `map` the
-    unrolled map; `print` shows it in words (docs/coverage.md). result : opened, or its folder.
+    map of what was seen; `print` shows it in words (docs/coverage.md). result : opened, or its folder.
     Raises `InputError` where it holds no finished run, no surface or no depth, where its verdict is "not usable", and
     where no part of the space was seen enough.
     """
@@ -262,8 +272,12 @@ def coverage(result: Result | Path | str) -> Coverage:
     total = _share(faces, 0, len(inside), layout.step, ODDS[layout.kind])
     unit = "mm" if run.scale_known else "unit"
     caution = CAUTION if {reason.code for reason in verdict(run).reasons} >= _MISLEADING else ""
+    classes = np.zeros(len(row), np.uint8)
+    classes[counted] = chart.classes[row[counted], column_of(hours[counted])]
     first = space.first
-    return Coverage(unit, run.scale, total, shares, spots, chart, surface, unseen, known, layout, first, caution)
+    return Coverage(
+        unit, run.scale, total, shares, spots, chart, surface, unseen, known, layout, first, classes, caution
+    )
 
 
 def _percent(share: Share) -> str:

@@ -11,7 +11,7 @@ import trimesh
 from scopemap.apps.coverage.coverage import coverage
 from scopemap.apps.view.fly_through import Painting
 from scopemap.engine.errors import InputError
-from scopemap.report.coverage_picture import COLOURS, OUTSIDE
+from scopemap.report.coverage_picture import OUTSIDE, legend_of
 from scopemap.result.result import Result
 
 _LEVELS = 0.0, 0.25, 0.5, 0.75, 1.0
@@ -19,9 +19,8 @@ _LEVELS = 0.0, 0.25, 0.5, 0.75, 1.0
 
 def coverage_painting(folder: Path) -> Painting:
     """Return the closed surface of a run by whether a frame saw it; raises as `coverage`."""
-    seen, _, hidden = COLOURS
-    legend = {name: COLOURS[name] for name in (seen, hidden)} | {"not examined": OUTSIDE}
-    return Painting(coverage(folder).painted, legend)
+    found = coverage(folder)
+    return Painting(found.painted, legend_of(found.classes) | {"not examined": OUTSIDE})
 
 
 def confidence_painting(folder: Path) -> Painting:

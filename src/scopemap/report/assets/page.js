@@ -212,17 +212,21 @@ function writeLosses() {
 
 // Share not seen, its map, and the blind spots, as `scopemap coverage` wrote them beside the result.
 function writeCoverage() {
-  const found = run.coverage, percent = (share) => `${Math.round(100 * share)} %`;
+  const found = run.coverage;
   element("coverage").hidden = !found;
   if (!found) return;
-  const { share, low, high, area } = found.total, lumen = found.kind === "lumen", digits = (value) => Number(value.toPrecision(3));
-  put("coverage-share", `Not seen: ${percent(share)} (90 % interval: ${percent(low)} to ${percent(high)}) of ${digits(area)} ${found.unit}² of a ${found.kind}. ${found.caution}`.trim());
+  const { share, area, start, end } = found.total, lumen = found.kind === "lumen", digits = (value) => Number(value.toPrecision(2));
+  // Without a scale lengths say nothing: places are shares of the examined length.
+  const along = (place) => (!lumen ? `${Math.round(place)} degrees` : found.unit === "mm" ? `${Math.round(place)} mm` : `${Math.round((100 * (place - start)) / (end - start))} % of the examined length`);
+  put("coverage-share", found.statement);
+  put("coverage-basis", `These are estimates, calibrated on synthetic ${lumen ? "colons" : "cavities"} (docs/coverage.md).`);
+  element("spot-words").hidden = !found.blind_spots.length;
   element("coverage-map").src = `data:image/png;base64,${found.map}`;
   element("spot-list").replaceChildren(...found.blind_spots.map((spot, n) => {
     const item = document.createElement("li"), button = document.createElement("button");
     const where = spot.clock === null ? "all round" : `${Math.round(spot.clock) || 12} o'clock`;
     button.type = "button";
-    button.textContent = `${n + 1}. ${digits(spot.area)} ${found.unit}² at ${Math.round(spot.along)} ${lumen ? found.unit : "degrees"}, ${where}: second ${spot.time_s.toFixed(1)}`;
+    button.textContent = `${n + 1}. ${digits(Math.min(100, (100 * spot.area) / (share * area)))} % of what was not seen, at ${along(spot.along)}, ${where}: second ${spot.time_s.toFixed(1)}`;
     button.addEventListener("click", () => (mark(spot.position_mm, 0), setRow(run.indices.indexOf(spot.frame)), element("surface").scrollIntoView({ block: "nearest" })));
     item.append(button);
     return item;
