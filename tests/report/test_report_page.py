@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from scopemap.engine.notices import Notice
 from scopemap.report.facts import report_facts
 from scopemap.report.frame_pictures import FramePictures
 from scopemap.report.notebook import in_one_line
@@ -22,6 +23,7 @@ from scopemap.report.page_data import page_data
 from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
 from scopemap.result.result import Result
 from scopemap.result.summary import frames_per_s, time_words
+from scopemap.result.wording import facts_of_notices
 from tests.support.drawn_run import (
     CAMERA,
     FRAMES,
@@ -191,6 +193,23 @@ def test_several_runs_share_a_page(tmp_path: Path, folder: Path) -> None:
     assert "<title>ours, theirs" in text
     runs = json.loads(text.partition('id="data">')[2].partition("</script>")[0])["runs"]
     assert [(run["name"], run["verdict"]["word"]) for run in runs] == [("ours", "doubtful"), ("theirs", "not usable")]
+
+
+def test_lengths_are_in_mm_only_where_the_scale_is_known(tmp_path: Path) -> None:
+    scaled = Notice("fusion-scaled", {"voxel_mm": 0.39, "divisor": 128, "max_depth_mm": 78.0})
+    far = Notice("fusion-too-far", {"median_mm": 90.0, "max_depth_mm": 78.0})
+    in_mm = "Voxels measure 0.39 mm, 1/128 of the median depth; pixels beyond 78 mm are not fused. "
+    in_units = (
+        "Voxels measure 0.39 units (the scale is unknown), 1/128 of the median depth; pixels beyond 78 units are "
+    )
+    for known, said in ((True, in_mm), (False, in_units)):
+        scale = {"known": known, "measured": known, "source": "a source"}
+        folder = draw_run(tmp_path / str(known), scale=scale, notices=facts_of_notices([scaled, far]))
+        found = page_data(report_facts(Result(folder), 1000))
+        assert [note for note in found["notes"] if note.startswith(said)]
+        reason = next(one for one in found["verdict"]["reasons"] if one["code"] == "fusion-too-far")
+        assert (" mm" in reason["text"]) == known
+        assert (" 78 units." in reason["text"]) == (not known)
 
 
 def test_truth_is_shown_where_it_is_known(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def page_data(facts: ReportFacts, *, name: str = "", share: float = 1.0) -> dict
         "titles": [one.facts for one in maps],
         "scale_known": run.scale_known,
         "scale_source": scale_source(run.provenance),
-        "notes": [in_words(one) for one in notices_of(run.provenance) if not gives_reason(one.code)],
+        "notes": _notes(run),
         "frames_per_s": frames_per_s(run),
         "camera": {key: getattr(run.camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "frames": _frames(run, maps),
@@ -89,6 +89,12 @@ def by_hand_data(run: Result) -> dict[str, Any]:
     shown = asdict(found) | {"word": found.word, "advice": advice, "reasons": reasons}
     earlier = [number for number, is_so in enumerate(earlier_references(run, kept, kept)) if is_so]
     return {"verdict": shown, "measurements": kept, "by_earlier_reference": earlier}
+
+
+def _notes(run: Result) -> list[str]:
+    """Return the notices of a run that are no reasons of its verdict, in words."""
+    found = notices_of(run.provenance)
+    return [in_words(one, scale_known=run.scale_known) for one in found if not gives_reason(one.code)]
 
 
 def _frames(run: Result, maps: list[MapOnPage]) -> dict[str, Any]:

@@ -309,7 +309,7 @@ def _of_notices(evidence: Evidence, rules: Sequence[Rule]) -> list[Reason]:
         Reason(
             notice.code,
             _graded(notice.code, notice.level, evidence, rules),
-            text_of(notice),
+            text_of(notice, scale_known=evidence.scale_known),
             sentences.next_step(notice.code, evidence),
         )
         for notice in evidence.notices

@@ -208,6 +208,9 @@ WORDINGS: dict[str, Wording] = {
 """The words of every code of `engine/notices.py`."""
 
 
+_MM = re.compile(r"(?<=\d) mm\b")
+
+
 class _Format(Formatter):
     """Formats shares as "6 %", and counts by their noun: `{frames:frame}` is "1 frame" or "12 frames"."""
 
@@ -218,17 +221,22 @@ class _Format(Formatter):
         return f"{text[:-1]} %" if format_spec.endswith("%") else text
 
 
-def text_of(notice: Notice) -> str:
-    """Return one sentence: what was found, and what it means for the result."""
+def text_of(notice: Notice, *, scale_known: bool = True) -> str:
+    """Return one sentence: what was found, and what it means for the result.
+
+    scale_known : where it is not, lengths are in units of the result, and the sentence says so.
+    """
     words = _Format().vformat(WORDINGS[notice.code].text, (), notice.values)
+    if not scale_known:
+        words = _MM.sub(" units", _MM.sub(" units (the scale is unknown)", words, count=1))
     return re.sub(r"^[a-z](?=[a-z-]*[\s:,])", lambda first: first[0].upper(), words.rstrip(".")) + "."
 
 
-def in_words(said: str | Notice) -> str:
-    """Return a notice with its next step in words; the plain text of a reader as it is."""
+def in_words(said: str | Notice, *, scale_known: bool = True) -> str:
+    """Return a notice with its next step in words, as `text_of`; the plain text of a reader as it is."""
     if isinstance(said, str):
         return said
-    return f"{text_of(said)} {WORDINGS[said.code].next_step}".rstrip()
+    return f"{text_of(said, scale_known=scale_known)} {WORDINGS[said.code].next_step}".rstrip()
 
 
 def facts_of_notices(notices: Iterable[Notice]) -> list[dict[str, Any]]:

@@ -193,6 +193,7 @@ def print_warnings(provenance: Mapping[str, Any]) -> None:
     from scopemap.result.evidence import notices_of
     from scopemap.result.wording import in_words
 
+    scale_known = bool((provenance.get("scale") or {}).get("known"))
     for notice in notices_of(provenance):
         if notice.level != "info":
-            typer.echo(f"warning: {in_words(notice)}", err=True)
+            typer.echo(f"warning: {in_words(notice, scale_known=scale_known)}", err=True)
