@@ -60,6 +60,19 @@ def test_a_file_is_written_as_it_comes_under_its_safe_name(
     assert "reading the video Müller_1970.mp4" in words(window)
     assert "scopemap-app-" not in words(window)
     assert workspace.new_result(file) == workspace.results / "Müller_1970"
+    # What cannot be read is no video: the list does not offer it.
+    assert "the file is not kept" in words(window)
+    assert workspace.sent == []
+
+
+def test_a_letter_keeps_its_name_and_is_not_listed(opened: tuple[BrowserWindow, Workspace, Client]) -> None:
+    window, workspace, client = opened
+    client.start(button(window), "letter.pdf", 10)
+    client.part(button(window), 0, b"%PDF-1.4\n\n")
+    until(window, lambda: "the file is not kept" in words(window))
+    assert "letter.pdf" in words(window)
+    assert "letter.pdf.video" not in words(window)
+    assert files(workspace) == []
 
 
 @pytest.mark.parametrize(

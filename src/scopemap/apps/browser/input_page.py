@@ -18,7 +18,7 @@ from scopemap.apps.browser.run_choice import LAYOUTS, PRESETS, Box, RunChoice, b
 from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.window import escaped, fenced, typed_number
 from scopemap.apps.browser.workspace import Workspace
-from scopemap.engine.errors import ScopemapError, SettingsError
+from scopemap.engine.errors import InputError, ScopemapError, SettingsError
 from scopemap.input.scopes import SCOPES
 from scopemap.report.frame_pictures import shrunk
 
@@ -39,12 +39,22 @@ _WORDS = {"error": "Error", "warning": "Caution", "info": "Note"}
 
 
 class InputPage:
-    """An input; started : called with the run that is started. back : called where the page is left."""
+    """An input; started : called with the run that is started. back : called where the page is left.
+
+    is_new : whether it is a file that was just sent, which is not kept where it cannot be read.
+    """
 
     def __init__(
-        self, workspace: Workspace, source: Path, started: Callable[[BrowserRun], None], back: Callable[[], None]
+        self,
+        workspace: Workspace,
+        source: Path,
+        started: Callable[[BrowserRun], None],
+        back: Callable[[], None],
+        *,
+        is_new: bool = False,
     ) -> None:
         self._workspace, self._source, self._started, self._back = workspace, source, started, back
+        self._is_new = is_new
         self._looked: Look | None = None
         self._camera: CameraPart | None = None
         self._drawing: RedactPart | None = None
@@ -93,6 +103,9 @@ class InputPage:
 
     def _show(self, found: Look | ScopemapError) -> None:
         self._bar.visible = False
+        if isinstance(found, InputError) and self._is_new:
+            self._source.unlink(missing_ok=True)
+            raise InputError(f"{found}; the file is not kept")
         if isinstance(found, ScopemapError):
             raise found
         self._looked = found

@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from scopemap.apps.browser.uploads import UNKNOWN_KIND
+
 _PLACES = ("the folder", "folder")
 """What stands for the folder of the videos, with and without its own name."""
 
@@ -19,6 +21,7 @@ class Names:
         self._instead: dict[str, str] = {}
         self._counts: dict[str, int] = {}
         self._left_out: set[str] = set()
+        self._lengthened: set[str] = set()
 
     def leave_out(self, folder: Path) -> None:
         """Show files of a folder by their names alone: it is a temporary one, of which nobody knows."""
@@ -34,7 +37,9 @@ class Names:
     def of(self, path: Path, kind: str) -> str:
         """Return the name of a file or folder; hidden: its kind and a number, the same each time."""
         if not self.anonymous:
-            return path.name
+            name = path.name.removesuffix(UNKNOWN_KIND)
+            self._lengthened |= {path.name} - {name}
+            return name
         key = kind, path.absolute()
         if key not in self._of:
             self._counts[kind] = self._counts.get(kind, 0) + 1
@@ -55,9 +60,11 @@ class Names:
         return out
 
     def hidden(self, text: str) -> str:
-        """Return a text without temporary folders; names that are known here are hidden in it, if they are to be."""
+        """Return a text without temporary folders, and with names of files as `of` returns them."""
         for folder in sorted(self._left_out, key=len, reverse=True):  # one may be inside of another
             text = text.replace(folder, "")
+        for name in self._lengthened:
+            text = text.replace(name, name.removesuffix(UNKNOWN_KIND))
         if not (self.anonymous and self._instead):
             return text
         # The longest first: a folder's path before its name, "a_2" before "a".

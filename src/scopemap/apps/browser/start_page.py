@@ -77,7 +77,7 @@ class StartPage:
                 f"{self._window.names.of(self._workspace.uploads / name, 'video')} was not taken: {reason}"
             )
         if (sent := self._receiver.take()) is not None:
-            self._choose(sent)
+            self._choose(sent, is_new=True)
         runs = self._workspace.runs.runs[-_MOST_RUNS:]
         if tuple((run, run.status, run.stopping) for run in runs) != self._shown:
             self._show_runs()
@@ -202,8 +202,8 @@ class StartPage:
             raise InputError("type the path of a video below this folder")
         self._choose(self._workspace.inside(name))
 
-    def _choose(self, source: Path) -> None:
-        self._window.show(InputPage(self._workspace, source, self.show_run, self._window.start))
+    def _choose(self, source: Path, *, is_new: bool = False) -> None:
+        self._window.show(InputPage(self._workspace, source, self.show_run, self._window.start, is_new=is_new))
 
     def _open_live(self, source: str) -> None:
         if not source:

@@ -18,6 +18,8 @@ from typing import IO, Any
 
 PART = ".part"
 """What the name of a file ends in while it comes."""
+UNKNOWN_KIND = ".video"
+"""What is added to the name of a video of a kind that is not known, so that it is read as nothing else; not shown."""
 _MOST_AT_ONCE = 4
 _KEPT_FREE_BYTES = 500_000_000
 _QUIET_EVERY_S = 0.5

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from scopemap.apps.browser.runs import BrowserRun, RunQueue
-from scopemap.apps.browser.uploads import PART, Receiver
+from scopemap.apps.browser.uploads import PART, UNKNOWN_KIND, Receiver
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.input.decoding import read_decoded
 from scopemap.input.opening import VIDEO_ENDINGS
@@ -40,7 +40,6 @@ _MARK = "provenance.json"
 _MOST_NAMED = 80
 _MOST_KEPT = 60
 """Letters that are kept of a sent file's name: with what is added to them the file's system takes them."""
-_UNKNOWN_KIND = ".video"
 _VIDEOS = {*VIDEO_ENDINGS, ".dcm", ".bag"}
 _IMAGES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 _MOST_LISTED = 200
@@ -86,7 +85,7 @@ class Workspace:
     @property
     def sent(self) -> list[Path]:
         """Videos that were sent to the page, the latest first."""
-        found = [path for path in _inside(self.uploads) if path.suffix in {*_VIDEOS, _UNKNOWN_KIND}]
+        found = [path for path in _inside(self.uploads) if path.suffix in {*_VIDEOS, UNKNOWN_KIND}]
         return sorted(found, key=lambda path: -path.stat().st_mtime)[:_MOST_LISTED]
 
     @property
@@ -134,7 +133,7 @@ class Workspace:
         ending = Path(name).suffix.lower()
         if ending in _VIDEOS:
             return _free_place(self.uploads, Path(name).stem, ending)
-        return _free_place(self.uploads, Path(name).name, _UNKNOWN_KIND)
+        return _free_place(self.uploads, Path(name).name, UNKNOWN_KIND)
 
     @property
     def calibrations(self) -> Path:
