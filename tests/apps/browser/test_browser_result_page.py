@@ -244,7 +244,8 @@ def test_without_a_scale_two_points_become_the_reference(tmp_path: Path) -> None
             click(shown, page, pixel)
         shown.press("Measure the area")
         shown.until(lambda: "--reference-mm 5" in shown.words)
-        assert "mm2" in shown.words
+        assert "mm²" in shown.words
+        assert "mm2" not in shown.words
         assert "by an earlier reference" not in shown.words
         # Another reference: what was measured by the one before is marked.
         shown.choose("ButtonGroup", "Measure", "Distance")

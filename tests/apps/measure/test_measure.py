@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from scopemap.apps.measure.measure import Measure
 from scopemap.engine.geometry.surface_measures import SurfacePoint, area_inside, meet_surface, path_length
 from tests.support.drawn_run import CAMERA, FRAMES, IN_RESULT, draw_run
 from tests.support.front_door import call, refused
@@ -140,6 +141,7 @@ def test_the_area_of_a_patch_of_the_tube(known: Path, capfd: pytest.CaptureFixtu
     outline = [*((angle, 20.0) for angle in angles), *((angle, 32.0) for angle in angles[::-1])]
     (one,) = measured(capfd, known, pixels(*outline)).values()
     assert (one["what"], one["unit"]) == ("area", "mm2")
+    assert str(Measure("area", 40.0, 30.0, 50.0, "mm2")) == "area: 40 mm² (30 to 50)"
     assert one["value"] == pytest.approx(RADIUS * 1.5 * 12, rel=0.03)
     assert one["low"] < RADIUS * 1.5 * 12 < one["high"]
 

@@ -191,7 +191,7 @@ class Coverage:
 
     def __str__(self) -> str:
         """The figures in a few lines: the whole, the segments, and the largest blind spots."""
-        along, area = self._units
+        along, area = self._units[0], self._units[1].replace("mm2", "mm²")
         of = "a lumen" if self.layout.kind == "lumen" else "a cavity, by angles from the mean direction of view"
         lines = [f"not seen: {_percent(self.total)} of {_three_digits(self.total.area)} {area} of {of}; {self.scale}"]
         lines += [f"  {self.caution}"] if self.caution else []

@@ -68,6 +68,11 @@ class Measure:
         """Whether it is told from nothing: its interval does not begin at 0."""
         return self.low != 0
 
+    @property
+    def unit_in_words(self) -> str:
+        """The unit as a person reads it: "mm²" for "mm2"."""
+        return self.unit.replace("mm2", "mm²")
+
     def __str__(self) -> str:
         if not np.isfinite(self.value):
             return f"{self.what}: none, the surface has a gap between the points"
@@ -76,8 +81,10 @@ class Measure:
         )
         why = f"; wide mainly because of {self.why}" if self.why else ""
         if not self.is_measurable:
-            return f"{self.what}: not measurable ({low} to {high} {self.unit}{why})"
-        return f"{self.what}: {value} {self.unit}" + (f" ({low} to {high}{why})" if np.isfinite(self.low) else "")
+            return f"{self.what}: not measurable ({low} to {high} {self.unit_in_words}{why})"
+        return f"{self.what}: {value} {self.unit_in_words}" + (
+            f" ({low} to {high}{why})" if np.isfinite(self.low) else ""
+        )
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ const outlineOf = (points) => (points.length > 2 ? [...points, points[0]] : poin
 const rowOf = (one) => run.indices.indexOf(one.frame);
 
 // [value, interval] in words; a gap of the surface has no length.
-function figureWords({ value, low, high, unit, why }) {
+function figureWords({ value, low, high, unit: kept, why }) {
+  const unit = kept.replace("mm2", "mm²");
   if (value === null) return ["none: the surface has a gap", ""];
   const interval = low === null ? "" : `${rounded3(low)} to ${rounded3(high)} ${unit}`;
   const cause = why ? `, wide mainly because of ${why}` : "";
