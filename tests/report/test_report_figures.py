@@ -82,6 +82,9 @@ def test_depth_colours_are_a_scale(near_mm: float, span_mm: float) -> None:
     assert levels[0] == 255  # near is red, here as in the previews and on the page
     assert levels[-1] == 0
     assert (np.diff(levels) <= 0).all()
+    # Over the logarithm: the geometric mean has the middle colour.
+    middle = np.full((1, 1), np.sqrt(near_mm * (near_mm + span_mm)))
+    assert table.index(colour_depth(middle, near_mm, near_mm + span_mm)[0, 0].tolist()) in (127, 128)
 
 
 def test_unknown_depth_is_black_and_the_range_must_make_sense() -> None:
@@ -92,6 +95,8 @@ def test_unknown_depth_is_black_and_the_range_must_make_sense() -> None:
     assert rgb.any(axis=-1).sum() == 3
     with pytest.raises(ValueError, match="beyond"):
         colour_depth(depth, 10, 10)
+    with pytest.raises(ValueError, match="beyond 0"):
+        colour_depth(depth, 0, 10)
 
 
 def test_a_ball_is_painted_where_it_projects() -> None:

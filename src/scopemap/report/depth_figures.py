@@ -27,14 +27,12 @@ MASKED_GREY = 110
 
 
 def colour_depth(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndarray:
-    """Return (H, W, 3) uint8 sRGB of depth (H, W) mm: `near_mm` red, `far_mm` blue (turbo), NaN black."""
-    if not far_mm > near_mm:
-        raise ValueError(f"colouring depth: far ({far_mm} mm) must be beyond near ({near_mm} mm)")
-    return colour_share((far_mm - depth_mm) / (far_mm - near_mm))
+    """Return (H, W, 3) uint8 sRGB of depth (H, W) mm over its logarithm: near red, far blue (turbo), NaN black.
 
-
-def colour_depth_in_logs(depth_mm: np.ndarray, near_mm: float, far_mm: float) -> np.ndarray:
-    """Return (H, W, 3) uint8 sRGB of depth (H, W) mm over its logarithm: near red, far blue (turbo), NaN black."""
+    Raises `ValueError` unless 0 < `near_mm` < `far_mm`.
+    """
+    if not far_mm > near_mm > 0:
+        raise ValueError(f"colouring depth: far ({far_mm} mm) must be beyond near ({near_mm} mm), and that beyond 0")
     return colour_share(np.log(far_mm / depth_mm) / np.log(far_mm / near_mm))
 
 
@@ -69,7 +67,7 @@ class DepthPreviews:
         mm, or multiples of the nearest depth where the scale is unknown.
         """
         scale_mm = DepthReader(self._folder.parent).scale_mm
-        bgr_by_unit = colour_depth_in_logs(scale_mm * np.arange(1 << 16).clip(1)[None], *range_mm)[0, :, ::-1].copy()
+        bgr_by_unit = colour_depth(scale_mm * np.arange(1 << 16).clip(1)[None], *range_mm)[0, :, ::-1].copy()
         bgr_by_unit[0] = 0
         legend_of = cache(lambda width: _depth_legend(width, range_mm, scale_known)[..., ::-1])
 
@@ -89,7 +87,7 @@ def _depth_legend(width: int, range_mm: tuple[float, float], scale_known: bool) 
     """Return what the colours of the previews mean, (h, width, 3) uint8."""
     shown_mm = np.geomspace(*range_mm, max(2, min(_MOST_NUMBERS, (width - _LAST_PX) // _STEP_PX)))
     unit_mm = 1.0 if scale_known else range_mm[0]
-    colours = (f"#{bytes(rgb).hex()}" for rgb in colour_depth_in_logs(shown_mm[None], *range_mm)[0])
+    colours = (f"#{bytes(rgb).hex()}" for rgb in colour_depth(shown_mm[None], *range_mm)[0])
     words = dict(zip([f"{mm / unit_mm:.3g}" for mm in shown_mm], colours, strict=True)) | {"unknown": "#000000"}
     words["no tissue"] = f"#{bytes([MASKED_GREY] * 3).hex()}"
     sheet = Sheet(width, _LEGEND_PX)
@@ -124,7 +122,7 @@ def draw_renderings(pairs: Mapping[int, tuple[np.ndarray, np.ndarray]], file: Pa
 
 
 def percentiles(maps: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of the known values, apart; 0 and 1 without any."""
+    """Return the 2nd and 98th percentile of the known values, apart; 1 and 2 without any."""
     known = np.concatenate([values[np.isfinite(values)] for values in maps])
-    low, high = np.percentile(known, (2, 98)) if len(known) else (0.0, 1.0)
+    low, high = np.percentile(known, (2, 98)) if len(known) else (1.0, 2.0)
     return float(low), float(max(high, low + 1e-3))

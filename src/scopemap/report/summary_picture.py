@@ -14,7 +14,7 @@ from PIL import Image
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.rendering import render_mesh, vertex_colours
 from scopemap.input.decoding import decoded
-from scopemap.report.depth_figures import MASKED_GREY, colour_depth_in_logs
+from scopemap.report.depth_figures import MASKED_GREY, colour_depth
 from scopemap.report.facts import PicturedFrame, ReportFacts
 from scopemap.report.frame_pictures import WHOLLY_USABLE
 from scopemap.report.mesh_figures import (
@@ -124,7 +124,7 @@ def _depth_row(facts: ReportFacts, frames: list[PicturedFrame]) -> dict[str, np.
     for frame in frames:
         if (depth_mm := run.depth.read(frame.index)) is not None:
             title = " " * len(shown) or f"depth: red {ends[0]}, blue {ends[1]}"
-            shown[title] = _fitted(_without_masked(frame, colour_depth_in_logs(depth_mm, near_mm, far_mm)))
+            shown[title] = _fitted(_without_masked(frame, colour_depth(depth_mm, near_mm, far_mm)))
             _scale_frame(run, frame.index, shown[title])
     return shown
 

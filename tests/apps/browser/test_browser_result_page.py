@@ -15,6 +15,7 @@ import pytest
 import trimesh
 
 from scopemap.apps.browser.files_part import export_place
+from scopemap.apps.browser.frame_images import depth_words
 from scopemap.apps.browser.marks import CLICKED
 from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.runs import BrowserRun
@@ -149,6 +150,11 @@ def test_frames_say_what_they_are(tmp_path: Path) -> None:
         shown.press("Look from here")
         place = np.array(shown.window.server.initial_camera.position)
         np.testing.assert_allclose(place, pose_of(18)[:3, 3], atol=1e-6)
+
+
+def test_depth_has_a_unit_or_is_said_in_multiples() -> None:
+    assert depth_words(12.0, 49.0, scale_known=True) == "depth 12 to 49 mm, near red"
+    assert depth_words(12.0, 48.0, scale_known=False) == "depth, far is 4 times near, near red"
 
 
 def test_frames_are_played_to_their_end(tmp_path: Path) -> None:

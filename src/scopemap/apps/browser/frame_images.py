@@ -36,7 +36,7 @@ class FrameImages:
 
     @cached_property
     def depth_range_mm(self) -> tuple[float, float]:
-        """Depth at the ends of the colours: blue, red."""
+        """Depth at the ends of the colours: red, blue."""
         depths = [frame.depth_mm[::4, ::4].ravel() for frame in looking_frames(self._view.whole)]
         known = np.concatenate([*depths, np.empty(0, np.float32)])
         known = known[np.isfinite(known)]
@@ -83,8 +83,8 @@ class FrameImages:
             parts.append(("picture" if is_own else f"picture of frame {found[0]}", found[1], is_own))
         if depth_mm is not None:
             near, far = self.depth_range_mm
-            unit = " mm" if view.whole.scale_known else ""
-            parts.append((f"depth {near:.2g}-{far:.2g}{unit}, near red", colour_depth(depth_mm, near, far), True))
+            words = depth_words(near, far, scale_known=view.whole.scale_known)
+            parts.append((words, colour_depth(depth_mm, near, far), True))
         if view.pose is not None and not view.surface.is_empty:
             parts.append(("surface", self._rendered(view.pose, picture, depth_mm), True))
         if not parts:
@@ -107,6 +107,13 @@ class FrameImages:
             rgb = cv2.resize(picture, (camera.width, camera.height))
             seen = lit_like(seen, camera, rgb, depth_mm)
         return np.where(np.isnan(seen.depth_mm)[..., None], np.array(_EMPTY, np.uint8), seen.rgb)
+
+
+def depth_words(near_mm: float, far_mm: float, *, scale_known: bool) -> str:
+    """Return what the colours of depth mean, in mm, or where the scale is unknown in multiples of the nearest depth."""
+    if scale_known:
+        return f"depth {near_mm:.2g} to {far_mm:.2g} mm, near red"
+    return f"depth, far is {far_mm / near_mm:.2g} times near, near red"
 
 
 def _tile(image: np.ndarray, size: tuple[int, int], words: str, mark: np.ndarray | None, width: int) -> np.ndarray:
