@@ -230,6 +230,14 @@ def test_the_changes_of_two_examinations_are_flown_to(tmp_path: Path, monkeypatc
         sent = nodes["/page/first/surface"].glb_data
         press(window, "Colours", "picture")
         assert nodes["/page/first/surface"].glb_data != sent
+        # One over the other they are told apart: of the same colours, each has a tint.
+        sides = ("/page/first/surface", "/page/second/surface")
+        assert nodes[sides[0]].glb_data == nodes[sides[1]].glb_data
+        beside = nodes[sides[0]].glb_data
+        press(window, "One over the other", True)
+        assert len({beside, *(nodes[side].glb_data for side in sides)}) == 3
+        press(window, "One over the other", False)
+        assert nodes[sides[1]].glb_data == beside
         assert [nodes[f"/page/{side}/name"].text for side in ("first", "second")] == ["a", "b"]
 
 
@@ -263,8 +271,9 @@ def test_of_two_that_do_not_fit_no_change_is_shown(tmp_path: Path, monkeypatch: 
         "scopemap.apps.exams.compare_exams.compare_exams", lambda *folders: (asked.append(folders), found)[1]
     )
     with opened(ComparePage(first, second)) as window:
-        until(window, lambda: "One over the other" in words(window))
+        until(window, lambda: "Exchange the two" in words(window))
         said = words(window)
+        assert "One over the other" not in said
         assert said.index("They do not fit: matched points are 28.6%") < said.index("Found in a")
         assert "Changed places are not judged" in said
         assert "what changed" not in said

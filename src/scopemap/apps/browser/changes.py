@@ -12,7 +12,7 @@ import trimesh
 from scopemap.apps.browser.files_part import video_name
 from scopemap.apps.browser.legends import words_html
 from scopemap.apps.browser.scene import draw_path, look_from
-from scopemap.apps.browser.surface_pair import SurfacePair
+from scopemap.apps.browser.surface_pair import TINTS, SurfacePair, tinted
 from scopemap.apps.browser.window import escaped
 from scopemap.apps.exams.change import Change
 from scopemap.apps.exams.change_painting import COMPARED
@@ -70,7 +70,8 @@ class ShownChanges:
         if is_judged:
             window.on(gui.add_dropdown("Colours", (_CHANGED, _PICTURE)), self._colour)
         self._legend = gui.add_html("")
-        window.on(gui.add_checkbox("One over the other", initial_value=False), self._pair.place)
+        if is_judged:
+            window.on(gui.add_checkbox("One over the other", initial_value=False), self._overlay)
         button = gui.add_button("Download the comparison")
         button.on_click(lambda event: window.do(self._send, event.client))
         gui.add_markdown("It is one file to keep, print or send, with the table and the pictures.")
@@ -79,14 +80,28 @@ class ShownChanges:
             gui.add_markdown(f"The same as a page:\n```\n{command}\n```")
         self._colour(_CHANGED if is_judged else _PICTURE)
 
+    def _overlay(self, is_over: bool) -> None:
+        self._pair.place(is_over)
+        self._colour(self._chosen)
+
     def _colour(self, chosen: str) -> None:
+        """Show both in the chosen colours; over each other they have a tint each, but where they changed."""
+        self._chosen, is_over, legend = chosen, self._pair.overlaid, dict[str, str]()
         colours = [np.asarray(vertex_colours(surface)[:, :3]) for surface in self._pair.shown]
+        if is_over:
+            colours = [tinted(*each) for each in zip(colours, TINTS, strict=True)]
+            legend = dict(zip(self._names, TINTS, strict=True))
         if chosen == _CHANGED:
+            meanings = dict([*COMPARED.items()][-1:]) if is_over else COMPARED
             table = np.array([rgb_of(colour) for colour in COMPARED.values()], np.uint8)
-            compared: list[Any] = [surface.vertex_attributes[_COMPARED] for surface in self._pair.shown]
-            colours = [table[np.round(of).astype(int)] for of in compared]
+            for number, surface in enumerate(self._pair.shown):
+                attribute: Any = surface.vertex_attributes[_COMPARED]
+                of = np.round(attribute).astype(int)
+                shown = of == len(COMPARED) - 1 if is_over else np.ones(len(of), bool)
+                colours[number] = np.where(shown[:, None], table[of], colours[number])
+            legend |= meanings
         self._pair.draw(colours)
-        self._legend.content = words_html(COMPARED) if chosen == _CHANGED else ""
+        self._legend.content = words_html(legend) if legend else ""
 
     def _fly(self, number: int, change: Change) -> None:
         """Look at a change from where the first camera saw it best, and show the frames of both."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from scopemap.apps.browser.legends import ramp_html, words_html
 from scopemap.apps.browser.scene import draw_path, look_at
-from scopemap.apps.browser.surface_pair import SurfacePair
+from scopemap.apps.browser.surface_pair import TINTS, SurfacePair, tinted
 from scopemap.apps.browser.two_results import TwoResults, apart_of, compare_results, is_alone, is_same_input
 from scopemap.apps.browser.window import escaped
 from scopemap.apps.exams.wording import names_of
@@ -24,8 +24,7 @@ from scopemap.result.result import Result
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
 
-_FIRST = "#466ec8"
-_SECOND = "#e07b1a"
+_FIRST, _SECOND = TINTS
 _DISTANCE = "distance to the other"
 _ALONE = "in one alone"
 _PICTURE = "picture"
@@ -86,7 +85,7 @@ class ComparePage:
             chosen = gui.add_dropdown("Colours", (_DISTANCE, _ALONE, _PICTURE, _PLAIN), initial_value=_DISTANCE)
             window.on(chosen, self._colour)
             overlaid = gui.add_checkbox("One over the other", initial_value=False)
-            window.on(overlaid, self._pair.place)
+            window.on(overlaid, self._overlay)
             self._colour(_DISTANCE)
         else:
             self._legend.content = words_html(self._of_paths())
@@ -104,9 +103,13 @@ class ComparePage:
         first, second = self._names
         return {f"path of {first}": _FIRST, f"path of {second}": _SECOND}
 
+    def _overlay(self, is_over: bool) -> None:
+        self._pair.place(is_over)
+        self._colour(self._chosen)
+
     def _colour(self, chosen: str) -> None:
-        """Show both surfaces in the chosen colours, and what these mean."""
-        found = self._found
+        """Show both surfaces in the chosen colours, and what these mean; pictures over each other are tinted."""
+        found, self._chosen = self._found, chosen
         first, second = self._names
         far, legend = found.most_apart, words_html(self._of_paths())
         colours = [np.asarray(vertex_colours(surface)[:, :3]) for surface in self._pair.shown]
@@ -126,6 +129,9 @@ class ComparePage:
             legend = words_html(alone | self._of_paths())
         elif chosen == _PLAIN:
             colours = [np.tile(one, (len(of), 1)) for one, of in zip(own, apart, strict=True)]
+        elif self._pair.overlaid:
+            colours = [tinted(*each) for each in zip(colours, TINTS, strict=True)]
+            legend = words_html({first: _FIRST, second: _SECOND} | self._of_paths())
         self._pair.draw(colours)
         self._legend.content = legend
 

@@ -12,11 +12,15 @@ from scopemap.apps.browser.scene import look_from
 from scopemap.apps.browser.shown_surface import MOST_FACES, facing_of
 from scopemap.apps.browser.surface_colours import in_relief
 from scopemap.apps.browser.unlit_mesh import unlit_glb
+from scopemap.report.sheet import rgb_of
 from scopemap.report.shown_mesh import simplified
 
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
 
+TINTS = ("#466ec8", "#e07b1a")
+"""Colours of the first and of the second."""
+_TINTED = 0.65  # by hand: share of its tint in the colour of a surface that lies over another one
 _GAP = 1.15
 """Distance of the two over their width."""
 
@@ -31,6 +35,7 @@ class SurfacePair:
     both are looked at. names : that stand above them.
 
     nodes : of the scene, under which what belongs to each is drawn. shown : the surfaces as they are shown.
+    overlaid : whether one is over the other.
     """
 
     nodes = ("/page/first", "/page/second")
@@ -53,6 +58,7 @@ class SurfacePair:
 
     def place(self, overlaid: bool) -> None:
         """Put one over the other, or beside it, and look at both."""
+        self.overlaid = overlaid
         aside = np.zeros(3) if overlaid else self._aside
         self._second.position = tuple(aside)
         first, second = self._points
@@ -78,6 +84,12 @@ class SurfacePair:
             for node, surface, facing, of in zip(self.nodes, self.shown, self._facing, colours, strict=True):
                 glb = unlit_glb(np.asarray(surface.vertices), np.asarray(surface.faces), in_relief(facing, of))
                 self._window.scene.add_glb(f"{node}/surface", glb, cast_shadow=False, receive_shadow=False)
+
+
+def tinted(colours: np.ndarray, tint: str) -> np.ndarray:
+    """Return colours (V, 3) uint8, most of which is a tint "#rrggbb"."""
+    mixed = (1 - _TINTED) * colours + _TINTED * np.array(rgb_of(tint))
+    return np.round(mixed).astype(np.uint8)
 
 
 def distance_to_see(points: np.ndarray, fov_rad: float, aspect: float) -> float:
