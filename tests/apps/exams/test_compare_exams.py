@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from base64 import b64decode
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from scopemap.apps.exams.examination import Examination
 from scopemap.apps.exams.exams_page import facts_of
 from scopemap.apps.exams.fit import GOOD_RESIDUAL, MOST_FAR, MOST_RESIDUAL, ExamFit, fit_of, judgement
 from scopemap.apps.exams.wording import names_of, summary
+from scopemap.apps.measure.hand_measure import HandMeasure, add_measurement
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.align import Similarity
@@ -272,3 +274,26 @@ def test_other_places_cannot_be_compared(runs: tuple[Path, Path], tmp_path: Path
     other = examined(tmp_path / "far", far, surface(3, 30.0, False), Similarity.identity())
     with pytest.raises(InputError, match="cannot be compared: 0 of 6 keyframes"):
         compare_exams(runs[0], other)
+
+
+def test_sizes_are_in_mm_by_the_reference_of_the_first(
+    runs: tuple[Path, Path], found: ExamComparison, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    first = shutil.copytree(runs[0], tmp_path / "first")
+    ends = np.array([[0.0, 0.0, PLANE_MM], [4.0, 0.0, PLANE_MM]])
+    add_measurement(first, HandMeasure(".", 2, np.zeros((2, 2)), None, 10.0, [], ends, "reference"))
+    referred = compare_exams(first, runs[1])
+    factor = 10 / 4
+    assert referred.registration.S_first_second.scale == pytest.approx(found.registration.S_first_second.scale * factor)
+    np.testing.assert_allclose(referred.second.vertices, np.asarray(found.second.vertices) * factor, rtol=1e-6)
+    for one, other in zip(referred.changes, found.changes, strict=True):
+        assert one.area_mm2 == pytest.approx(other.area_mm2 * factor**2)
+        assert one.rise_mm == pytest.approx(other.rise_mm * factor)
+        np.testing.assert_allclose(one.place_mm, other.place_mm * factor)
+    assert call("compare-exams", first, runs[1], "--out", tmp_path / "out") == 0
+    (sizes,) = (line for line in capfd.readouterr().out.splitlines() if line.startswith("Sizes are those of first: "))
+    assert "reference of 10 mm in frame 2" in sizes
+    assert "unknown" not in sizes
+    changes = json.loads((tmp_path / "out" / "changes.json").read_text())["changes"]
+    assert changes[0]["area_mm2"] == pytest.approx(referred.changes[0].area_mm2)
+    assert "area, mm²" in (tmp_path / "out" / "compare.html").read_text()

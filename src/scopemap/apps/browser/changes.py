@@ -17,6 +17,7 @@ from scopemap.apps.browser.window import escaped
 from scopemap.apps.exams.change import Change
 from scopemap.apps.exams.change_painting import COMPARED
 from scopemap.apps.exams.compare_exams import ExamComparison
+from scopemap.apps.exams.examination import as_compared
 from scopemap.apps.exams.exams_page import comparison_page, pictures_of, pictures_of_view
 from scopemap.apps.exams.fit import ExamFit
 from scopemap.apps.exams.wording import seen_words, summary
@@ -44,7 +45,7 @@ class ShownChanges:
     def __init__(
         self, window: BrowserWindow, found: ExamComparison, folders: tuple[Path, Path], names: tuple[str, str]
     ) -> None:
-        runs = Result(folders[0]), Result(folders[1])
+        runs = as_compared(folders[0]), Result(folders[1])
         self._window, self._found, self._runs, self._folders, self._names = window, found, runs, folders, names
         self._poses = runs[0].frames["T_world_camera"][runs[0].frames.tracked]
 

@@ -42,6 +42,11 @@ class Change:
             seen_in="second",
         )
 
+    def enlarged(self, factor: float) -> Change:
+        """Return the change in a world whose lengths are times a factor."""
+        place_mm, area_mm2 = self.place_mm * factor, self.area_mm2 * factor**2
+        return replace(self, place_mm=place_mm, area_mm2=area_mm2, rise_mm=self.rise_mm * factor)
+
     @property
     def radius_mm(self) -> float:
         """Of a circle with its area."""

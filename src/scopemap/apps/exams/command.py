@@ -36,10 +36,10 @@ def compare_exams(
     options.check_output(out / "compare.html", (".html",), overwrite)
     from scopemap.apps.exams.change_painting import change_painting
     from scopemap.apps.exams.compare_exams import compare_exams as compare
+    from scopemap.apps.exams.examination import as_compared
     from scopemap.apps.exams.exams_page import PAGE, facts_of, write_comparison
     from scopemap.apps.exams.wording import names_of, summary
     from scopemap.apps.view.fly_through import write_fly_through
-    from scopemap.result.result import Result
 
     for folder in (first, second):
         options.warn_of_damage(folder, silent=quiet)
@@ -47,7 +47,7 @@ def compare_exams(
     write_comparison(found, first, second, out)
     if video is not None:
         write_fly_through(first, video, source, change_painting(first, found))
-    run = Result(first)
+    run = as_compared(first)
     if as_json:
         print_json(facts_of(found, "mm" if run.scale_known else "unit"))
     elif not quiet:

@@ -11,7 +11,7 @@ Changes are judged only where the two surfaces fit (`fit`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scopemap.apps.exams.change import Change, changes_of_both
-from scopemap.apps.exams.examination import HIDDEN, Examination
+from scopemap.apps.exams.examination import HIDDEN, Examination, to_mm
 from scopemap.apps.exams.fit import ExamFit, fit_of
 from scopemap.apps.exams.registration import LEAST_PAIRS, Correspondences3D, Registration, register, robust_similarity
 from scopemap.engine.cameras.camera import PinholeCamera
@@ -52,7 +52,7 @@ _APART = 0.08  # of depth, from the other surface: only one of them saw it
 
 @dataclass(frozen=True)
 class ExamComparison:
-    """Two examinations in the world of the first.
+    """Two examinations in the world of the first, in mm where a reference gives its scale (`as_compared`).
 
     registration : of all pairs, and how well they agree. second : its surface in the world of the first. changes : what
     the views of both show, then the surest; none where the two do not fit. views : numbers of frames of both that show
@@ -97,7 +97,23 @@ def compare_exams(
         in_first = [change.of_second(S) for change in of_second]
         changes = changes_of_both(of_first, in_first, found.residual * one.depth_mm)
     views = _views(one, other, S)
-    return ExamComparison(found, moved, changes, views, only[0], only[1], (compared[0], compared[1]))
+    every = ExamComparison(found, moved, changes, views, only[0], only[1], (compared[0], compared[1]))
+    return _enlarged(every, to_mm(one.run))
+
+
+def _enlarged(found: ExamComparison, factor: float) -> ExamComparison:
+    """Return a comparison in a world of the first whose lengths are times a factor."""
+    by = found.registration
+    S = replace(by.S_first_second, scale=by.S_first_second.scale * factor, t=by.S_first_second.t * factor)
+    pairs = by.pairs._replace(first=by.pairs.first * factor)
+    second = found.second.copy()
+    second.vertices = np.asarray(second.vertices) * factor
+    return replace(
+        found,
+        registration=by._replace(S_first_second=S, pairs=pairs),
+        second=second,
+        changes=[change.enlarged(factor) for change in found.changes],
+    )
 
 
 def _views(one: Examination, other: Examination, S: Similarity) -> list[tuple[int, int]]:

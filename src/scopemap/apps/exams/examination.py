@@ -6,12 +6,25 @@ from pathlib import Path
 
 import numpy as np
 
+from scopemap.apps.export.reference_scale import holds_for, in_mm, reference_scale
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.result.result import Result
 
 HIDDEN = 0.15
 """Of depth: farther apart the surfaces are not the same wall."""
+
+
+def to_mm(run: Result) -> float:
+    """Return what lengths of a result are multiplied by, by the reference of its main segment; 1 where none is kept."""
+    known = reference_scale(run)
+    return known.factor if known is not None and holds_for(known, run, run.main_segment) else 1.0
+
+
+def as_compared(folder: Path) -> Result:
+    """Return the first of two examinations as their comparison has it: in mm where `to_mm` gives its scale."""
+    run = Result(folder)
+    return in_mm(run, run.main_segment)
 
 
 class Examination:

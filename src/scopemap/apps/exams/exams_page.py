@@ -13,6 +13,7 @@ import numpy as np
 
 from scopemap.apps.exams.change import Change
 from scopemap.apps.exams.compare_exams import ExamComparison
+from scopemap.apps.exams.examination import as_compared
 from scopemap.apps.exams.fit import ExamFit
 from scopemap.apps.exams.wording import names_of, seen_words, summary
 from scopemap.engine.errors import reporting
@@ -73,7 +74,7 @@ def write_comparison(found: ExamComparison, first: Path, second: Path, out: Path
 
     Raises `InputError` where a file cannot be written.
     """
-    runs, names = (Result(first), Result(second)), names_of(first.resolve().name, second.resolve().name)
+    runs, names = (as_compared(first), Result(second)), names_of(first.resolve().name, second.resolve().name)
     with reporting(f"cannot write to {out}"):
         out.mkdir(parents=True, exist_ok=True)
         facts = facts_of(found, "mm" if runs[0].scale_known else "unit")
