@@ -26,6 +26,7 @@ from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.exams.change import Change
 from scopemap.apps.exams.compare_exams import ExamComparison
 from scopemap.apps.exams.registration import Correspondences3D, Registration
+from scopemap.apps.measure.hand_measure import HandMeasure, add_measurement
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.rendering import vertex_colours
@@ -239,6 +240,27 @@ def test_the_changes_of_two_examinations_are_flown_to(tmp_path: Path, monkeypatc
         press(window, "One over the other", False)
         assert nodes[sides[1]].glb_data == beside
         assert [nodes[f"/page/{side}/name"].text for side in ("first", "second")] == ["a", "b"]
+
+
+def test_lesions_of_both_lie_in_the_world_of_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = draw_run(tmp_path / "a"), draw_run(tmp_path / "b", name="another.mp4")
+    corners = np.array([[0.0, 10.0, 40.0], [2.0, 10.0, 40.0], [2.0, 10.0, 43.0]])
+    for folder, name in zip(folders, ("polyp", "scar"), strict=True):
+        add_measurement(folder, HandMeasure(".", 2, corners[:, :2], None, None, [], corners, "lesion", name))
+    compared = np.ones(len(tube().vertices), np.uint8)
+    of = registered(0.01)._replace(S_first_second=ANOTHER_WORLD)
+    found = ExamComparison(of, tube(), [], [], 0.1, 0.2, (compared, compared))
+    monkeypatch.setattr("scopemap.apps.exams.compare_exams.compare_exams", lambda *folders: found)
+    with opened(ComparePage(*folders)) as window:
+        until(window, lambda: "One over the other" in words(window))
+        nodes = window.scene._handle_from_node_name
+        for side, name, world in (
+            ("first", "polyp", corners),
+            ("second", "scar", ANOTHER_WORLD.transform_points(corners)),
+        ):
+            assert nodes[f"/page/{side}/lesion/0/words"].text == name
+            places = [nodes[f"/page/{side}/lesion/0/{corner}"].position for corner in range(3)]
+            np.testing.assert_allclose(places, world, rtol=1e-6)
 
 
 def test_the_comparison_is_downloaded_as_one_file_of_both_names(

@@ -11,16 +11,18 @@ import trimesh
 
 from scopemap.apps.browser.files_part import video_name
 from scopemap.apps.browser.legends import words_html
+from scopemap.apps.browser.marks import draw_marks
 from scopemap.apps.browser.scene import draw_path, look_from
 from scopemap.apps.browser.surface_pair import TINTS, SurfacePair, tinted
 from scopemap.apps.browser.window import escaped
 from scopemap.apps.exams.change import Change
 from scopemap.apps.exams.change_painting import COMPARED
 from scopemap.apps.exams.compare_exams import ExamComparison
-from scopemap.apps.exams.examination import as_compared
+from scopemap.apps.exams.examination import as_compared, to_mm
 from scopemap.apps.exams.exams_page import comparison_page, pictures_of, pictures_of_view
 from scopemap.apps.exams.fit import ExamFit
 from scopemap.apps.exams.wording import seen_words, summary
+from scopemap.apps.measure.hand_measure import HandMeasure, kept_measures
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.report.sheet import rgb_of
 from scopemap.result.result import Result
@@ -57,6 +59,7 @@ class ShownChanges:
         surfaces = [_compared(*one) for one in zip((first.mesh, found.second), found.compared, strict=True)]
         self._pair = SurfacePair(window, surfaces, self._poses, self._names)
         draw_path(window.scene, f"{self._pair.nodes[0]}/path", self._poses[:, :3, 3])
+        self._draw_lesions()
         unit = "mm" if first.scale_known else "units"
         for number, change in enumerate(found.changes[:_MOST], 1):
             seen = "" if change.seen_in == "both" else f", in {seen_words(change, self._names)} alone"
@@ -80,6 +83,15 @@ class ShownChanges:
             command = shlex.join(["scopemap", "compare-exams", *map(str, self._folders), "--out", "comparison"])
             gui.add_markdown(f"The same as a page:\n```\n{command}\n```")
         self._colour(_CHANGED if is_judged else _PICTURE)
+
+    def _draw_lesions(self) -> None:
+        """Draw the lesions that are kept with either, where they lie in the world of the first."""
+        factor, S = to_mm(Result(self._folders[0])), self._found.registration.S_first_second
+        size_mm = float(self._runs[0].mesh.scale)
+        for node, folder, is_first in zip(self._pair.nodes, self._folders, (True, False), strict=True):
+            for number, one in enumerate(_lesions_of(folder)):
+                world = one.world * factor if is_first else S.transform_points(one.world)
+                draw_marks(self._window.scene, f"{node}/lesion/{number}", world, size_mm, one.name or "lesion")
 
     def _overlay(self, is_over: bool) -> None:
         self._pair.place(is_over)
@@ -134,6 +146,14 @@ class ShownChanges:
         self._words.content = words
         for handle, (name, picture) in zip(self._pictures, pictures.items(), strict=True):
             handle.image, handle.label, handle.visible = picture, ", ".join(name.split("\n")).removeprefix(", "), True
+
+
+def _lesions_of(folder: Path) -> list[HandMeasure]:
+    """Return the lesions that are kept for the surface of a result that is compared: that of its main segment."""
+    run = Result(folder)
+    tracked = set(run.tracked["index"].tolist())
+    lesions = [one for one in kept_measures(folder) if (one.kind, one.folder) == ("lesion", ".")]
+    return [one for one in lesions if one.frame in tracked and run.segment_at(one.frame) == run.main_segment]
 
 
 def _compared(mesh: trimesh.Trimesh, compared: np.ndarray) -> trimesh.Trimesh:
