@@ -12,8 +12,8 @@ from typing import Any
 from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.window import BrowserWindow, escaped
 from scopemap.apps.export.formats import FORMATS, export_run
-from scopemap.apps.export.reference_scale import holds_for, reference_scale
 from scopemap.report.page import PAGE, PICTURE, page_to_send
+from scopemap.report.reference_scale import holds_for, reference_scale
 from scopemap.result.result import Result
 
 EXPORTS = "exports"

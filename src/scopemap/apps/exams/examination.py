@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scopemap.apps.export.reference_scale import holds_for, in_mm, reference_scale
 from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.report.reference_scale import holds_for, in_mm, reference_scale
 from scopemap.result.result import Result
 
 HIDDEN = 0.15

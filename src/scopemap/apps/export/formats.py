@@ -11,11 +11,11 @@ from scopemap.apps.export.dicom_stl import write_dicom_stl
 from scopemap.apps.export.image_layouts import write_colmap, write_endogslam, write_endonerf, write_nerfstudio
 from scopemap.apps.export.mcap_bag import write_mcap
 from scopemap.apps.export.points import write_gaussians, write_points
-from scopemap.apps.export.reference_scale import in_mm
 from scopemap.apps.export.surfaces import Axes, write_glb, write_slicer, write_surface, write_surfaces
 from scopemap.apps.export.trajectories import lines_in_words, write_euroc_file, write_kitti_file, write_kitti_folder
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.input.trajectory.trajectory import Unit, write_tum
+from scopemap.report.reference_scale import in_mm
 from scopemap.result.result import Result
 
 Write = Callable[[Result, Path, Unit, Axes], None]

@@ -15,12 +15,12 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from scopemap.apps.export.reference_scale import in_mm
 from scopemap.apps.export.slicer_markups import markup, write_markups
 from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.mesh_files import ply_bytes, save_mesh, texture_jpeg
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit
+from scopemap.report.reference_scale import in_mm
 from scopemap.result.result import Result
 
 Axes = Literal["lps", "ras", "opencv", "gltf"]

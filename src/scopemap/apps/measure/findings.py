@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from scopemap.apps.export.reference_scale import holds_for, in_mm, reference_scale
 from scopemap.apps.export.slicer_markups import markup, write_markups
 from scopemap.apps.measure.dicom_report import write_dicom_report
 from scopemap.apps.measure.surface_finding import SurfaceFinding
 from scopemap.engine.errors import reporting
+from scopemap.report.reference_scale import holds_for, in_mm, reference_scale
 from scopemap.result.result import Result
 
 FINDING_ENDINGS = (".json", ".dcm")
