@@ -23,7 +23,7 @@ from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.features import SiftFeatures
 from scopemap.input.mask_files import masks_of
 from scopemap.input.sequence import Sequence
-from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder
+from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder, needs_weights
 
 if TYPE_CHECKING:
     from scopemap.input.depth_files import FilesOfInput
@@ -124,7 +124,7 @@ def _networks(config: Config, other_flows: tuple[str, ...]) -> list[tuple[tuple[
     No weights are named where the settings name their folder.
     """
     depth, networks = config.depth, config.networks
-    models = {depth.backend: depth.model} if depth.backend in ("depth-anything", "depth-pro") else {}
+    models = {depth.backend: depth.model} if needs_weights(depth.backend) else {}
     if depth.anchor == "depth-pro":
         models.setdefault("depth-pro", depth.anchor_model)
     needed: list[tuple[tuple[str, ...], tuple[str, ...]]] = []

@@ -1,6 +1,6 @@
 """What the networks of the extra `networks` will cost a run on a CPU, in one sentence before it starts.
 
-Measured at 400x320 to 1350x1080 px, but for Depth Pro, estimated by the size of its weights. RAFT compares all pairs of
+Measured at 400x320 to 1350x1080 px; networks of depth have theirs in `NETWORKS`. RAFT compares all pairs of
 pixels of an eighth of the working size: a part of its time, and nearly all of its memory, grow with their square.
 """
 
@@ -11,19 +11,18 @@ from pathlib import Path
 from scopemap.engine.config import Config
 from scopemap.engine.models.device import choose_device, cpu_threads
 from scopemap.input.sequence import Sequence
+from scopemap.runner.depth_backends import NETWORKS
 
-# Seconds of one core: of one flow, for each million pixels and each square of that; of depth, for a picture of any
-# size; of the perceptual distance and of the other stages, for each million pixels.
+# Seconds of one core: of one flow, for each million pixels and each square of that; of the perceptual distance and of
+# the other stages, for each million pixels.
 _FLOW_S = {"raft-small": (7.5, 2.0), "raft-large": (26.0, 10.5)}
-_DEPTH_S = {"depth-anything": 2.2, "depth-pro": 200.0}
 _PERCEPTUAL_S = {"lpips": 0.8}
 _STAGES_S = 2.3
-# GB: of Python with PyTorch and kernels, of the other stages for each million pixels, of the networks of depth, and of
-# the correlations of one flow for each square of a million pixels: 4 bytes a pair, and a third for its pyramid.
+# GB: of Python with PyTorch and kernels, of the other stages for each million pixels, and of the correlations of one
+# flow for each square of a million pixels: 4 bytes a pair, and a third for its pyramid.
 _START_GB = 1.3
 _STAGES_GB = 0.75
 _FLOW_GB = 4 * 4 / 3 / 64**2 * 1e3
-_DEPTH_GB = {"depth-anything": 0.4, "depth-pro": 6.0}
 
 
 def network_cost(config: Config, sequence: Sequence) -> str:
@@ -33,17 +32,18 @@ def network_cost(config: Config, sequence: Sequence) -> str:
     flows = [networks.flow] * (2 if mapis.consistency_px else 1) * refines + [networks.keyframe_flow] * 2
     anchor, every_frame = [depth.anchor] * (depth.anchor != depth.backend), [depth.backend]
     perceptual = [networks.perceptual] * refines
-    used = {*flows, *anchor, *every_frame, *perceptual} & {*_FLOW_S, *_DEPTH_S, *_PERCEPTUAL_S}
+    of_depth = {name: network for name, network in NETWORKS.items() if network.has_weights}
+    used = {*flows, *anchor, *every_frame, *perceptual} & {*_FLOW_S, *of_depth, *_PERCEPTUAL_S}
     if not used or choose_device(networks.device) != "cpu":
         return ""
     c, cores = sequence.camera, cpu_threads()
     mpx = c.width * c.height / 1e6
     frame_s = sum(a * mpx + b * mpx**2 for a, b in (_FLOW_S.get(name, (0.0, 0.0)) for name in flows))
-    frame_s += sum(_DEPTH_S.get(name, 0.0) for name in every_frame) + _STAGES_S * mpx
+    frame_s += sum(of_depth[name].seconds for name in every_frame if name in of_depth) + _STAGES_S * mpx
     frame_s += sum(_PERCEPTUAL_S.get(name, 0.0) * mpx for name in perceptual)
-    once_s = sum(_DEPTH_S.get(name, 0.0) for name in anchor)
+    once_s = sum(of_depth[name].seconds for name in anchor if name in of_depth)
     gb = _START_GB + _STAGES_GB * mpx + _FLOW_GB * mpx**2 * any(name in _FLOW_S for name in flows)
-    gb += sum(_DEPTH_GB.get(name, 0.0) for name in {*anchor, *every_frame})
+    gb += sum(of_depth[name].gigabytes for name in {*anchor, *every_frame} & of_depth.keys())
     frames = sequence.used_count
     all_s = "" if frames is None else f", {(once_s + frames * frame_s) / cores / 60:.0f} min for {frames} frames,"
     free_gb = _available_gb()
