@@ -1,7 +1,8 @@
 """RTDL: rotation first, then the whole motion, by dog-leg on a keyframe's photometric residuals, coarse to fine.
 
 Equations 5 to 12 of arXiv 2508.11282, section "WEMA-RTDL module". `residuals.py` has the photometric error (5) and its
-Jacobian, `least_squares.py` the dog-leg step (7 to 9). Steps are composed on the group, where the paper adds (10, 12).
+Jacobian, `geometry/least_squares.py` the dog-leg step (7 to 9). Steps are composed on the group, where the paper adds
+(10, 12).
 """
 
 from __future__ import annotations
