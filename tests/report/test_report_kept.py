@@ -14,9 +14,12 @@ from scopemap.apps.measure.hand_measure import add_measurement
 from scopemap.report.page import write_report
 from scopemap.result.result import Result
 from tests.apps.browser.test_browser_measures import picked
-from tests.report.test_report_browser import Opened, browser, pytestmark  # noqa: F401
+from tests.report.test_report_browser import browser  # noqa: F401
 from tests.report.test_report_links import shown_at
 from tests.support.drawn_run import draw_run
+from tests.support.opened_page import IN_A_BROWSER, Opened
+
+pytestmark = IN_A_BROWSER
 
 
 def test_a_lesion_and_the_reference_are_in_the_report(browser: Any, tmp_path: Path) -> None:  # noqa: F811

@@ -15,10 +15,11 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.report.page import keep_measurements, write_report
-from tests.report.test_report_browser import Opened, chromium, pytestmark  # noqa: F401
 from tests.support.drawn_run import CAMERA, IN_RESULT, draw_run, pose_of, tube
 from tests.support.front_door import call
+from tests.support.opened_page import IN_A_BROWSER, Opened, chromium
 
+pytestmark = IN_A_BROWSER
 HAND = (0x10, 0x10, 0x10)
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from scopemap.engine.cameras.lenses import FisheyeCamera
@@ -21,6 +22,7 @@ from scopemap.runner.lens_of_motion import OtherLens, lens_of_motion, lenses_of
 from scopemap.runner.observers import RunStopped
 from scopemap.runner.reconstruct import reconstruct
 from scopemap.runner.run import Run
+from tests.support.alike_runs import check_alike
 from tests.support.turning_clip import write_clip
 
 pytestmark = pytest.mark.slow
@@ -131,15 +133,19 @@ def test_a_run_begins_again_with_the_lens_of_the_motion(
     assert not {"camera-assumed", "camera-unknown"} & {reason.code for reason in verdict(result).reasons}
 
 
-def test_a_pass_with_the_lens_of_the_motion_is_stopped_and_goes_on_to_the_same_bytes(
+def test_a_pass_with_the_lens_of_the_motion_is_stopped_and_goes_on_to_the_same_result(
     clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settled = LensTest(0.2, 0.2, 0.0, 0.01)
+    settled, depths_mm = LensTest(0.2, 0.2, 0.0, 0.01), list[float]()
 
     def run(out: Path, tests: list[LensTest], *observers: Callable[[Step], None]) -> list[int]:
         told, indices = iter(tests), list[int]()
         monkeypatch.setattr(Run, "lens", property(lambda run: next(told)))
-        note = lambda step: indices.append(step.frame.index)  # noqa: E731
+
+        def note(step: Step) -> None:
+            indices.append(step.frame.index)
+            depths_mm.append(float(np.nanmedian(step.frame.depth_mm)))
+
         sequence = open_sequence(clip)
         reconstruct(sequence, Config.load(settings=LIGHT), out=out, observers=(note, *observers))
         return indices
@@ -159,7 +165,8 @@ def test_a_pass_with_the_lens_of_the_motion_is_stopped_and_goes_on_to_the_same_b
     assert rest == whole[len(whole) - len(rest) :]
     assert rest[0] > 4, "no frame is tracked twice"
     assert rest[0] < 12
-    for name in ("trajectory.tum", "frames.csv", "camera.yaml", "config.toml"):
+    check_alike(*(Result(tmp_path / name) for name in ("stopped", "whole")), depth_mm=float(np.median(depths_mm)))
+    for name in ("camera.yaml", "config.toml"):
         assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
     said = [Result(tmp_path / name).provenance for name in ("whole", "stopped")]
     assert said[0]["notices"] == said[1]["notices"]

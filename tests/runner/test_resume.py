@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 
 from scopemap import Config, Result, open_sequence, reconstruct
 from scopemap.engine.errors import InputError
@@ -25,16 +24,11 @@ from scopemap.result.checkpoint import CHECKPOINT, CHECKPOINT_NEW, read_checkpoi
 from scopemap.result.result_folder import LOCK, STORED, UNFINISHED
 from scopemap.runner.checkpoints import can_resume, check_resumable, discard_unfinished, identity_of
 from scopemap.runner.observers import RunStopped
+from tests.support.alike_runs import check_alike
 from tests.support.front_door import call, refused, warned
 from tests.support.tiny_phantom import FRAMES, write_tiny
 
 pytestmark = pytest.mark.slow
-
-# Of a resumed run: the stored pictures are JPEG, the stored depth has steps of .03 %. Shares of the median depth, a
-# pixel is .007 of it; rotation in rad.
-_MOST_SHIFT, _MOST_TURN = 0.01, 0.01
-# Of the distance between the surfaces, over the median depth: the median vertex, and nearly all.
-_MOST_APART = {50: 0.01, 95: 0.05}
 
 
 class _Killed(BaseException):
@@ -62,20 +56,6 @@ def whole(request: pytest.FixtureRequest, folder: Path, tmp_path_factory: pytest
 def _run(folder: Path, out: Path, preset: Any, **options: Any) -> Result:
     config = preset if isinstance(preset, Config) else Config.load(preset)
     return reconstruct(open_sequence(folder), config, out=out, **options)
-
-
-def _check_alike(found: Result, wanted: Result) -> None:
-    """Compare frames, path and surface."""
-    for column in ("index", "status", "map", "name"):
-        np.testing.assert_array_equal(found.frames[column], wanted.frames[column])
-    depth_mm = float(np.median(np.linalg.norm(wanted.mesh.vertices, axis=1)))  # from the first camera
-    one, other = found.frames["T_world_camera"], wanted.frames["T_world_camera"]
-    np.testing.assert_allclose(one[:, :3, 3], other[:, :3, 3], rtol=0, atol=_MOST_SHIFT * depth_mm)
-    np.testing.assert_allclose(one[:, :3, :3], other[:, :3, :3], rtol=0, atol=_MOST_TURN)
-    apart_mm = KDTree(wanted.mesh.vertices).query(found.mesh.vertices)[0]
-    for percentile, most in _MOST_APART.items():
-        assert np.percentile(apart_mm, percentile) <= most * depth_mm
-    assert found.provenance["scale"] == wanted.provenance["scale"]
 
 
 def _killing(at: int) -> Callable[[Step], None]:
@@ -124,7 +104,7 @@ def test_a_process_killed_at_any_stage_loses_nothing(
     assert seen == list(range(after + 1, FRAMES))
     if not stage.startswith("frame"):
         assert after == FRAMES - 1, "nothing is tracked again"
-    _check_alike(result, Result(wanted))
+    check_alike(result, Result(wanted))
 
 
 def test_a_run_without_an_adjustment_is_resumed_too(folder: Path, tmp_path: Path) -> None:
@@ -135,7 +115,7 @@ def test_a_run_without_an_adjustment_is_resumed_too(folder: Path, tmp_path: Path
     found = _run(folder, tmp_path / "run", settings)
     assert found.provenance["resumed_after_frame"] >= 1
     assert len(list((tmp_path / "run" / "depth").glob("*.png"))) == FRAMES
-    _check_alike(found, wanted)
+    check_alike(found, wanted)
 
 
 @pytest.mark.parametrize("changes", [{}, {"tracking.camera_at_rest": True}, {"depth.backend": "shading"}])
@@ -149,7 +129,7 @@ def test_losses_and_maps_are_as_without_a_kill(changes: dict[str, Any], tmp_path
     assert found.provenance["resumed_after_frame"] >= 5
     codes = [{notice["code"] for notice in result.provenance["notices"]} for result in (found, wanted)]
     assert codes[0] == codes[1]
-    _check_alike(found, wanted)
+    check_alike(found, wanted)
 
 
 def test_a_stopped_run_keeps_every_frame_and_goes_on(
@@ -171,7 +151,7 @@ def test_a_stopped_run_keeps_every_frame_and_goes_on(
         assert [path.name for path in out.iterdir()] == [UNFINISHED]
     result = _run(folder, out, preset, observers=(stop_in_the_middle,))
     assert tracked == list(range(FRAMES)), "no frame is tracked twice"
-    _check_alike(result, Result(wanted))
+    check_alike(result, Result(wanted))
 
 
 def test_other_settings_begin_anew_or_are_refused_by_name(folder: Path, tmp_path: Path) -> None:

@@ -39,10 +39,10 @@ def test_each_idea_is_another_value_of_a_constant_of_the_engine() -> None:
 @pytest.mark.slow
 def test_a_constant_is_changed_for_one_run(tmp_path: Path) -> None:
     clip = RealClip("a clip", write_tiny(tmp_path / "phantom"), arguments=("--frames", "0:2"))
-    earns.run_with(clip, "tracking.tracker._PATIENCE=0", tmp_path / "run")
+    earns.run_with(clip, "tracking.keyframe_choice._PATIENCE=0", tmp_path / "run")
     assert (tmp_path / "run" / "provenance.json").is_file()
     with pytest.raises(subprocess.CalledProcessError):
-        earns.run_with(RealClip("none", tmp_path / "none"), "tracking.tracker._PATIENCE=0", tmp_path / "failed")
+        earns.run_with(RealClip("none", tmp_path / "none"), "tracking.keyframe_choice._PATIENCE=0", tmp_path / "failed")
 
 
 def test_the_phantoms_are_eight_and_those_of_the_other_tables() -> None:
