@@ -103,16 +103,31 @@ def test_the_command_prints_compares_and_fails(
     assert "slower: depth network" in slower.stderr
 
 
-def test_a_slower_whole_is_measured_once_more(measured: Speed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_three_runs_the_median_counts(measured: Speed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "speed.json"
     file.write_text(json.dumps(measured.json()), encoding="utf-8")
     slow = replace(measured, cpu_ms=2 * measured.cpu_ms)
-    for found, code in (([slow, measured], 0), ([slow, slow], 1), ([measured], 0)):
+    monkeypatch.setattr(speed, "reconstruct", lambda *_, **__: None)
+    monkeypatch.setattr(speed, "write_phantom", lambda *_: None)
+    monkeypatch.setattr(speed, "open_sequence", lambda *_, **__: None)
+    for found, code in (([slow, measured, measured], 0), ([slow, measured, slow], 1)):
         runs = iter(found)
-        monkeypatch.setattr(speed, "measure_speed", lambda *_, runs=runs: next(runs))
+        monkeypatch.setattr(speed, "_measured", lambda *_, runs=runs: next(runs))
         answer = CliRunner().invoke(app, ["bench", "speed", "--compare", str(file), "--whole"])
         assert (answer.exit_code, next(runs, None)) == (code, None)
     assert CliRunner().invoke(app, ["bench", "speed", "--whole"]).exit_code == 2
+
+
+def test_the_calibration_is_measured_while_the_run_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(speed, "_CALIBRATION_PAUSE_S", 0.0)
+    with speed.calibrating() as found:
+        while len(found) < 3:
+            pass
+    count = len(found)
+    assert min(found) > 0
+    with speed.calibrating() as others:
+        pass
+    assert (len(found), len(others) >= 1) == (count, True)
 
 
 @pytest.mark.parametrize("words", [("speed", "--dry-run"), ("speed", "--out", "x"), ("scared", "--frames", "5")])

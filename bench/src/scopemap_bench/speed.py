@@ -1,7 +1,8 @@
 """Processor time of each stage of a run on this machine, and its comparison with an earlier measurement.
 
 A stage counts without the stages that it calls. Times of two machines are compared as ratios to a calibration, OpenCV's
-DIS flow of a fixed pair of images: not this package's code, and like most of its work.
+DIS flow of a fixed pair of images: not this package's code, and like most of its work. It is measured again and again
+while the run lasts: a processor whose cores are all busy is slower than an idle one, and other work comes and goes.
 """
 
 from __future__ import annotations
@@ -77,6 +78,7 @@ _OTHER_FLOW = "flow between keyframes"
 _NOISE = 0.2  # of the calibration: two measurements of one machine differ by 0.15
 _WARM_UP_FRAMES = 12  # compile, load and fill caches
 _CALIBRATION_RUNS = 15
+_CALIBRATION_PAUSE_S = 0.2  # some 60 flows in a run of the phantom; their ratios of five runs lie 3 % apart
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,11 @@ class Speed:
     stages: dict[str, StageTime]
 
     @property
+    def whole_ratio(self) -> float:
+        """Processor time of the whole process per frame, in calibrations."""
+        return self.cpu_ms / self.calibration_ms
+
+    @property
     def _measured(self) -> str:
         return f"{self.frames} frames of {self.clip} at {self.size[0]}x{self.size[1]} px, preset {self.preset}"
 
@@ -125,7 +132,7 @@ class Speed:
             raise InputError(f"cannot compare {self._measured} with {before._measured}: measure the same")
         stages = ({} if whole else speed.stages for speed in (self, before))
         now, then = ({name: stage.ratio for name, stage in of_run.items()} for of_run in stages)
-        now["whole process"], then["whole process"] = (one.cpu_ms / one.calibration_ms for one in (self, before))
+        now["whole process"], then["whole process"] = (one.whole_ratio for one in (self, before))
         slower = {name: (ratio, then.get(name, 0.0)) for name, ratio in now.items()}
         return [
             f"{name}: {ratio:.2f} of the calibration, before {was:.2f}"
@@ -144,10 +151,11 @@ def read_speed(file: Path) -> Speed:
         raise InputError(f"reading {file}: it holds no measurement of speed ({error})") from None
 
 
-def measure_speed(video: Path | None, config: Config, frames: int | None = None) -> Speed:
+def measure_speed(video: Path | None, config: Config, frames: int | None = None, runs: int = 1) -> Speed:
     """Run a video, or by default a phantom, and return the processor time of its stages.
 
-    `frames`: None: all. OpenCV has one thread meanwhile, so that its work is counted where it is called.
+    `frames`: None: all. `runs`: the one whose whole process has the median ratio counts. OpenCV has one thread
+    meanwhile, so that its work is counted where it is called.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -157,21 +165,21 @@ def measure_speed(video: Path | None, config: Config, frames: int | None = None)
                 write_phantom(PHANTOM, Path(folder) / "phantom")
             path, out = video or Path(folder) / "phantom", Path(folder) / "run"
             reconstruct(open_sequence(path, frames=slice(_WARM_UP_FRAMES)), config, out=out)
-            return _measured(path, config, frames, out)
+            measured = [_measured(path, config, frames, out) for _ in range(runs)]
+            return sorted(measured, key=lambda speed: speed.whole_ratio)[runs // 2]
     finally:
         cv2.setNumThreads(threads)
 
 
 def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Speed:
     sequence, clock = open_sequence(path, frames=slice(frames)), Stopwatch()
-    calibrations = calibrations_ms()
     started, cpu_started = time.perf_counter(), time.process_time()
-    with clock.attached():
+    with calibrating() as calibrations, clock.attached():
         result = reconstruct(sequence, config, out=out, overwrite=True)
     count = len(result.frames)
-    cpu_ms = 1e3 * (time.process_time() - cpu_started) / count
+    cpu_ms = (1e3 * (time.process_time() - cpu_started) - sum(calibrations)) / count
     passed_ms = 1e3 * (time.perf_counter() - started) / count
-    calibration_ms = float(np.median(calibrations + calibrations_ms()))
+    calibration_ms = float(np.median(calibrations))
     size, stages = (sequence.camera.width, sequence.camera.height), clock.stages(count, calibration_ms)
     return Speed(sequence.name, count, config.preset, size, calibration_ms, cpu_ms, passed_ms, stages)
 
@@ -248,15 +256,47 @@ def resolved(place: str) -> tuple[Any, str]:
     return owner, name
 
 
+@contextmanager
+def calibrating() -> Iterator[list[float]]:
+    """Measure the calibration in a thread of its own while the context lasts, ms of processor time each.
+
+    The list is complete when the context ends; it holds at least one.
+    """
+    times_ms: list[float] = []
+    ended = threading.Event()
+
+    def measure() -> None:
+        flow = _calibration()
+        while True:
+            times_ms.append(_timed_ms(flow))
+            if ended.wait(_CALIBRATION_PAUSE_S):
+                return
+
+    thread = threading.Thread(target=measure, name="calibration")
+    thread.start()
+    try:
+        yield times_ms
+    finally:
+        ended.set()
+        thread.join()
+
+
 def calibrations_ms() -> list[float]:
     """Return the processor times of OpenCV's DIS flow of a fixed pair of images, 320x256 px."""
+    flow = _calibration()
+    return [_timed_ms(flow) for _ in range(_CALIBRATION_RUNS)]
+
+
+def _calibration() -> Callable[[], object]:
     noise = np.random.default_rng(0).normal(size=(256, 340)).astype(np.float32)
     blurred = cv2.GaussianBlur(noise, (0, 0), 2.5)
     smooth = (127 + 60 * blurred / blurred.std()).clip(0, 255).astype(np.uint8)
     pair = np.ascontiguousarray(smooth[:, :320]), np.ascontiguousarray(smooth[:, 4:324])
-    dis, times_ms = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM), []
-    for _ in range(_CALIBRATION_RUNS):
-        started = time.thread_time()
-        dis.calc(*pair, np.zeros((256, 320, 2), np.float32))
-        times_ms.append(1e3 * (time.thread_time() - started))
-    return times_ms
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return lambda: dis.calc(*pair, np.zeros((256, 320, 2), np.float32))
+
+
+def _timed_ms(call: Callable[[], object]) -> float:
+    started = time.thread_time()
+    call()
+    return 1e3 * (time.thread_time() - started)
