@@ -34,7 +34,6 @@ NEEDS = {
     **{name: (f'preset = "{name}"', " and ".join(NETWORKS), OF_NETWORKS) for name in ("paper", "paper-strict")},
     "flow": ('settings = { "networks.flow" = "raft-small" }', "torch and torchvision", OF_NETWORKS),
     "distance": ('settings = { "networks.perceptual" = "lpips" }', "torch and torchvision and lpips", OF_NETWORKS),
-    "device": ('settings = { "networks.device" = "cuda" }', "torch", OF_NETWORKS),
     "pycolmap": ('use = "colmap"', "pycolmap", "pip install -c constraints.txt -e './bench[colmap]'"),
 }
 

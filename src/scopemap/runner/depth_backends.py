@@ -58,7 +58,7 @@ def create_depth(
     """Return the estimator that `settings.backend` names: one of `NETWORKS`, stereo, files:FOLDER.
 
     rectifier : from the camera that depth files show the view of to the working camera.
-    device : "auto", "cpu" or "cuda", for networks but scopenet, which runs on the CPU.
+    device : "auto", "cpu" or "cuda".
     of_input : what the input knows of depth files.
     calibrated : whether the frames' camera is known; False: ScopeNet gets no ray directions (wrong ones mislead it).
     averaged : whether ScopeNet may take three times as long, and err less.
@@ -111,7 +111,9 @@ def create_anchor(settings: DepthSettings, device: str) -> AnchoredDepth:
 def _scopenet(asked: _Asked) -> DepthEstimator:
     from scopemap.engine.depth.scopenet.estimator import ScopeNetDepth
 
-    return ScopeNetDepth(asked.settings.model, rays_known=asked.calibrated, averaged=asked.averaged)
+    return ScopeNetDepth(
+        asked.settings.model, rays_known=asked.calibrated, averaged=asked.averaged, device=asked.device
+    )
 
 
 def _depth_anything(asked: _Asked) -> DepthEstimator:

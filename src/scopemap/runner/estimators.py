@@ -42,8 +42,6 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
 
     own : replace those of the settings; a flow must then be safe in several threads.
     """
-    if config.networks.device != "auto":
-        device.choose_device(config.networks.device)  # also where no network would run there
     own = own or CustomEstimators()
     if own == CustomEstimators():
         _need_weights(config)
@@ -72,7 +70,7 @@ def create_estimators(config: Config, sequence: Sequence, own: CustomEstimators 
         own.flow or create_flow(networks.keyframe_flow, networks.device),
         perceptual.create_perceptual(networks.perceptual, networks.device),
         masks_of(config.mask, sequence),
-        AlikeFeatures() if networks.features == "alike" else SiftFeatures(),
+        AlikeFeatures(networks.device) if networks.features == "alike" else SiftFeatures(),
         tracker,
     )
 
@@ -128,8 +126,6 @@ def _networks(config: Config, other_flows: tuple[str, ...]) -> list[tuple[tuple[
     if depth.anchor == "depth-pro":
         models.setdefault("depth-pro", depth.anchor_model)
     needed: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
-    if networks.device not in ("auto", "cpu"):
-        needed.append((("torch",), ()))
     if models:
         from scopemap.engine.depth.pretrained import PACKAGES
 

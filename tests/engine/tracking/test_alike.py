@@ -57,9 +57,9 @@ def test_features_are_those_of_before() -> None:
 def test_a_picture_is_described_once(monkeypatch: pytest.MonkeyPatch) -> None:
     answers, network = list[np.ndarray](), alike.network_answer
 
-    def answer(rgb: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+    def answer(rgb: np.ndarray, device: str) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
         answers.append(rgb)
-        return network(rgb)
+        return network(rgb, device)
 
     monkeypatch.setattr(alike, "network_answer", answer)
     detector, frame = AlikeFeatures(), _frame(RGB)

@@ -149,5 +149,5 @@ class NetworkSettings(Settings):
     device: str = Field(
         "auto",
         pattern=r"^(auto|cpu|cuda(:\d+)?|mps|xpu)$",
-        description="where the networks of the extra `networks` run: auto | cpu | cuda; scopenet: on the CPU",
+        description="where networks run, auto: each where it can | cpu | cuda: all of them, or an error",
     )

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     import onnxruntime
 
 
+_CUDA = "CUDAExecutionProvider"  # ONNX Runtime's name
+
+
 def cpu_threads() -> int:
     """Return how many threads a network gets on the CPU: OMP_NUM_THREADS, else the cores that this process may use."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
@@ -20,17 +23,46 @@ def cpu_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def open_network(content: bytes, threads: int = 0) -> onnxruntime.InferenceSession:
-    """Return the session of an ONNX graph on the CPU; raises what the runtime raises. threads : 0: one a core."""
+def open_network(content: bytes, threads: int = 0, device: str = "auto") -> onnxruntime.InferenceSession:
+    """Return the session of an ONNX graph; raises what the runtime raises.
+
+    threads : on the CPU; 0: one a core. device : "auto": the first CUDA device where the runtime finds one, else the
+    CPU; "cuda", "cuda:N": there, or `SettingsError`; others are torch's alone, and the graph runs on the CPU.
+    """
     import onnxruntime
 
+    kind, _, number = device.partition(":")
+    providers: list[str | tuple[str, dict[str, str]]] = ["CPUExecutionProvider"]
+    has_cuda = _CUDA in onnxruntime.get_available_providers()
+    if kind == "cuda" and not has_cuda:
+        raise SettingsError(_without_cuda(device, "this build of ONNX Runtime has no CUDA"))
+    if has_cuda and kind in ("auto", "cuda"):
+        providers.insert(0, (_CUDA, {"device_id": number or "0"}))
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or cpu_threads()
     # Threads that wait must sleep: the tracker needs the cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.enable_cpu_mem_arena = False  # which keeps the most that was ever needed: 50 MB, and saves no time
     options.log_severity_level = 4  # what is wrong is raised, not printed
-    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(content, options, providers=providers)
+    # The runtime goes on with the CPU, without a word, where CUDA's libraries or the device are missing.
+    if kind == "cuda" and _CUDA not in session.get_providers():
+        raise SettingsError(_without_cuda(device, "ONNX Runtime cannot use CUDA: libraries or device are missing"))
+    return session
+
+
+def runtime_of(session: onnxruntime.InferenceSession) -> str:
+    """Return the runtime of an ONNX graph, its version, and CUDA where it runs there, as provenance has it."""
+    import onnxruntime
+
+    return f"onnxruntime {onnxruntime.__version__}" + (", CUDA" if _CUDA in session.get_providers() else "")
+
+
+def _without_cuda(device: str, reason: str) -> str:
+    return (
+        f"device '{device}' was asked for, but {reason}: install onnxruntime-gpu in place of onnxruntime, or use auto, "
+        "by which each network runs where it can"
+    )
 
 
 def missing_packages(what: str, *packages: str) -> str:

@@ -15,7 +15,7 @@ from scopemap.engine.flow.corners import usable_pixels
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.local_contrast import local_mean
 from scopemap.engine.geometry.warp import bilinear
-from scopemap.engine.models.device import open_network
+from scopemap.engine.models.device import open_network, runtime_of
 from scopemap.engine.models.weights import sha256_of
 from scopemap.engine.tracking.features import Features, points_at
 
@@ -37,11 +37,13 @@ class AlikeFeatures:
     """ALIKE-t's keypoints and descriptors (64), matched as mutual nearest neighbours.
 
     Those of the last pictures are kept: tracking, relocalisation and loop closure ask for the same ones.
+    device : as `open_network` takes it.
     """
 
     name, descriptor_size, max_ratio = "alike", 64, 1.0
 
-    def __init__(self) -> None:
+    def __init__(self, device: str = "auto") -> None:
+        self._device = device
         self._kept: deque[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = deque(maxlen=_MOST_KEPT)
 
     def detect(self, frame: Frame) -> Features:
@@ -55,18 +57,18 @@ class AlikeFeatures:
             if picture is rgb and np.array_equal(usable, valid):
                 return pixels, descriptors
         height, width = valid.shape
-        scores, maps, head = network_answer(evenly_lit(rgb))
+        scores, maps, head = network_answer(evenly_lit(rgb), self._device)
         pixels = _keypoints(scores[:height, :width], usable_pixels(valid))
         descriptors = descriptors_at(pixels, maps, head)
         self._kept.append((rgb, valid, pixels, descriptors))
         return pixels, descriptors
 
     def provenance(self) -> dict[str, str]:
-        """Return the name, the network's hash, and the runtime."""
+        """Return the name, the network's hash, and the runtime; raises as `open_network` does for the device."""
         with resources.as_file(resources.files(__package__) / _NETWORK) as file:
-            sha256 = sha256_of(file) if file.is_file() else "missing"
-        runtime = f"onnxruntime {onnxruntime.__version__}"
-        return {"features": self.name, f"sha256 {_NETWORK}": sha256, "runtime": runtime}
+            sha256 = sha256_of(file) if file.is_file() else ""
+        facts = {"features": self.name, f"sha256 {_NETWORK}": sha256 or "missing"}
+        return facts | ({"runtime": runtime_of(_network(self._device))} if sha256 else {})
 
 
 def evenly_lit(rgb: np.ndarray) -> np.ndarray:
@@ -78,7 +80,7 @@ def evenly_lit(rgb: np.ndarray) -> np.ndarray:
     return np.clip(rgb * (_EVEN_LEVEL / (local + _DARKEST))[..., None], 0, 255).astype(np.uint8)
 
 
-def network_answer(rgb: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+def network_answer(rgb: np.ndarray, device: str = "auto") -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
     """Return the network's scores, features and head for a picture (H, W, 3) uint8 of any size.
 
     Scores (H', W') float32, 0..1, and features (16, H'/n, W'/n) at four scales n, of the picture continued at its right
@@ -87,7 +89,7 @@ def network_answer(rgb: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.nd
     height, width = rgb.shape[:2]
     padded = np.pad(rgb, ((0, -height % STRIDE), (0, -width % STRIDE), (0, 0)), mode="edge")
     planes = np.ascontiguousarray(padded.transpose(2, 0, 1)[None], np.float32) / np.float32(255)
-    scores, head, *maps = _network().run(["scores", "head", *_MAPS], {"rgb": planes})
+    scores, head, *maps = _network(device).run(["scores", "head", *_MAPS], {"rgb": planes})
     return scores[0, 0], [features[0] for features in maps], head
 
 
@@ -120,10 +122,10 @@ def _keypoints(scores: np.ndarray, usable: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def _network() -> onnxruntime.InferenceSession:
+def _network(device: str) -> onnxruntime.InferenceSession:
     file = resources.files(__package__) / _NETWORK
     try:
-        return open_network(file.read_bytes())
+        return open_network(file.read_bytes(), device=device)
     except FileNotFoundError:
         raise WeightsError(
             f"loading ALIKE-t: this installation lacks {file}, which the package comes with; install it again, or "

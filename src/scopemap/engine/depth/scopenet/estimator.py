@@ -1,10 +1,10 @@
 """ScopeNet behind the `DepthEstimator` contract: the weights that come with the package, or others of the same network.
 
-The network is an ONNX graph (`training/export.py` writes it) and runs in ONNX Runtime on the CPU, in float32. It
-estimates ln of the distance along the ray and ln of the Laplace scale b of its error. Depth is distance times the z of
-the unit ray. A Laplace distribution has the standard deviation sqrt(2) b; of a logarithm it is, to first order, the
-relative one of distance, and so of depth. A second output, which other networks of the class may lack, is the
-probability of an instrument, at half the size.
+The network is an ONNX graph (`training/export.py` writes it) and runs in ONNX Runtime, in float32. It estimates ln of
+the distance along the ray and ln of the Laplace scale b of its error. Depth is distance times the z of the unit ray. A
+Laplace distribution has the standard deviation sqrt(2) b; of a logarithm it is, to first order, the relative one of
+distance, and so of depth. A second output, which other networks of the class may lack, is the probability of an
+instrument, at half the size.
 """
 
 from __future__ import annotations
@@ -13,19 +13,22 @@ import math
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import onnxruntime
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.depth.estimate import DepthEstimate
 from scopemap.engine.depth.scopenet.colours import one_colour
 from scopemap.engine.depth.scopenet.planes import INSTRUMENTS, PLANES, STRIDE, input_planes
-from scopemap.engine.errors import WeightsError
+from scopemap.engine.errors import SettingsError, WeightsError
 from scopemap.engine.frame import Frame
 from scopemap.engine.models import weights
-from scopemap.engine.models.device import cpu_threads, open_network
+from scopemap.engine.models.device import cpu_threads, open_network, runtime_of
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 WEIGHTS_NAME = "scopenet.onnx"
 _INPUT = "planes"
@@ -40,20 +43,29 @@ class ScopeNetDepth:
     model : the network, a .onnx file; "": that of the package.
     rays_known : whether the frames' camera is calibrated. False: the network gets no ray directions, as in
         part of its training; depth is still distance times the z of the assumed camera's ray.
-    threads : of the network; 0: one for each core.
+    threads : of the network; 0: one for each core. device : as `open_network` takes it.
     averaged : whether depth is the mean, in ln, of the picture in one colour, and in grey, mirrored and larger by a
         quarter: errors that depend on hue, side and size cancel in part, for three times the time.
 
-    Raises `WeightsError` where the file is missing, cannot be read, or holds another network.
+    Raises `WeightsError` where the file is missing, cannot be read, or holds another network, `SettingsError` where the
+    network cannot run on the device.
     """
 
     name = "scopenet"
 
-    def __init__(self, model: str = "", *, rays_known: bool = True, threads: int = 0, averaged: bool = False) -> None:
+    def __init__(
+        self,
+        model: str = "",
+        *,
+        rays_known: bool = True,
+        threads: int = 0,
+        averaged: bool = False,
+        device: str = "auto",
+    ) -> None:
         self._rays_known, self._averaged = rays_known, averaged
         with resources.as_file(resources.files(__package__) / WEIGHTS_NAME) as embedded:
             file = Path(model).expanduser() if model else embedded
-            self._session = load_network(file, threads)
+            self._session = load_network(file, threads, device)
             self._origin = {"model": model or _AS_THEY_COME, f"sha256 {file.name}": weights.sha256_of(file)}
 
     def estimate(self, frame: Frame) -> DepthEstimate:
@@ -82,27 +94,29 @@ class ScopeNetDepth:
     def provenance(self) -> dict[str, str]:
         """Return the name, the weights with their hash, the runtime, whether the rays were given, and if averaged."""
         rays = "known" if self._rays_known else "assumed"
-        origin = {"depth": self.name, **self._origin, "runtime": f"onnxruntime {onnxruntime.__version__}", "rays": rays}
+        origin = {"depth": self.name, **self._origin, "runtime": runtime_of(self._session), "rays": rays}
         return origin | ({"answers": "mean of two"} if self._averaged else {})
 
 
-def load_network(file: Path, threads: int = 0) -> onnxruntime.InferenceSession:
+def load_network(file: Path, threads: int = 0, device: str = "auto") -> onnxruntime.InferenceSession:
     """Return a network that takes planes (1, 8, H, W) to (1, 2, H, W), float32, H and W multiples of `STRIDE`.
 
-    threads : 0: one for each core. Raises `WeightsError` where the file is missing, cannot be read, or holds another
-    network or weights that are not finite.
+    threads : 0: one for each core. device : as `open_network` takes it. Raises `WeightsError` where the file is
+    missing, cannot be read, or holds another network or weights that are not finite.
     """
     if not file.is_file():
         raise WeightsError(_missing(file))
-    return _loaded(file, threads or cpu_threads(), file.stat().st_mtime_ns)
+    return _loaded(file, threads or cpu_threads(), device, file.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)
-def _loaded(file: Path, threads: int, _: int) -> onnxruntime.InferenceSession:
+def _loaded(file: Path, threads: int, device: str, _: int) -> onnxruntime.InferenceSession:
     """Return a network, the same for runs that follow each other in one process, until its file changes."""
     try:
-        session = open_network(file.read_bytes(), threads)
+        session = open_network(file.read_bytes(), threads, device)
         answer = _answer(session, np.zeros((PLANES, STRIDE, STRIDE), np.float32))[0]
+    except SettingsError:
+        raise
     except Exception as error:  # the runtime raises a dozen kinds that share no other root
         reason = " ".join(str(error).split())
         raise WeightsError(f"cannot load ScopeNet from {file}: {reason}. Name another file in depth.model") from None
