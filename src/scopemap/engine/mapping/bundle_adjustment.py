@@ -29,11 +29,11 @@ from scopemap.engine.geometry.least_squares import Linear, Prior, ReducedModel, 
 from scopemap.engine.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
 from scopemap.engine.mapping.bundle_problem import (
     BundleProblem,
+    BundleState,
     Errors,
     Observations,
     Points,
     Reprojection,
-    State,
     held_to_result,
     jacobians,
     reproject,
@@ -59,7 +59,7 @@ class BundleSolution(NamedTuple):
     other keyframe observes a point. iterations : accepted and rejected.
     """
 
-    state: State
+    state: BundleState
     log_depth_sigma: np.ndarray
     iterations: int
 
@@ -127,7 +127,7 @@ def _with_window(
         points=points,
         observations=Observations(np.searchsorted(own, seen.point[some]), place[observer[some]], seen.pixel[some]),
         neighbours=place[problem.neighbours[(place[problem.neighbours] >= 0).all(1)]],
-        start=State(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.log_focal),
+        start=BundleState(moved[keyframes], state.log_scale[keyframes], state.log_depth[own], state.log_focal),
         held=int((keyframes < first).sum()),
     )
     solved, new = adjust(part, max_iterations=max_iterations), ~known
@@ -135,7 +135,7 @@ def _with_window(
     log_depth[own[new]], sigma[own[new]] = solved.state.log_depth[new], solved.log_depth_sigma[new]
     moved[keyframes], log_scale[keyframes] = solved.state.T_camera_world, solved.state.log_scale
     return BundleSolution(
-        State(moved, log_scale, log_depth, state.log_focal), sigma, found.iterations + solved.iterations
+        BundleState(moved, log_scale, log_depth, state.log_focal), sigma, found.iterations + solved.iterations
     )
 
 
@@ -148,13 +148,13 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     # Where only the kernel's scale changes, the errors do not.
     found_at: tuple[np.ndarray, Errors] | None = None
 
-    def seen_at(state: State) -> Errors:
+    def seen_at(state: BundleState) -> Errors:
         nonlocal found_at
         if found_at is None or found_at[0] is not state.log_depth:
             found_at = state.log_depth, reprojection_errors(problem, state)
         return found_at[1]
 
-    def rescaled(state: State) -> State:
+    def rescaled(state: BundleState) -> BundleState:
         seen = seen_at(state)
         lengths = np.linalg.norm(seen.error[seen.ahead], axis=1)
         return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
@@ -170,7 +170,7 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
     return BundleSolution(state, log_depth_sigma(problem, state), found.iterations)
 
 
-def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
+def errors_px(problem: BundleProblem, state: BundleState) -> np.ndarray:
     """Return the lengths of the reprojection errors (N,) of a state, px; infinite behind a camera."""
     if not len(problem.observations.point):
         return np.zeros(0)
@@ -178,12 +178,12 @@ def errors_px(problem: BundleProblem, state: State) -> np.ndarray:
     return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
 
 
-def weights(state: State, seen: Errors | Reprojection) -> np.ndarray:
+def weights(state: BundleState, seen: Errors | Reprojection) -> np.ndarray:
     """Return the robust weights (N,) of the observations, 1/px^2."""
     return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, CAUCHY)[1], 0) / state.sigma_px**2
 
 
-def linearised(problem: BundleProblem, state: State, seen: Errors | None = None) -> ReducedModel:
+def linearised(problem: BundleProblem, state: BundleState, seen: Errors | None = None) -> ReducedModel:
     """Return the model of the cost around a state: unknowns of the keyframes, ln f if unknown, then the points.
 
     seen : the errors of the observations, where they are known.
@@ -205,14 +205,14 @@ def linearised(problem: BundleProblem, state: State, seen: Errors | None = None)
     )
 
 
-def _held_depths(problem: BundleProblem, state: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _held_depths(problem: BundleProblem, state: BundleState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return how far ln depth of the points (P,) is from the estimate, its weight, and the unknown of its scale."""
     points = problem.points
     off = state.log_depth - points.log_depth - state.log_scale[points.host]
     return off, cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2, _PER_KEYFRAME * points.host + 6
 
 
-def _derivatives(problem: BundleProblem, state: State, points: slice) -> Linear:
+def _derivatives(problem: BundleProblem, state: BundleState, points: slice) -> Linear:
     """Return the derivatives of the observations of some points by the keyframes and ln f."""
     seen = reproject(problem, state, points)
     by_camera, by_host, by_depth, by_focal = jacobians(problem, state, points, seen)
@@ -224,7 +224,7 @@ def _derivatives(problem: BundleProblem, state: State, points: slice) -> Linear:
     return Linear(columns, by, by_depth, seen.error, weights(state, seen) / problem.correlated)
 
 
-def _cost(problem: BundleProblem, state: State, seen: Errors, edges: _OdometryEdges) -> float:
+def _cost(problem: BundleProblem, state: BundleState, seen: Errors, edges: _OdometryEdges) -> float:
     """Return what is minimised, at a state."""
     points, priors = problem.points, problem.priors
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
@@ -249,7 +249,7 @@ class _OdometryEdges(NamedTuple):
     information: np.ndarray
 
 
-def _odometry_edges(problem: BundleProblem, state: State) -> _OdometryEdges:
+def _odometry_edges(problem: BundleProblem, state: BundleState) -> _OdometryEdges:
     """Deviations from the tracked motion between neighbours."""
     priors, tracked, T = problem.priors, problem.T_camera_world, state.T_camera_world
     information = np.repeat([priors.rotation_rad, priors.translation_share * problem.unit_mm], 3) ** -2.0
@@ -258,7 +258,7 @@ def _odometry_edges(problem: BundleProblem, state: State) -> _OdometryEdges:
     return _OdometryEdges(pairs, se3_log(T[j] @ inverse(T[i]) @ tracked[i] @ inverse(tracked[j])), information)
 
 
-def _camera_priors(problem: BundleProblem, state: State, edges: _OdometryEdges) -> list[Prior]:
+def _camera_priors(problem: BundleProblem, state: BundleState, edges: _OdometryEdges) -> list[Prior]:
     """Return the normal equations of the priors of keyframes, and of ln f."""
     T, unit, (i, j) = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), edges.pairs.T
     own = _PER_KEYFRAME * np.repeat(edges.pairs, 6, axis=1) + np.tile(np.arange(6), 2)
@@ -276,7 +276,7 @@ def _camera_priors(problem: BundleProblem, state: State, edges: _OdometryEdges) 
     return priors
 
 
-def with_points(problem: BundleProblem, state: State) -> State:
+def with_points(problem: BundleProblem, state: BundleState) -> BundleState:
     """Return the state with the points where all observations place them, keyframes held."""
     for _ in range(_POINT_STEPS):
         h, g = _by_points(problem, state)
@@ -286,13 +286,13 @@ def with_points(problem: BundleProblem, state: State) -> State:
     return state
 
 
-def log_depth_sigma(problem: BundleProblem, state: State) -> np.ndarray:
+def log_depth_sigma(problem: BundleProblem, state: BundleState) -> np.ndarray:
     """Return the standard deviation of ln depth (P,) by the observations alone; infinite without any."""
     with np.errstate(divide="ignore"):
         return 1 / np.sqrt(_by_points(problem, state)[0])
 
 
-def _by_points(problem: BundleProblem, state: State) -> np.ndarray:
+def _by_points(problem: BundleProblem, state: BundleState) -> np.ndarray:
     """Return the second and the first derivatives (2, P) of the observations by ln depth of the points."""
     found, number = np.zeros((2, len(problem.points.host))), problem.observations.point
     for points in problem.parts:
@@ -312,7 +312,7 @@ def _adjoint(T: np.ndarray) -> np.ndarray:
     return adjoint
 
 
-def _retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
+def _retract(problem: BundleProblem, state: BundleState, step: np.ndarray) -> BundleState:
     """Return the state after a step; points move along their rays in inverse depth, which parallax is linear in."""
     count = _PER_KEYFRAME * len(state.T_camera_world)
     own = step[:count].reshape(-1, _PER_KEYFRAME)
@@ -321,4 +321,4 @@ def _retract(problem: BundleProblem, state: State, step: np.ndarray) -> State:
     log_focal = state.log_focal + (0.0 if problem.log_focal_sigma is None else float(step[count]))
     by_points = step[len(step) - len(state.log_depth) :]
     log_depth = state.log_depth - np.log(np.clip(1 - by_points, *_INVERSE_DEPTH_STEP))
-    return State(T, state.log_scale + own[:, 6], log_depth, log_focal, state.sigma_px)
+    return BundleState(T, state.log_scale + own[:, 6], log_depth, log_focal, state.sigma_px)

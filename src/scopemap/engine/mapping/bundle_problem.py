@@ -93,7 +93,7 @@ class BundleProblem:
     priors: Priors
     neighbours: np.ndarray
     focal_px: float
-    start: State | None = None
+    start: BundleState | None = None
     log_focal_sigma: float | None = None
     least_sigma_px: float = 0.1
     correlated: float = 1.0
@@ -124,7 +124,7 @@ class BundleProblem:
         return slice(*self.first_seen[[points.start, points.stop]].tolist())
 
     @property
-    def begin(self) -> State:
+    def begin(self) -> BundleState:
         """The state to begin with: `start`, or as tracked."""
         return self.tracked if self.start is None else self.start
 
@@ -134,14 +134,18 @@ class BundleProblem:
         return self.points.median_mm
 
     @property
-    def tracked(self) -> State:
+    def tracked(self) -> BundleState:
         """The state as tracked."""
         log_scale, log_focal = np.zeros(len(self.T_camera_world)), math.log(self.focal_px)
-        return State(self.T_camera_world, log_scale, self.points.log_depth, log_focal)
+        return BundleState(self.T_camera_world, log_scale, self.points.log_depth, log_focal)
 
 
-class State(NamedTuple):
-    """T_camera_world (K, 4, 4), ln of the depth scales (K,), ln of the depths (P,), ln of fx in px."""
+class BundleState(NamedTuple):
+    """The unknowns of bundle adjustment: poses and ln depth scale of keyframes, ln depth of points, ln of fx in px.
+
+    T_camera_world : (K, 4, 4). log_scale : (K,). log_depth : (P,). sigma_px : robust standard deviation of the
+    reprojection errors there, NaN: not known yet.
+    """
 
     T_camera_world: np.ndarray
     log_scale: np.ndarray
@@ -175,7 +179,7 @@ def held_to_result(
     return replace(points, log_depth=np.where(known, log_depth - log_scale, points.log_depth), sigma=sigma)
 
 
-def middle(problem: BundleProblem, state: State, most: int) -> tuple[BundleProblem, State]:
+def middle(problem: BundleProblem, state: BundleState, most: int) -> tuple[BundleProblem, BundleState]:
     """Return the problem and the state of at most so many keyframes, those in the middle."""
     count = len(problem.T_camera_world)
     if count <= most:
@@ -205,7 +209,7 @@ def successive(problem: BundleProblem, first: int, end: int) -> BundleProblem:
     )
 
 
-def successive_state(problem: BundleProblem, state: State, first: int, end: int) -> State:
+def successive_state(problem: BundleProblem, state: BundleState, first: int, end: int) -> BundleState:
     """Return the state of the keyframes from `first` to before `end`, and of the points that they host."""
     T, log_scale = state.T_camera_world[first:end], state.log_scale[first:end]
     own = _hosted(problem, first, end)
@@ -242,7 +246,7 @@ class Reprojection(NamedTuple):
     pair: np.ndarray
 
 
-def reprojection_errors(problem: BundleProblem, state: State) -> Errors:
+def reprojection_errors(problem: BundleProblem, state: BundleState) -> Errors:
     """Return the errors of all observations."""
     error, ahead = np.zeros((len(problem.observations.point), 2)), np.zeros(len(problem.observations.point), bool)
     for points in problem.parts:
@@ -251,7 +255,7 @@ def reprojection_errors(problem: BundleProblem, state: State) -> Errors:
     return Errors(error, ahead)
 
 
-def reproject(problem: BundleProblem, state: State, points: slice) -> Reprojection:
+def reproject(problem: BundleProblem, state: BundleState, points: slice) -> Reprojection:
     """Return where some points of a state are projected, against where they were observed."""
     some, T, focal = problem.seen(points), state.T_camera_world, math.exp(state.log_focal)
     number, pixel = problem.observations.point[some], problem.observations.pixel[some]
@@ -266,7 +270,7 @@ def reproject(problem: BundleProblem, state: State, points: slice) -> Reprojecti
 
 
 def jacobians(
-    problem: BundleProblem, state: State, points: slice, at: Reprojection
+    problem: BundleProblem, state: BundleState, points: slice, at: Reprojection
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the derivatives of pixels by twists of the observing camera and of the host (n, 2, 6), ln depth and ln f.
 

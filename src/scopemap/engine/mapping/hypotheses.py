@@ -27,7 +27,7 @@ import numpy as np
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.mapping.bundle_adjustment import BundleSolution, adjust_in_windows, errors_px
-from scopemap.engine.mapping.bundle_problem import BundleProblem, State, successive
+from scopemap.engine.mapping.bundle_problem import BundleProblem, BundleState, successive
 from scopemap.engine.mapping.correction import FrameCorrection, TrackedPose
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField
 from scopemap.engine.mapping.judge import (
@@ -51,7 +51,7 @@ class AdjustedMaps(NamedTuple):
     correction: FrameCorrection
     errors: MapErrors
     problem: BundleProblem
-    solution: State
+    solution: BundleState
 
 
 def explain(
@@ -231,7 +231,7 @@ def _solution(keyframes: MapKeyframes, problem: BundleProblem) -> tuple[BundleSo
 
 
 def _errors_of_maps(
-    keyframes: MapKeyframes, problem: BundleProblem, state: State, main: int
+    keyframes: MapKeyframes, problem: BundleProblem, state: BundleState, main: int
 ) -> tuple[dict[int, float], float]:
     """Return the robust standard deviations of reprojection errors within each map, and the largest between maps.
 
@@ -250,7 +250,7 @@ def _errors_of_maps(
     return within_px, float(np.max(between_px or math.nan))
 
 
-def _largest_near_px(problem: BundleProblem, state: State) -> float:
+def _largest_near_px(problem: BundleProblem, state: BundleState) -> float:
     """Return the largest robust standard deviation of the errors between two neighbouring keyframes; 0 without any."""
     length_px, seen = errors_px(problem, state), problem.observations
     ends = np.column_stack([problem.points.host[seen.point], seen.keyframe])

@@ -35,7 +35,7 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.geometry.least_squares import robust_sigma_2d
 from scopemap.engine.mapping.bundle_adjustment import errors_px, with_points
-from scopemap.engine.mapping.bundle_problem import BundleProblem, State, part_of, reprojection_errors
+from scopemap.engine.mapping.bundle_problem import BundleProblem, BundleState, part_of, reprojection_errors
 from scopemap.engine.mapping.depth_correction import depth_disagreement
 from scopemap.engine.mapping.feature_tracks import NEAR_GAPS
 from scopemap.engine.notices import Notice
@@ -125,7 +125,7 @@ def halves(problem: BundleProblem, most: int | None = None) -> tuple[BundleProbl
     return part_of(problem, adjusted), part_of(problem, left_out)
 
 
-def placed(left_out: BundleProblem, keyframes: State) -> State:
+def placed(left_out: BundleProblem, keyframes: BundleState) -> BundleState:
     """Return the state of points that their own observations place in the keyframes of a solution."""
     state = keyframes._replace(log_depth=left_out.points.log_depth + keyframes.log_scale[left_out.points.host])
     for _ in range(_RESCALINGS):
@@ -135,7 +135,7 @@ def placed(left_out: BundleProblem, keyframes: State) -> State:
     return state
 
 
-def left_out_px(left_out: BundleProblem, state: State, unit: np.ndarray | float = 1.0, least: int = 0) -> float:
+def left_out_px(left_out: BundleProblem, state: BundleState, unit: np.ndarray | float = 1.0, least: int = 0) -> float:
     """Return the robust standard deviation of the errors of left-out points, px; NaN of fewer than `least`.
 
     state : as `placed` returns it. unit : (N,) what each error is multiplied by.

@@ -25,7 +25,7 @@ from scopemap.engine.frame import Rows
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.mapping.bundle_adjustment import BundleSolution, errors_px
-from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundleProblem, Points, Priors, State
+from scopemap.engine.mapping.bundle_problem import CORRELATED, TRACKED, BundleProblem, BundleState, Points, Priors
 from scopemap.engine.mapping.correction import FrameCorrection, KeyframeStep, TrackedPose
 from scopemap.engine.mapping.depth_correction import DepthCorrectionField, fit_depth_corrections
 from scopemap.engine.mapping.feature_tracks import FeatureTracks
@@ -146,7 +146,7 @@ class Keyframes:
         if graph is None:
             return problem, np.zeros((0, 2), int)
         log_depth = points.log_depth + graph.log_scale[points.host]
-        start = State(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.log_focal)
+        start = BundleState(inverse(graph.T_world_camera), graph.log_scale, log_depth, problem.tracked.log_focal)
         return replace(problem, start=start), graph.accepted
 
     def partner(self, number: int, merged: Collection[int]) -> int:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from scopemap.engine.mapping.bundle_adjustment import MOST_AT_ONCE, adjust, linearised
-from scopemap.engine.mapping.bundle_problem import BundleProblem, State, middle
+from scopemap.engine.mapping.bundle_problem import BundleProblem, BundleState, middle
 from scopemap.engine.mapping.judge import LEAST_COMPARED, MOST_LENS_RATIO, LensTest, halves, left_out_px, placed
 
 # Of the adjustment with the focal length free.
@@ -39,7 +39,7 @@ _ANGLES_RAD = np.linspace(0, _WIDEST_RAD, 1024)  # where lenses are inverted: ev
 _ON_AXIS = 1e-9  # guard: focal lengths from the axis
 
 
-def lens_test(problem: BundleProblem, solution: State) -> LensTest:
+def lens_test(problem: BundleProblem, solution: BundleState) -> LensTest:
     """Return the test of the lens from a solution with it held; nothing is known with too few keyframes or points.
 
     Of more keyframes than are adjusted at once, those in the middle are tested.
@@ -72,7 +72,7 @@ class LensKinds:
     kinds: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     bend: tuple[float, ...] = ()
 
-    def better_than(self, test: LensTest, problem: BundleProblem, solution: State) -> LensTest:
+    def better_than(self, test: LensTest, problem: BundleProblem, solution: BundleState) -> LensTest:
         """Return the test of the kind of lens through which left-out tracks fit clearly best; the one given: none does.
 
         test : of the focal length alone. problem, solution : with the present lens held.
@@ -96,7 +96,7 @@ class LensKinds:
 class _Seen:
     """A problem, and what it is through other lenses."""
 
-    def __init__(self, problem: BundleProblem, solution: State, bend: tuple[float, ...]) -> None:
+    def __init__(self, problem: BundleProblem, solution: BundleState, bend: tuple[float, ...]) -> None:
         points, seen, focal_px = problem.points, problem.observations, problem.focal_px
         self._corners, self._pixels = (_bent(pixel, bend, focal_px) for pixel in (points.pixel, seen.pixel))
         self._problem, self._start = problem, solution

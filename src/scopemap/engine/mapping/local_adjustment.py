@@ -23,9 +23,9 @@ from scopemap.engine.mapping.bundle_problem import (
     CORRELATED,
     TRACKED,
     BundleProblem,
+    BundleState,
     Observations,
     Points,
-    State,
     held_to_result,
 )
 from scopemap.engine.mapping.correction import KeyframeCorrection, KeyframeStep
@@ -201,7 +201,7 @@ class LocalAdjustment:
         count = len(self._window)
         _, _, T_camera_world, log_scale, log_depth, found_sigma = map(list, zip(*self._window, strict=True))
         T = np.stack(T_camera_world)
-        start = State(T, np.array(log_scale), np.concatenate(log_depth), math.log(focal_px))
+        start = BundleState(T, np.array(log_scale), np.concatenate(log_depth), math.log(focal_px))
         held = max(count - _FREE, 0)
         host_scale, found = start.log_scale[points.host], np.concatenate(found_sigma)
         points = held_to_result(points, points.host < held, start.log_depth, host_scale, found)

@@ -24,7 +24,7 @@ from scopemap.engine.mapping.bundle_adjustment import (
     adjust_one_by_one,
     log_depth_sigma,
 )
-from scopemap.engine.mapping.bundle_problem import BundleProblem, Priors, State, middle
+from scopemap.engine.mapping.bundle_problem import BundleProblem, BundleState, Priors, middle
 from scopemap.engine.mapping.judge import (
     KNOWN_SIGMA,
     LEAST_COMPARED,
@@ -49,7 +49,7 @@ _LEAST_OF_KEYFRAME = 5  # by hand: fewer such points of a keyframe have no relie
 class _Shape:
     """Where a start ended: keyframes, left-out points (Q,) ln mm as these place them, which are known, and errors."""
 
-    keyframes: State
+    keyframes: BundleState
     host: np.ndarray
     log_depth: np.ndarray
     known: np.ndarray
@@ -90,7 +90,7 @@ def with_other_starts(
     return (_from(problem, best), test) if test.replaced else (found, test)
 
 
-def _test(problem: BundleProblem, keyframes: State, *, is_rigid: bool) -> tuple[State, ShapeTest]:
+def _test(problem: BundleProblem, keyframes: BundleState, *, is_rigid: bool) -> tuple[BundleState, ShapeTest]:
     """Return the keyframes of the start that wins, the given ones where none does, and what the starts tell."""
     adjusted, left_out = halves(problem, _POINTS)
     if len(left_out.points.host) < LEAST_COMPARED or len(problem.T_camera_world) < 2:
@@ -114,7 +114,7 @@ def _test(problem: BundleProblem, keyframes: State, *, is_rigid: bool) -> tuple[
     return keyframes, ShapeTest("not determined", False, *own.likeness(nearest), own.error_px, other_px)
 
 
-def _shape(left_out: BundleProblem, keyframes: State) -> _Shape:
+def _shape(left_out: BundleProblem, keyframes: BundleState) -> _Shape:
     """Return the shape of left-out points as the keyframes of a solution place them."""
     loose = _loosely(left_out, left_out.points.log_depth)
     state = placed(loose, keyframes)
@@ -152,7 +152,7 @@ def _flat(problem: BundleProblem) -> BundleProblem:
     return replace(flat, T_camera_world=T, priors=_NO_POSES, neighbours=in_turn, start=start)
 
 
-def _from(problem: BundleProblem, keyframes: State) -> BundleSolution:
+def _from(problem: BundleProblem, keyframes: BundleState) -> BundleSolution:
     """Return the solution of all points from keyframes that another start has found.
 
     Points are held loosely to the depth at which these place them. A keyframe's scale is then the median change of the

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from scopemap.engine.errors import WeightsError, reporting
 from scopemap.engine.models.device import need_packages
 
-State = Literal["present", "by hand", "missing", "damaged"]
+Availability = Literal["present", "by hand", "missing", "damaged"]
 LOCK_NAME = "weights.lock.json"
 _CONFIGURATION = ("config.json", "preprocessor_config.json")
 
@@ -86,7 +86,7 @@ def fault(*names: str) -> str:
     there = next((one for one in map(find, names) if _is_there(one)), None)
     if there is None:
         return names[0]
-    return f"{there.name} (damaged)" if _state(there) == "damaged" else ""
+    return f"{there.name} (damaged)" if _availability(there) == "damaged" else ""
 
 
 def locate(*names: str) -> Path:
@@ -103,9 +103,9 @@ def verify(name: str) -> Path:
     return locate(name)
 
 
-def overview() -> list[tuple[Checkpoint, State]]:
-    """Return every registered checkpoint and every other one that was pulled, with the state of its files."""
-    return [(one, _state(one)) for one in map(find, dict.fromkeys([*REGISTRY, *_read_lock()]))]
+def overview() -> list[tuple[Checkpoint, Availability]]:
+    """Return every registered checkpoint and every other one that was pulled, and whether its files are there."""
+    return [(one, _availability(one)) for one in map(find, dict.fromkeys([*REGISTRY, *_read_lock()]))]
 
 
 def pull(name: str, *, progress: bool = False) -> Path:
@@ -183,7 +183,7 @@ def _checked(checkpoint: Checkpoint) -> Path:
     return weights_folder() / checkpoint.place
 
 
-def _state(checkpoint: Checkpoint) -> State:
+def _availability(checkpoint: Checkpoint) -> Availability:
     if not _is_there(checkpoint):
         return "missing"
     with suppress(WeightsError):
