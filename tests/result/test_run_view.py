@@ -26,14 +26,14 @@ from scopemap.input.opening import open_sequence
 from scopemap.result.result import Result
 from scopemap.result.result_folder import UNFINISHED
 from scopemap.result.run_view import (
-    RunProgressState,
+    RunProgress,
     SeenMap,
     look,
     read_map,
     read_pictures,
-    read_state,
+    read_progress,
     view_folder,
-    write_state,
+    write_progress,
 )
 from scopemap.runner import watched
 from scopemap.runner.observers import RunStopped
@@ -53,7 +53,7 @@ class Looking(RunWatch):
     def __init__(self, out: Path, total: int) -> None:
         super().__init__(out, total)
         self.folder = view_folder(out)
-        self.states: list[RunProgressState] = []
+        self.reported: list[RunProgress] = []
         self.maps: list[SeenMap] = []
         self.pictures: list[tuple[bytes, bytes]] = []
 
@@ -70,7 +70,7 @@ class Looking(RunWatch):
         look(self.folder)
         self._write()
         for found, seen in (
-            (self.states, read_state(self.folder)),
+            (self.reported, read_progress(self.folder)),
             (self.maps, read_map(self.folder)),
             (self.pictures, read_pictures(self.folder)),
         ):
@@ -101,7 +101,7 @@ def looked(phantom: Path, settings: Config, tmp_path_factory: pytest.TempPathFac
 
 def test_the_path_and_the_points_grow(looked: tuple[Looking, Path]) -> None:
     watch, _ = looked
-    tracking = [seen for seen, state in zip(watch.maps, watch.states, strict=True) if state.doing == "tracking"]
+    tracking = [seen for seen, progress in zip(watch.maps, watch.reported, strict=True) if progress.doing == "tracking"]
     assert [len(seen.index) for seen in tracking] == list(range(1, FRAMES + 1))
     sizes = [len(seen.points) for seen in tracking]
     assert sizes == sorted(sizes)
@@ -121,19 +121,19 @@ def test_points_are_where_the_frame_saw_them(looked: tuple[Looking, Path], phant
 
 def test_after_the_adjustment_the_frames_are_final(looked: tuple[Looking, Path], settings: Config) -> None:
     watch, out = looked
-    final = [(state, seen) for state, seen in zip(watch.states, watch.maps, strict=True) if state.adjusted]
+    final = [(progress, seen) for progress, seen in zip(watch.reported, watch.maps, strict=True) if progress.adjusted]
     assert len(final) == FRAMES
-    state, seen = final[-1]
-    assert state.doing != "tracking"
+    progress, seen = final[-1]
+    assert progress.doing != "tracking"
     np.testing.assert_allclose(seen.T_world_camera, Result(out).trajectory.T_world_camera, atol=1e-4)
 
 
 def test_the_state_tells_how_far_it_is(looked: tuple[Looking, Path]) -> None:
-    states = looked[0].states
-    assert [state.done for state in states[:FRAMES]] == list(range(1, FRAMES + 1))
-    assert {state.total for state in states[:FRAMES]} == {FRAMES}
-    assert states[0].status == "initial"
-    assert {state.status for state in states[1:FRAMES]} == {"ok"}
+    reported = looked[0].reported
+    assert [progress.done for progress in reported[:FRAMES]] == list(range(1, FRAMES + 1))
+    assert {progress.total for progress in reported[:FRAMES]} == {FRAMES}
+    assert reported[0].status == "initial"
+    assert {progress.status for progress in reported[1:FRAMES]} == {"ok"}
 
 
 def test_pictures_are_those_of_the_frame(looked: tuple[Looking, Path]) -> None:
@@ -159,8 +159,8 @@ def test_what_was_seen_goes_on_with_a_run_that_was_stopped(phantom: Path, settin
         watch = RunWatch(out, FRAMES)
 
         def note(step: Step) -> None:
-            state = watch.state()
-            counts.append((state.frames, state.points))
+            progress = watch.so_far()
+            counts.append((progress.frames, progress.points))
             if step.frame.index == stop_at:
                 raise RunStopped
 
@@ -176,21 +176,21 @@ def test_what_was_seen_goes_on_with_a_run_that_was_stopped(phantom: Path, settin
 
 
 def test_where_nobody_looks_nothing_is_drawn(phantom: Path, settings: Config, tmp_path: Path) -> None:
-    out, seen = tmp_path / "out", list[tuple[set[str], RunProgressState]]()
+    out, seen = tmp_path / "out", list[tuple[set[str], RunProgress]]()
 
     def note(step: Step) -> None:
         watch._write()
-        state = read_state(view_folder(out))
-        assert state is not None
-        seen.append(({file.name for file in view_folder(out).iterdir()}, state))
+        progress = read_progress(view_folder(out))
+        assert progress is not None
+        seen.append(({file.name for file in view_folder(out).iterdir()}, progress))
         if step.frame.index == FRAMES - 3:
             look(view_folder(out))
 
     watch = RunWatch(out, FRAMES)
     reconstruct(open_sequence(phantom), settings, out=out, observers=(watch, note))
-    assert [names for names, _ in seen[:-2]] == [{"state.json"}] * (FRAMES - 2)
+    assert [names for names, _ in seen[:-2]] == [{"progress.json"}] * (FRAMES - 2)
     assert {"picture.jpg", "depth.jpg", "map.npz"} <= seen[-2][0]
-    assert [state.frames for _, state in seen] == list(range(1, FRAMES + 1))
+    assert [progress.frames for _, progress in seen] == list(range(1, FRAMES + 1))
 
 
 def test_a_folder_that_takes_nothing_does_not_end_the_run(
@@ -199,7 +199,7 @@ def test_a_folder_that_takes_nothing_does_not_end_the_run(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    for name in ("write_state", "write_pictures", "write_map"):
+    for name in ("write_progress", "write_pictures", "write_map"):
         monkeypatch.setattr(watched, name, full)
     with RunWatch(tmp_path / "out", FRAMES) as watch:
         result = reconstruct(open_sequence(phantom), settings, out=tmp_path / "out", observers=(watch,))
@@ -208,10 +208,10 @@ def test_a_folder_that_takes_nothing_does_not_end_the_run(
 
 @pytest.mark.parametrize("content", [b"", b"[1]", b"{", b'{"done": 1, "unknown": 2}', b"\xff\xfe"])
 def test_what_is_half_written_or_foreign_is_nothing_to_see(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "state.json").write_bytes(content)
+    (tmp_path / "progress.json").write_bytes(content)
     (tmp_path / "map.npz").write_bytes(content)
-    state = read_state(tmp_path)
-    assert state is None or state == RunProgressState(done=1)
+    progress = read_progress(tmp_path)
+    assert progress is None or progress == RunProgress(done=1)
     assert read_map(tmp_path) is None
     assert read_pictures(tmp_path) is None
 
@@ -222,7 +222,7 @@ def test_a_run_in_a_terminal_can_be_watched_and_killed(phantom: Path, tmp_path: 
     frames, out = only_images(phantom, tmp_path / "frames"), tmp_path / "out"
     command = [sys.executable, "-m", "scopemap", "run", str(frames), "--out", str(out), "--watched", "--quiet"]
     killed = subprocess.Popen(command, env=os.environ | {"PYTHONUNBUFFERED": "1"})
-    while killed.poll() is None and read_state(view_folder(out)) is None:
+    while killed.poll() is None and read_progress(view_folder(out)) is None:
         pass
     killed.send_signal(signal.SIGKILL)
     killed.wait()
@@ -252,7 +252,7 @@ def test_the_window_says_how_long_each_phase_after_tracking_takes(tmp_path: Path
         page = RunPage(run, folder, "run", lambda: None)  # type: ignore[arg-type]
         for phase in ("adjusting keyframes", "fusing", "texturing", "writing"):
             watch.progress(phase, *((1, 100) if phase == "fusing" else (0, 0)))
-            write_state(folder, watch.state())
+            write_progress(folder, watch.so_far())
             if phase == "adjusting keyframes":
                 shown.show(page)
             page.tick()

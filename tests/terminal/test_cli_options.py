@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from scopemap.engine.errors import SettingsError
-from scopemap.report.run_state import RunState
+from scopemap.report.progress_meter import ProgressMeter
 from scopemap.terminal import progress
 from scopemap.terminal.options import (
     parse_box,
@@ -115,36 +115,36 @@ def test_each_phase_after_tracking_says_about_how_long_the_rest_takes(
 ) -> None:
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(progress.time, "perf_counter", lambda: clock.now)
-    state = RunState(None)
+    meter = ProgressMeter(None)
     for _ in range(101):
-        state.add(_step())  # type: ignore[arg-type]
+        meter.add(_step())  # type: ignore[arg-type]
         clock.now += 1.0
-    assert state.time_left == ""  # their number is unknown
+    assert meter.time_left == ""  # their number is unknown
     clock.now -= 1.0
     # Tracking took 100 s and the rest takes about as long.
-    assert state.words("adjusting keyframes", 0, 0) == "adjusting keyframes: about 101 s left"
+    assert meter.words("adjusting keyframes", 0, 0) == "adjusting keyframes: about 101 s left"
     clock.now += 20
-    assert state.time_left == "about 81 s left, "
+    assert meter.time_left == "about 81 s left, "
     clock.now += 20  # longer than its share
-    assert state.time_left == "at least 76 s left, "
-    assert state.words("fusing", 1, 100) == "fusing frame 1 of 100: about 76 s left"
+    assert meter.time_left == "at least 76 s left, "
+    assert meter.words("fusing", 1, 100) == "fusing frame 1 of 100: about 76 s left"
     clock.now += 10  # now by its own pace, 20 s, and a quarter of 101 s for what follows
-    assert state.words("fusing", 50, 100) == "fusing frame 50 of 100: about 35 s left"
-    state.words("fusing", 100, 100)
+    assert meter.words("fusing", 50, 100) == "fusing frame 50 of 100: about 35 s left"
+    meter.words("fusing", 100, 100)
     for phase in ("texturing", "writing", "writing the report"):
-        assert "s left" in state.words(phase, 0, 0)
+        assert "s left" in meter.words(phase, 0, 0)
         clock.now += 1000
-        assert state.time_left.startswith("at least ")
+        assert meter.time_left.startswith("at least ")
     # Of a run that was resumed after its last frame only what is counted tells.
-    resumed = RunState(100)
+    resumed = ProgressMeter(100)
     resumed.words("resuming", 100, 0)
     assert resumed.words("adjusting keyframes", 0, 0) == "adjusting keyframes"
     resumed.words("fusing", 1, 100)
     clock.now += 10
     assert resumed.words("fusing", 50, 100) == "fusing frame 50 of 100: about 20 s left"
     # Nothing is known of a run that begins again.
-    state.words("tracking again, lens b", 0, 0)
-    assert state.words("preparing", 0, 0) == "preparing"
+    meter.words("tracking again, lens b", 0, 0)
+    assert meter.words("preparing", 0, 0) == "preparing"
     with run_progress(3, silent=False) as (observers, tell):
         for _ in range(3):
             observers[0](_step())  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from scopemap.engine.odometry import Step
-from scopemap.report.run_state import RunState
+from scopemap.report.progress_meter import ProgressMeter
 
 _SECONDS_BETWEEN = 0.5
 Progress = Callable[[str, int, int], None]
@@ -25,7 +25,7 @@ def notebook_progress(total: int | None) -> Iterator[tuple[Callable[[Step], None
     """Yield the observer and the progress of a run of `total` frames that show it in one line below a cell."""
     from IPython.display import display
 
-    state, shown_s = RunState(total), time.perf_counter()
+    meter, shown_s = ProgressMeter(total), time.perf_counter()
     line = display({"text/plain": "preparing"}, raw=True, display_id=True)  # type: ignore[no-untyped-call]
 
     def show(words: str) -> None:
@@ -33,17 +33,17 @@ def notebook_progress(total: int | None) -> Iterator[tuple[Callable[[Step], None
 
     def observe(step: Step) -> None:
         nonlocal shown_s
-        state.add(step)
+        meter.add(step)
         if time.perf_counter() - shown_s > _SECONDS_BETWEEN:
             shown_s = time.perf_counter()
-            show(state.line)
+            show(meter.line)
 
     def progress(doing: str, done: int, frames: int) -> None:
         nonlocal shown_s
-        words = state.words(doing, done, frames)
+        words = meter.words(doing, done, frames)
         if not frames or done == frames or time.perf_counter() - shown_s > _SECONDS_BETWEEN:
             shown_s = time.perf_counter()
             show(words)
 
     yield observe, progress
-    show(f"{state.done} frames done")
+    show(f"{meter.done} frames done")

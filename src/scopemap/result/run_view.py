@@ -1,11 +1,11 @@
 """What can be seen of a run while it goes on: small files in the folder that it fills, each replaced at once.
 
-DIR/.unfinished/view/  state.json  picture.jpg (usable pixels, corners)  depth.jpg  map.npz (path, points)
+DIR/.unfinished/view/  progress.json  picture.jpg (usable pixels, corners)  depth.jpg  map.npz (path, points)
                        coverage.png (of a live stream: what was not seen so far)
                        looked_at (touched by whoever looks)
 
-Whoever looks reads them when it likes, so that nobody who looks can slow the run down. Where nobody looks, state.json
-alone is written. They go with the folder.
+Whoever looks reads them when it likes, so that nobody who looks can slow the run down. Where nobody looks,
+progress.json alone is written. They go with the folder.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from scopemap.result.result_folder import UNFINISHED, VIEW
 
-_STATE = "state.json"
+_PROGRESS = "progress.json"
 _PICTURE = "picture.jpg"
 _DEPTH = "depth.jpg"
 _MAP = "map.npz"
@@ -35,7 +35,7 @@ def view_folder(out: Path) -> Path:
 
 
 @dataclass(frozen=True)
-class RunProgressState:
+class RunProgress:
     """How far a run is.
 
     doing : what is done now, in words. done, total : frames; 0: not known. time_left : in words, or "". status : of the
@@ -95,9 +95,9 @@ def last_look(folder: Path) -> int:
         return 0
 
 
-def write_state(folder: Path, state: RunProgressState) -> None:
+def write_progress(folder: Path, progress: RunProgress) -> None:
     """Write how far a run is; raises `OSError`."""
-    _replace(folder / _STATE, json.dumps(asdict(state)).encode())
+    _replace(folder / _PROGRESS, json.dumps(asdict(progress)).encode())
 
 
 def write_pictures(folder: Path, picture: bytes, depth: bytes) -> None:
@@ -118,12 +118,12 @@ def write_map(folder: Path, seen: SeenMap) -> None:
     _replace(folder / _MAP, held.getvalue())
 
 
-def read_state(folder: Path) -> RunProgressState | None:
+def read_progress(folder: Path) -> RunProgress | None:
     """Return how far the run is; None where there is nothing to see, or no longer."""
-    known = {one.name for one in fields(RunProgressState)}
+    known = {one.name for one in fields(RunProgress)}
     try:
-        values: dict[str, Any] = json.loads((folder / _STATE).read_text(encoding="utf-8"))
-        return RunProgressState(**{name: value for name, value in values.items() if name in known})
+        values: dict[str, Any] = json.loads((folder / _PROGRESS).read_text(encoding="utf-8"))
+        return RunProgress(**{name: value for name, value in values.items() if name in known})
     except (OSError, ValueError, TypeError, AttributeError):
         return None
 

@@ -236,7 +236,7 @@ class _Passes:
             for observer in self.observers:
                 if isinstance(observer, RestartedObserver):
                     observer.forget()
-            from scopemap.report.run_state import TRACKING_AGAIN
+            from scopemap.report.progress_meter import TRACKING_AGAIN
 
             self.progress(f"{TRACKING_AGAIN}, lens {sequence.camera_source}", 0, 0)
         return found
@@ -263,10 +263,10 @@ class _Passes:
             pipeline = Pipeline(config, estimators, store, self.tracker)
             pipeline.mapper.try_lenses(lenses_of(sequence, config, again=start.number > 1))
             run = Run(sequence, pipeline, self.clock, writers, self.progress, self.plan)
-            states = None
+            checkpoints = None
             if folder is not None and isinstance(self.tracker, ResumableTracker | None):
-                states = Checkpoints(folder, self.identity, run, start.record(), self.lasting)
-            run.track(self.observers, states)
+                checkpoints = Checkpoints(folder, self.identity, run, start.record(), self.lasting)
+            run.track(self.observers, checkpoints)
             # A tracker of the caller cannot begin again, and who stops a run waits for its end.
             if start.number < MOST_PASSES and self.tracker is None and not run.stopped:
                 other = lens_of_motion(sequence, config, run.lens, again=start.number > 1)

@@ -36,7 +36,7 @@ _Item = TypeVar("_Item")
 _END = object()
 
 
-class RunStates(Protocol):
+class CheckpointWriter(Protocol):
     """Writes checkpoints of a run as it goes, with each stage as it was after the same frame, as `Checkpoints` does."""
 
     @property
@@ -111,26 +111,26 @@ class Run:
         self.pipeline.fusion.most_blocks = self.kept_maps.limits.blocks
         self.pipeline.mapper.limit(self.plan.observations)
 
-    def track(self, observers: tuple[Observer, ...], states: RunStates | None = None) -> None:
+    def track(self, observers: tuple[Observer, ...], checkpoints: CheckpointWriter | None = None) -> None:
         """Pass all frames through the pipeline, those after the last checkpoint. Raises `RunStopped` of an observer."""
         last, complete = -1, False
-        if states is not None and states.exist:
-            last, complete = states.restore()
+        if checkpoints is not None and checkpoints.exist:
+            last, complete = checkpoints.restore()
             self.resumed_after = last
             self.progress("resuming", len(self.frames), 0)
         frames, stop = iter(()) if complete else self._until_stopped(last), None
-        for step in overlapped(frames, self.pipeline, self.clock, self.plan.ahead, states):
+        for step in overlapped(frames, self.pipeline, self.clock, self.plan.ahead, checkpoints):
             self.take(step)
-            if states is not None:
-                states.take(step)
+            if checkpoints is not None:
+                checkpoints.take(step)
             for observer in observers:
                 try:
                     self.stopped = bool(observer(step)) or self.stopped
                 except RunStopped as asked:
                     # Frames that are on their way are tracked: the checkpoint is that after a frame.
                     self.stopped, stop = True, asked
-        if states is not None and len(self.frames) and not complete and (stop or not self.interrupted):
-            states.commit_all(self.frames.last_index, stopped=stop is not None, complete=not self.interrupted)
+        if checkpoints is not None and len(self.frames) and not complete and (stop or not self.interrupted):
+            checkpoints.commit_all(self.frames.last_index, stopped=stop is not None, complete=not self.interrupted)
         if stop is not None:
             raise stop
 
@@ -349,7 +349,11 @@ def in_thread(items: Iterable[_Item], thread: str, count: int = 2) -> Generator[
 
 
 def overlapped(
-    frames: Iterator[Frame], pipeline: Pipeline, clock: Clock, ahead: int = 2, states: RunStates | None = None
+    frames: Iterator[Frame],
+    pipeline: Pipeline,
+    clock: Clock,
+    ahead: int = 2,
+    checkpoints: CheckpointWriter | None = None,
 ) -> Iterator[Step]:
     """Yield the steps of all frames; each stage but the last runs in a thread of its own, `ahead` frames ahead."""
 
@@ -357,14 +361,14 @@ def overlapped(
         def results() -> Iterator[Any]:
             for item, due in items:
                 result = clock.timed(part, call, item)
-                if due and states is not None:
-                    states.keep(part)
+                if due and checkpoints is not None:
+                    checkpoints.keep(part)
                 yield result, due
 
         return in_thread(results(), part, ahead)
 
     read = iter(partial(clock.timed, "read", next, frames, None), None)
-    marked = ((frame, states is not None and states.due()) for frame in read)
+    marked = ((frame, checkpoints is not None and checkpoints.due()) for frame in read)
     items: Any = marked
     for part, call in pipeline.steps.items():
         items = stage(part, call, items)
@@ -372,5 +376,5 @@ def overlapped(
         for step, due in items:
             clock.timed("store or fuse", pipeline.fuse, step)
             yield step
-            if due and states is not None:
-                states.commit(step.frame.index)
+            if due and checkpoints is not None:
+                checkpoints.commit(step.frame.index)

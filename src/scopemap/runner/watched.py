@@ -20,15 +20,15 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.odometry import Step
 from scopemap.report.depth_figures import colour_depth
 from scopemap.report.frame_pictures import shrunk
-from scopemap.report.run_state import RunState
+from scopemap.report.progress_meter import ProgressMeter
 from scopemap.result.run_view import (
-    RunProgressState,
+    RunProgress,
     last_look,
     view_folder,
     write_coverage,
     write_map,
     write_pictures,
-    write_state,
+    write_progress,
 )
 from scopemap.runner.seen_pieces import SeenPieces
 
@@ -49,8 +49,8 @@ class RunWatch:
     """Observes a run that writes to `out`, and shows it; a context that ends with the run.
 
     out : the folder of the result; or, with `folder`, nothing: what is seen is written there. total : frames of the
-    input, None: not known. adjusts : as of `RunState`. Of a live stream, asked when it is written: live : what it does,
-    and what else is shown, by name; drawn : the map of what was not seen so far, PNG, b"": none.
+    input, None: not known. adjusts : as of `ProgressMeter`. Of a live stream, asked when it is written: live : what it
+    does, and what else is shown, by name; drawn : the map of what was not seen so far, PNG, b"": none.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class RunWatch:
             raise ValueError("a folder is needed to show a run in")
         self._out, self._folder, self._live, self._drawn = out, folder, live, drawn
         self._total, self._adjusts = total, adjusts
-        self._progress = RunState(total, adjusts=adjusts)
+        self._meter = ProgressMeter(total, adjusts=adjusts)
         self._words, self._done, self._frames = "preparing", 0, 0
         self._step: Step | None = None
         self._pieces = SeenPieces()
@@ -92,8 +92,8 @@ class RunWatch:
         """Take a step: an observer for `reconstruct`."""
         now = time.monotonic()
         with self._lock:
-            self._progress.add(step)
-            self._words, self._done, self._frames = "tracking", self._progress.done, self._total or 0
+            self._meter.add(step)
+            self._words, self._done, self._frames = "tracking", self._meter.done, self._total or 0
             is_due = now - self._pointed_s > _POINTS_EVERY_S
             if self._take(step, with_points=is_due) and is_due:
                 self._pointed_s = now
@@ -119,7 +119,7 @@ class RunWatch:
     def forget(self) -> None:
         """Begin anew: what a run has shown stays until its frames come again, what a live stream has shown goes."""
         with self._lock:
-            self._progress = RunState(self._total, adjusts=self._adjusts)
+            self._meter = ProgressMeter(self._total, adjusts=self._adjusts)
             self._step, self._map_of, self._final_map = None, {}, None
             if self._live is None:
                 self._pieces.begin()
@@ -143,22 +143,22 @@ class RunWatch:
     def progress(self, doing: str, done: int, frames: int) -> None:
         """Take what is done outside of tracking, as `Progress` is called."""
         with self._lock:
-            self._progress.words(doing, done, frames)
+            self._meter.words(doing, done, frames)
             self._words, self._done, self._frames = doing, done, frames
 
-    def state(self) -> RunProgressState:
+    def so_far(self) -> RunProgress:
         """Return how far the run is now."""
         doing, facts = (self._words, {}) if self._live is None else self._live()
         with self._lock:
             step = self._step
-            return RunProgressState(
+            return RunProgress(
                 doing=doing,
                 done=self._done,
                 total=self._frames,
-                time_left=self._progress.time_left.rstrip(", ") if self._live is None else "",
+                time_left=self._meter.time_left.rstrip(", ") if self._live is None else "",
                 status="" if step is None else step.track.status,
                 reason="" if step is None or step.track.status != "lost" else step.track.reason,
-                lost=self._progress.lost,
+                lost=self._meter.lost,
                 frame=-1 if step is None else step.frame.index,
                 time_s=0.0 if step is None else step.frame.time_s,
                 submap=0 if step is None else step.track.map,
@@ -191,7 +191,7 @@ class RunWatch:
                 self._draw(folder)
                 self._drawn_s = now
                 self._written += 1
-            write_state(folder, self.state())
+            write_progress(folder, self.so_far())
         except OSError:
             return
 

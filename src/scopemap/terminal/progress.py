@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from scopemap.report.run_state import RunState, of_all
+from scopemap.report.progress_meter import ProgressMeter, of_all
 
 if TYPE_CHECKING:
     from scopemap.engine.odometry import Step
@@ -22,7 +22,7 @@ _SECONDS_BETWEEN_LINES = 10.0
 _COMPILING = "compiling kernels, once"
 
 
-class RunProgress(NamedTuple):
+class ProgressDisplay(NamedTuple):
     """What a run calls: observers with each step (none if silent), `progress` before the first and after the last."""
 
     observers: tuple[Callable[[Step], bool | None], ...]
@@ -42,24 +42,24 @@ def both(
 
 
 @contextmanager
-def run_progress(total: int | None, *, silent: bool, adjusts: bool = True) -> Iterator[RunProgress]:
-    """Yield what shows the progress of a run of `total` frames; adjusts : as of `RunState`."""
+def run_progress(total: int | None, *, silent: bool, adjusts: bool = True) -> Iterator[ProgressDisplay]:
+    """Yield what shows the progress of a run of `total` frames; adjusts : as of `ProgressMeter`."""
     if silent:
-        yield RunProgress((), lambda doing, done, total: None)
+        yield ProgressDisplay((), lambda doing, done, total: None)
         return
-    state = RunState(total, adjusts=adjusts)
+    meter = ProgressMeter(total, adjusts=adjusts)
     with _display("tracking", "preparing") as show:
 
         def observe(step: Step) -> None:
-            state.add(step)
-            show("tracking", state.done, total, f"{state.time_left}{state.text}", state.line)
+            meter.add(step)
+            show("tracking", meter.done, total, f"{meter.time_left}{meter.text}", meter.line)
 
         def progress(doing: str, done: int, frames: int) -> None:
-            line = state.words(doing, done, frames)
-            left = state.time_left.rstrip(", ")
+            line = meter.words(doing, done, frames)
+            left = meter.time_left.rstrip(", ")
             show(doing, done, total if doing == "resuming" else frames or None, left, line)
 
-        yield RunProgress((observe,), progress)
+        yield ProgressDisplay((observe,), progress)
 
 
 @contextmanager

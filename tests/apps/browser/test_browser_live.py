@@ -24,10 +24,10 @@ from scopemap.apps.browser.result_page import ResultPage
 from scopemap.apps.browser.run_page import RunPage
 from scopemap.apps.browser.window import BrowserWindow
 from scopemap.apps.browser.workspace import Workspace
-from scopemap.apps.live.live_state import LiveState
+from scopemap.apps.live.live_status import LiveStatus
 from scopemap.engine.errors import InputError
 from scopemap.result.result import Result
-from scopemap.result.run_view import look, read_map, read_pictures, read_state, view_folder
+from scopemap.result.run_view import look, read_map, read_pictures, read_progress, view_folder
 from tests.apps.live.test_live import write_video
 from tests.support.front_door import call
 from tests.support.tiny_phantom import write_tiny
@@ -36,7 +36,7 @@ from tests.support.window_without_browser import element, press, seen_by_someone
 pytestmark = pytest.mark.slow
 
 PATIENCE_S = 240.0
-STATE = LiveState(
+STATUS = LiveStatus(
     state="lost",
     reason="too dark",
     frame=3,
@@ -75,16 +75,18 @@ def wait_for(is_so: Callable[[], Any]) -> Any:
 
 
 def test_facts_of_a_session_are_words() -> None:
-    assert STATE.words == "lost: move back slowly"
-    assert STATE.line.startswith("lost: move back slowly: 14.5 frames/s, latency 70 ms (95 % below 99), 2 of 40 frames")
-    assert STATE.facts == {
+    assert STATUS.words == "lost: move back slowly"
+    assert STATUS.line.startswith(
+        "lost: move back slowly: 14.5 frames/s, latency 70 ms (95 % below 99), 2 of 40 frames"
+    )
+    assert STATUS.facts == {
         "why": "too dark",
         "latency": "70 ms (95 % below 99 ms)",
         "frames": "14.5 per second; 2 of 40 dropped",
         "tracked": "30, lost 8, submap 2",
         "scale": "unknown: compare shapes, not sizes",
     }
-    full = replace(STATE, full=True, scale_known=True, reason="", snapshot="a.png").facts
+    full = replace(STATUS, full=True, scale_known=True, reason="", snapshot="a.png").facts
     assert list(full) == ["latency", "frames", "tracked", "scale", "surface", "snapshot"]
     assert full["scale"] == "known"
 
@@ -102,7 +104,7 @@ def test_a_session_that_is_watched_does_what_lines_say(clip: Path, tmp_path: Pat
         def state() -> Any:
             assert process.poll() is None
             look(view)
-            return read_state(view)
+            return read_progress(view)
 
         try:
             wait_for(lambda: state() and state().doing == "tracking" and read_map(view))
@@ -137,7 +139,7 @@ def test_a_session_whose_window_is_gone_ends_with_its_result(clip: Path, tmp_pat
     program = [sys.executable, "-m", "scopemap", "live", str(clip), "--watched", "--out", str(out), "--quiet"]
     with subprocess.Popen(program, stdin=subprocess.PIPE) as process:
         try:
-            wait_for(lambda: (state := read_state(view_folder(out))) and state.status)
+            wait_for(lambda: (state := read_progress(view_folder(out))) and state.status)
             process.stdin.close()  # type: ignore[union-attr]
             assert process.wait(PATIENCE_S) == 0
         finally:

@@ -135,22 +135,22 @@ def session_of(clip: Path, snapshots: Path, observer: Callable[[Any, Any], None]
 
 def test_a_session_tracks_and_says_when_it_is_lost(clip: Path, tmp_path: Path) -> None:
     words: list[str] = []
-    session = session_of(clip, tmp_path, lambda step, _: words.append(session.state().words))
-    assert session.state().state == "starting"
+    session = session_of(clip, tmp_path, lambda step, _: words.append(session.status().words))
+    assert session.status().state == "starting"
     result = session.run().result()
-    state = session.state()
+    status = session.status()
     assert words[1] == "tracking"
     assert words[-1] == "lost: move back slowly"
-    assert state.state == "ended"
-    assert state.tracked + state.lost == len(result.trajectory) == state.read - state.dropped
-    assert 0 < state.latency_p50_ms <= state.latency_p95_ms
+    assert status.state == "ended"
+    assert status.tracked + status.lost == len(result.trajectory) == status.read - status.dropped
+    assert 0 < status.latency_p50_ms <= status.latency_p95_ms
     assert len(result.mesh.faces) > 100
-    json.dumps(asdict(state))
+    json.dumps(asdict(status))
 
 
 def test_a_reset_forgets_and_a_snapshot_is_kept(clip: Path, tmp_path: Path) -> None:
     def ask(step: Any, _: Any) -> None:
-        if not session.state().snapshot:
+        if not session.status().snapshot:
             session.snapshot()
         elif not asked:
             asked.append(step.frame.index)
@@ -162,9 +162,9 @@ def test_a_reset_forgets_and_a_snapshot_is_kept(clip: Path, tmp_path: Path) -> N
     result = session.run().result()
     assert asked
     assert result.trajectory.indices[0] > asked[0]
-    assert session.state().tracked + session.state().lost == len(result.trajectory)
+    assert session.status().tracked + session.status().lost == len(result.trajectory)
     assert result.trajectory.status[0] == "initial"
-    snapshot = Path(session.state().snapshot)
+    snapshot = Path(session.status().snapshot)
     assert cv2.imread(str(snapshot)).shape == (128, 160, 3)
     assert snapshot.with_suffix(".ply").stat().st_size > 1000
     facts = json.loads(snapshot.with_suffix(".json").read_text())

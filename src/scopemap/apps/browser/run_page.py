@@ -14,7 +14,7 @@ from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, look_at, quaternion
 from scopemap.apps.browser.serving import RUN_GOES_ON
 from scopemap.apps.browser.window import escaped, fenced
-from scopemap.result.run_view import RunProgressState, SeenMap, look, read_coverage, read_map, read_pictures, read_state
+from scopemap.result.run_view import RunProgress, SeenMap, look, read_coverage, read_map, read_pictures, read_progress
 
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
@@ -129,7 +129,7 @@ class RunPage:
         if status == "waiting":
             self._words.content = f"It waits in the queue: runs before it: {self._waiting()}"
         elif status == "running":
-            self._show_state()
+            self._show_progress()
         else:
             self._end(status)
 
@@ -186,38 +186,38 @@ class RunPage:
             self._words.content = "**The run has failed.**"
             return
         is_kept = isinstance(self._run, BrowserRun) and self._run.is_kept
-        state = read_state(self._folder) if is_kept else None
+        progress = read_progress(self._folder) if is_kept else None
         self._draw_all()
-        if state is not None:
-            self._note_size(state)
-        self._words.content = stopped_words(state) + self._size
+        if progress is not None:
+            self._note_size(progress)
+        self._words.content = stopped_words(progress) + self._size
         for way, is_offered in zip(self._ways, (True, is_kept), strict=False):
             way.visible = is_offered
 
-    def _show_state(self) -> None:
-        state = read_state(self._folder)
-        if state is None:
+    def _show_progress(self) -> None:
+        progress = read_progress(self._folder)
+        if progress is None:
             # Before the first frame, and while the report is written: the result is in its place then.
             lines = [line for line in self._run.printed.splitlines() if line.strip()]
             doing = lines[-1] if lines else "preparing" if self._first < 0 else "writing the report"
             self._words.content = escaped(self._window.names.hidden(doing))
             return
-        self._note_size(state)
-        self._words.content = words_of(state) + self._size
-        self._bar.value, self._bar.visible = share_of(state), not self._live
-        self._facts.visible = bool(state.facts)
-        self._facts.content = "\n".join(f"- {name}: {escaped(value)}" for name, value in state.facts.items())
+        self._note_size(progress)
+        self._words.content = words_of(progress) + self._size
+        self._bar.value, self._bar.visible = share_of(progress), not self._live
+        self._facts.visible = bool(progress.facts)
+        self._facts.content = "\n".join(f"- {name}: {escaped(value)}" for name, value in progress.facts.items())
         if not self._window.server.get_clients():  # no one looks
             return
         look(self._folder)
-        if state.written != self._written:
-            self._written, self._is_lost = state.written, state.status == "lost"
+        if progress.written != self._written:
+            self._written, self._is_lost = progress.written, progress.status == "lost"
             self._draw_all()
 
-    def _note_size(self, state: RunProgressState) -> None:
-        if state.points:
-            grey = "" if not self._has_grey else _NOT_FINAL if state.adjusted else _GREY
-            self._size = f"\n\nThe surface so far: {state.points:,} points from {state.frames:,} frames.{grey}"
+    def _note_size(self, progress: RunProgress) -> None:
+        if progress.points:
+            grey = "" if not self._has_grey else _NOT_FINAL if progress.adjusted else _GREY
+            self._size = f"\n\nThe surface so far: {progress.points:,} points from {progress.frames:,} frames.{grey}"
 
     def _draw_all(self) -> None:
         if (pictures := read_pictures(self._folder)) is not None:
@@ -275,35 +275,35 @@ class RunPage:
             look_at(self._window, seen.T_world_camera[0], everything)
 
 
-def words_of(state: RunProgressState) -> str:
+def words_of(progress: RunProgress) -> str:
     """Return how far a run is, in one or two lines of Markdown."""
-    count = f" {state.done} of {state.total}" if state.total else f" {state.done}" if state.done else ""
+    count = f" {progress.done} of {progress.total}" if progress.total else f" {progress.done}" if progress.done else ""
     frames = " frames" if count else ""
-    lines = [f"**{escaped(state.doing)}**{count}{frames}{f', {state.time_left}' if state.time_left else ''}"]
-    if state.doing == "tracking" and state.status:
-        lost = f", {state.lost} lost so far" if state.lost else ""
-        submap = f", submap {state.submap + 1}" if state.submap else ""
-        is_lost = state.status == "lost"
-        how = f"**lost**: {escaped(state.reason)}" if is_lost else f"tracked at {state.time_s:.1f} s"
+    lines = [f"**{escaped(progress.doing)}**{count}{frames}{f', {progress.time_left}' if progress.time_left else ''}"]
+    if progress.doing == "tracking" and progress.status:
+        lost = f", {progress.lost} lost so far" if progress.lost else ""
+        submap = f", submap {progress.submap + 1}" if progress.submap else ""
+        is_lost = progress.status == "lost"
+        how = f"**lost**: {escaped(progress.reason)}" if is_lost else f"tracked at {progress.time_s:.1f} s"
         lines.append(f"{how}{submap}{lost}")
-    elif state.adjusted:
+    elif progress.adjusted:
         lines.append("Poses and points are those after the adjustment.")
     return "\n\n".join(lines)
 
 
-def stopped_words(state: RunProgressState | None) -> str:
-    """Return where a run was stopped that has kept its state; None: it has kept nothing."""
-    if state is None:
+def stopped_words(progress: RunProgress | None) -> str:
+    """Return where a run was stopped that has kept its progress; None: it has kept nothing."""
+    if progress is None:
         return "**Stopped** before anything was kept. *Continue* begins at the first frame."
-    if state.doing == "tracking":
-        of = f" of {state.total}" if state.total else ""
-        return f"**Stopped after {state.done}{of} frames.** What was tracked is kept."
-    return f"**Stopped while {escaped(state.doing)}.** All frames that were tracked are kept."
+    if progress.doing == "tracking":
+        of = f" of {progress.total}" if progress.total else ""
+        return f"**Stopped after {progress.done}{of} frames.** What was tracked is kept."
+    return f"**Stopped while {escaped(progress.doing)}.** All frames that were tracked are kept."
 
 
-def share_of(state: RunProgressState) -> float:
+def share_of(progress: RunProgress) -> float:
     """Return how much of its present stage a run has done, percent; of stages that are not counted all."""
-    return min(100.0, 100 * state.done / state.total) if state.total else 100.0
+    return min(100.0, 100 * progress.done / progress.total) if progress.total else 100.0
 
 
 def _pixels(content: bytes) -> np.ndarray:

@@ -16,7 +16,7 @@ from scopemap.apps.browser.runs import BrowserRun
 from scopemap.apps.browser.window import escaped
 from scopemap.apps.browser.workspace import DEMONSTRATION, VIDEO_KINDS, Workspace, in_time, made_and_word, thumbnail
 from scopemap.engine.errors import InputError
-from scopemap.result.run_view import read_state, view_folder
+from scopemap.result.run_view import read_progress, view_folder
 
 if TYPE_CHECKING:
     from scopemap.apps.browser.window import BrowserWindow
@@ -157,8 +157,8 @@ class StartPage:
             kept = ", and what was tracked is kept" if run.is_kept else ""
             ends = {"done": "done", "failed": "has failed", "stopped": f"was stopped{kept}"}
             return f"**{name}** {ends[run.status]}"
-        state = read_state(view_folder(run.out))
-        is_at = "starting" if state is None else words_of(state).partition("\n")[0]
+        progress = read_progress(view_folder(run.out))
+        is_at = "starting" if progress is None else words_of(progress).partition("\n")[0]
         return f"**{name}** {'is stopping' if run.stopping else 'runs'}: {is_at}"
 
     def _add_results(self, finished: list[Path]) -> None:

@@ -22,7 +22,7 @@ from scopemap.terminal.terminal_keys import terminal_keys
 
 if TYPE_CHECKING:
     from scopemap.apps.live.live import LiveSession
-    from scopemap.apps.live.live_state import LiveState
+    from scopemap.apps.live.live_status import LiveStatus
     from scopemap.engine.config import Config
     from scopemap.engine.odometry import Step
     from scopemap.runner.reconstructor import Reconstructor
@@ -131,9 +131,9 @@ def live(
         if out is not None:
             write_report(out)
         if not silent:
-            _print(result.provenance, session.state(), out)
+            _print(result.provenance, session.status(), out)
         elif as_json:
-            print_json(result.provenance | {"live": asdict(state := session.state()) | {"words": state.words}})
+            print_json(result.provenance | {"live": asdict(status := session.status()) | {"words": status.words}})
     if interruption.exit_code:
         raise typer.Exit(interruption.exit_code)
 
@@ -231,24 +231,24 @@ def _controls(session: LiveSession, seconds: float | None, *, silent: bool) -> I
 
 
 def _show(session: LiveSession, ended: threading.Event) -> None:
-    """Show a session's state until it ends: in one line of a terminal, else in one every ten seconds and at changes."""
+    """Show a session's status until it ends: in one line of a terminal, else every ten seconds and at changes."""
     terminal, shown, shown_s = sys.stderr.isatty(), "", 0.0
     while not ended.wait(_SHOWN_EVERY_S):
-        if (state := session.state()).state == "ended":  # the summary says so, once
+        if (status := session.status()).state == "ended":  # the summary says so, once
             continue
         if terminal:
-            sys.stderr.write("\r\033[K" + state.line[:100])
+            sys.stderr.write("\r\033[K" + status.line[:100])
             sys.stderr.flush()
-        elif state.state != shown or time.monotonic() - shown_s > _LINE_EVERY_S:
-            typer.echo(state.line, err=True)
-            shown, shown_s = state.state, time.monotonic()
+        elif status.state != shown or time.monotonic() - shown_s > _LINE_EVERY_S:
+            typer.echo(status.line, err=True)
+            shown, shown_s = status.state, time.monotonic()
     if terminal:
         sys.stderr.write("\n")
 
 
-def _print(provenance: dict[str, Any], state: LiveState, out: Path | None) -> None:
+def _print(provenance: dict[str, Any], status: LiveStatus, out: Path | None) -> None:
     print_warnings(provenance)
     typer.echo(f"{provenance['tracked']} of {provenance['frames']} frames tracked, {provenance['lost']} lost")
-    typer.echo(state.line)
+    typer.echo(status.line)
     if out is not None:
         typer.echo(f"Open {out / 'report.html'} in a browser. All files of the result are in {out}.")

@@ -12,7 +12,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from scopemap.apps.live.live_state import LiveState
+from scopemap.apps.live.live_status import LiveStatus
 from scopemap.engine.config import Config
 from scopemap.engine.errors import reporting
 from scopemap.engine.frame import Frame
@@ -90,14 +90,14 @@ class LiveSession:
         """Write the next frame's picture (PNG), its pose and the surface so far (PLY) to the folder for snapshots."""
         self._wants_snapshot = True
 
-    def state(self) -> LiveState:
+    def status(self) -> LiveStatus:
         """Return how the session is now."""
         with self._lock:
             latencies, times_s, step = list(self._latencies_ms), list(self._times_s), self._step
         span_s = times_s[-1] - times_s[0] if len(times_s) > 1 else 0.0
         median, slowest = np.percentile(latencies, [50, 95]) if latencies else (0.0, 0.0)
         word = self._state_word()
-        return LiveState(
+        return LiveStatus(
             state=word,
             reason=step.track.reason if step is not None and word == "lost" else "",
             frame=-1 if step is None else step.frame.index,

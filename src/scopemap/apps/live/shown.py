@@ -30,9 +30,9 @@ class ShownSession:
         covered = self._covered
 
         def live() -> tuple[str, dict[str, str]]:
-            state, coverage = session.state(), covered.shown.words
-            words = "writing the result" if state.state == "ended" and self._writes else state.words
-            return words, state.facts | ({"coverage": coverage} if coverage else {})
+            status, coverage = session.status(), covered.shown.words
+            words = "writing the result" if status.state == "ended" and self._writes else status.words
+            return words, status.facts | ({"coverage": coverage} if coverage else {})
 
         self._watch = RunWatch(None, folder=self._folder, live=live, drawn=lambda: covered.shown.png)
         return self._watch

@@ -20,7 +20,7 @@ from scopemap.terminal import options
 from scopemap.terminal.figures import print_json, print_warnings
 from scopemap.terminal.interruption import Interruption
 from scopemap.terminal.loading import loading
-from scopemap.terminal.progress import RunProgress, both, run_progress
+from scopemap.terminal.progress import ProgressDisplay, both, run_progress
 
 if TYPE_CHECKING:
     from scopemap.engine.config import Config
@@ -212,7 +212,7 @@ def _window(out: Path) -> AbstractContextManager[None]:
 @contextmanager
 def _shown(
     out: Path, frames: int | None, adjusts: bool, silent: bool, looked: Literal["", "app", "window"]
-) -> Iterator[tuple[RunProgress, Interruption]]:
+) -> Iterator[tuple[ProgressDisplay, Interruption]]:
     """Yield what a run tells how far it is, in the terminal and for what `looked` names; and what ends it early.
 
     looked : "app": a window beside this command. "window": one that has started it, and goes on with what it keeps.
@@ -226,7 +226,7 @@ def _shown(
 
             watch = stack.enter_context(RunWatch(out, frames, adjusts=adjusts))
             observers, progress = (watch, *observers), both(progress, watch.progress)
-        yield RunProgress(observers, progress), interruption
+        yield ProgressDisplay(observers, progress), interruption
 
 
 def _check_unfinished(out: Path, sequence: Sequence, resolved: Config, *, finish: bool, resume: bool | None) -> None:

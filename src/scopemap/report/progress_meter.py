@@ -35,7 +35,7 @@ def of_all(total: int | None) -> str:
     return f" of {total}" if total else ""
 
 
-class RunState:
+class ProgressMeter:
     """Counts the frames of a run; total : their number, None: unknown.
 
     adjusts : whether keyframes are adjusted after the last frame, and frames fused then.

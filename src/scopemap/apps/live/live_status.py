@@ -9,7 +9,7 @@ _WORDS = {"lost": "lost: move back slowly", "starting": "starting: hold still an
 
 
 @dataclass(frozen=True)
-class LiveState:
+class LiveStatus:
     """How a live session is.
 
     state : what it does. reason : why it is lost, or "". frame : number of the last one, -1: none. frames_per_s and
