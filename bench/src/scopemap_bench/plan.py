@@ -30,13 +30,13 @@ _METHOD_SETS = "method_sets"
 _NESTING = 2  # folders around or within a sequence that the pattern does not name
 
 
-class _Part(BaseModel):
+class _PlanPart(BaseModel):
     """A part of the plan: frozen, unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class ProtocolPlan(_Part):
+class ProtocolPlan(_PlanPart):
     """How runs are scored.
 
     align : alignment of the trajectory, also applied to mesh and depth in mm.
@@ -71,7 +71,7 @@ class ProtocolPlan(_Part):
         return self
 
 
-class FigurePlan(_Part):
+class FigurePlan(_PlanPart):
     """What the figures of a sequence show; it changes no row.
 
     frame : number of the second of the two consecutive frames, by default in the middle.
@@ -82,7 +82,7 @@ class FigurePlan(_Part):
     zoom: tuple[float, float, Annotated[float, Field(gt=0, le=1)]] = (0.5, 0.5, 0.25)
 
 
-class SequencePlan(_Part):
+class SequencePlan(_PlanPart):
     """One sequence, or all that a pattern finds.
 
     name : for tables; before the path of each sequence that a pattern finds.
@@ -123,7 +123,7 @@ class SequencePlan(_Part):
         return self
 
 
-class MethodPlan(_Part):
+class MethodPlan(_PlanPart):
     """One method.
 
     name : for tables and folders. use : "scopemap", "import", "colmap", or a baseline (`methods.method.BASELINES`).
@@ -151,7 +151,7 @@ class MethodPlan(_Part):
         return self
 
 
-class Plan(_Part):
+class Plan(_PlanPart):
     """A whole benchmark."""
 
     title: str

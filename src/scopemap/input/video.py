@@ -47,7 +47,7 @@ _MOST_WITHOUT_STAMP = 1000
 
 
 @dataclass
-class _Reading:
+class _DecodingPass:
     """One pass over a video: packets read, pictures shown and damaged so far, and whether it broke off.
 
     shown_pts, latest_pts : the latest of the pictures shown so far, and of those in the packets; None without any.
@@ -237,7 +237,7 @@ class VideoFile(Source):
 
     def _decoded(self, start: int = 0) -> Iterator[tuple[int, float, VideoFrame]]:
         """Yield number, time stamp, s, and picture of every frame from `start` on, and of some before it."""
-        reading = _Reading(TimeStamps(self.rate_hz))
+        reading = _DecodingPass(TimeStamps(self.rate_hz))
         try:
             try:
                 yield from self._read(reading, start)
@@ -251,7 +251,7 @@ class VideoFile(Source):
             reading.broken = True
         self._report(reading)
 
-    def _read(self, reading: _Reading, start: int) -> Iterator[tuple[int, float, VideoFrame]]:
+    def _read(self, reading: _DecodingPass, start: int) -> Iterator[tuple[int, float, VideoFrame]]:
         due = list[float | None]()
         with self._opened() as container:
             stream = self._stream(container)
@@ -302,7 +302,7 @@ class VideoFile(Source):
                 with suppress(av.FFmpegError):
                     yield from (frame for frame in packet.decode() if frame.pts is not None and frame.pts > last_pts)
 
-    def _look_for_smears(self, frame: VideoFrame, reading: _Reading) -> None:
+    def _look_for_smears(self, frame: VideoFrame, reading: _DecodingPass) -> None:
         """Warn once: FFmpeg fills what is missing from other pictures, and shows the result as if it were sound.
 
         Where nothing follows, the video breaks off, which is said by itself.
@@ -315,7 +315,7 @@ class VideoFile(Source):
         found = f"the data of the video {self.path.name} are interrupted or damaged near frame {reading.smeared}"
         self._warn(f"{found}: unless pieces were joined there, pictures up to the next key picture may be smeared")
 
-    def _report(self, reading: _Reading) -> None:
+    def _report(self, reading: _DecodingPass) -> None:
         stamps, read = reading.stamps, reading.shown
         claimed = self.count or 0
         # What claims a duration and not a count, of frames at any rate, must be held to that.

@@ -133,7 +133,7 @@ def _coverage(run: Result) -> dict[str, Any] | None:
     """Return what `scopemap coverage` wrote beside the result, and its map as PNG; None: nothing, or it is damaged."""
     folder = run.folder / COVERAGE
     try:
-        found = _Covered.model_validate_json((folder / "coverage.json").read_bytes())
+        found = _CoverageData.model_validate_json((folder / "coverage.json").read_bytes())
         picture = (folder / "map.png").read_bytes()
     except (OSError, ValidationError):
         return None
@@ -156,7 +156,7 @@ class _Spot(BaseModel):
     time_s: float
 
 
-class _Covered(BaseModel):
+class _CoverageData(BaseModel):
     kind: str
     unit: str
     statement: str

@@ -70,12 +70,12 @@ def run_in_processes(
     again. Closed early, or where this process ends, all processes end.
     """
     new, failed = ((number, task, NEW) for number, task in enumerate(tasks)), deque[tuple[int, Any, Outcome]]()
-    idle: list[_Worker] = []
-    busy: list[_Worker] = []
+    idle: list[_WorkerProcess] = []
+    busy: list[_WorkerProcess] = []
     try:
         while True:
             while len(busy) < limits.processes and (due := next(new, None) or (failed and failed.popleft())):
-                worker = idle.pop() if idle else _Worker(call, threads_of_each(limits.processes))
+                worker = idle.pop() if idle else _WorkerProcess(call, threads_of_each(limits.processes))
                 started(due[0])
                 worker.begin(*due)
                 busy.append(worker)
@@ -105,7 +105,7 @@ def threads_of_each(processes: int) -> int:
     return max(1, usable_cores() // processes)
 
 
-def _ready(busy: list[_Worker], limit_s: float | None) -> list[_Worker]:
+def _ready(busy: list[_WorkerProcess], limit_s: float | None) -> list[_WorkerProcess]:
     """Return the workers that have answered, have died or are over time, after waiting for the first of them."""
     now, left_s = time.monotonic(), None
     if limit_s is not None:
@@ -115,7 +115,7 @@ def _ready(busy: list[_Worker], limit_s: float | None) -> list[_Worker]:
     return [worker for worker in busy if worker.connection in answered or over(worker)]
 
 
-class _Worker:
+class _WorkerProcess:
     """A process that does tasks."""
 
     def __init__(self, call: Callable[[Any], Any], threads: int) -> None:

@@ -96,7 +96,7 @@ class Video:
 
 
 @dataclass(frozen=True)
-class _Task:
+class _RunTask:
     video: Video
     out: Path
     before: int | None
@@ -158,7 +158,7 @@ def run_batch(
     def begin(number: int) -> None:
         put(replace(rows[due[number].name], status="started"))
 
-    tasks = [_Task(video, out.absolute(), rows[video.name].before) for video in due]
+    tasks = [_RunTask(video, out.absolute(), rows[video.name].before) for video in due]
     try:
         with closing(engine(_run, tasks, limits, begin)) as ended:
             for number, outcome in ended:
@@ -176,7 +176,7 @@ def run_batch(
     return list(rows.values())
 
 
-def _run(task: _Task) -> dict[str, Any]:
+def _run(task: _RunTask) -> dict[str, Any]:
     """Run a video in this process, and return what its row says of the result."""
     video, folder = task.video, task.out / task.video.name
     log_to(task.out / LOGS / f"{video.name}.txt")

@@ -31,7 +31,7 @@ class Forecast:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _ForecastTask:
     video: Video
     out: Path
 
@@ -54,7 +54,7 @@ def forecast(
         folder = Path(tempfile.mkdtemp(prefix=".dry-run-", dir=out)).absolute()
         (folder / LOGS).mkdir()
     try:
-        for number, outcome in engine(_measure, [_Part(video, folder) for video in videos], limits):
+        for number, outcome in engine(_measure, [_ForecastTask(video, folder) for video in videos], limits):
             video = videos[number]
             video.forget_fetched(folder)
             found[number] = Forecast(video.name, outcome.fault, _bytes(video.path), outcome.value)
@@ -66,11 +66,11 @@ def forecast(
     return [found[number] for number in sorted(found)]
 
 
-def _measure(part: _Part) -> RunCost | None:
+def _measure(task: _ForecastTask) -> RunCost | None:
     """Run the first second of a video, and return what all of it costs, as `scopemap run --dry-run` does."""
-    log_to(part.out / LOGS / f"{part.video.name}.txt")
-    video = part.video.fetched(part.out)
-    return run_cost(video.open(), video.open, video.config, part.out / video.name)
+    log_to(task.out / LOGS / f"{task.video.name}.txt")
+    video = task.video.fetched(task.out)
+    return run_cost(video.open(), video.open, video.config, task.out / video.name)
 
 
 def _bytes(path: Path | RemoteFile) -> int:

@@ -48,7 +48,7 @@ class RayEngine:
     ) -> Generator[tuple[int, Outcome], None, None]:
         """Yield (number, outcome) of each task, as they end; `limits.processes` bounds the actors."""
         waiting = deque((number, NEW) for number in range(len(tasks)))
-        workers: list[_Worker] = []
+        workers: list[_ActorHandle] = []
         failed_starts = 0
         with self._connected() as ray:
             actor = self._actor(ray)
@@ -56,7 +56,7 @@ class RayEngine:
                 # An actor that is placed nowhere yet holds no task: those that run do them all.
                 starting = sum(not worker.is_busy for worker in workers)
                 lacking = min(limits.processes - len(workers), len(waiting) - starting)
-                workers += [_Worker(ray, actor()) for _ in range(lacking)]
+                workers += [_ActorHandle(ray, actor()) for _ in range(lacking)]
                 for worker in _ready(ray, workers, limits.seconds):
                     was_busy, (outcome, again) = worker.is_busy, worker.end(limits.seconds)
                     if not was_busy:
@@ -119,7 +119,7 @@ class _Tasks:
         return attempt(call, task)
 
 
-class _Worker:
+class _ActorHandle:
     """An actor as it is seen from here: it starts, then it does tasks."""
 
     def __init__(self, ray: Any, actor: Any) -> None:
@@ -150,7 +150,7 @@ class _Worker:
         self._ray.kill(self._actor)
 
 
-def _ready(ray: Any, workers: list[_Worker], limit_s: float | None) -> list[_Worker]:
+def _ready(ray: Any, workers: list[_ActorHandle], limit_s: float | None) -> list[_ActorHandle]:
     """Return the workers that have started, answered, died or are over time, after waiting for the first of them."""
     busy = [worker for worker in workers if worker.is_busy]
     last_s = _LONGEST_START_S if not busy else limit_s

@@ -110,7 +110,7 @@ class LiveCoverage:
     """
 
     def __init__(self, kept: KeptDepth) -> None:
-        self._kept, self._tasks = kept, queue.SimpleQueue[_Task | None]()
+        self._kept, self._tasks = kept, queue.SimpleQueue[_MapTask | None]()
         self.shown, self.count = ShownMap(b"", f"What was not seen: a map comes after {LEAST_FRAMES} frames."), 0
         self._idle, self._next_s = threading.Event(), time.monotonic() + _EVERY_S
         self._idle.set()
@@ -132,7 +132,7 @@ class LiveCoverage:
         if len(frames) < LEAST_FRAMES:
             return
         self._next_s, so_far = time.monotonic() + _EVERY_S, reconstructor.so_far(frames)
-        self._task = _Task(self._kept.folder, f"map {step.track.map + 1} until {step.frame.time_s:.0f} s", so_far)
+        self._task = _MapTask(self._kept.folder, f"map {step.track.map + 1} until {step.frame.time_s:.0f} s", so_far)
         self._idle.clear()
         self._tasks.put(self._task)
 
@@ -154,7 +154,7 @@ class LiveCoverage:
             self.shown = ShownMap(b"", f"No map of what was not seen: {error}.")
 
 
-class _Task(NamedTuple):
+class _MapTask(NamedTuple):
     """A map to be made in a folder of depth, to which `so_far` is written before. `of` : what that is, in words."""
 
     folder: Path
@@ -162,7 +162,7 @@ class _Task(NamedTuple):
     so_far: tuple[Result, TsdfVolume | None]
 
 
-def _made(task: _Task) -> ShownMap:
+def _made(task: _MapTask) -> ShownMap:
     """Return the map of a task."""
     with suppress(AttributeError, OSError):  # Windows knows no priorities of this kind
         os.nice(max(0, _NICE - os.nice(0)))
