@@ -20,7 +20,7 @@ from scopemap.engine.fusion.agreement import lit_like
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
-    MeshView,
+    Viewpoint,
     cropped,
     draw_path,
     mesh_picture,
@@ -40,7 +40,7 @@ def draw_surface(run: Result, frame: Frame, pose: np.ndarray, depth_mm: np.ndarr
     Confidence is blue at 0, yellow at 1. pose : (4, 4) of the frame, world mm. depth_mm : (H, W) of the frame.
     """
     mesh, camera, positions_mm = run.mesh, frame.camera, run.frames["T_world_camera"][run.frames.tracked, :3, 3]
-    view, outside = MeshView(pose, camera), outside_views(mesh, pose, positions_mm)["from outside"]
+    view, outside = Viewpoint(pose, camera), outside_views(mesh, pose, positions_mm)["from outside"]
 
     def seen(surface: trimesh.Trimesh) -> np.ndarray:
         rendering = render_mesh(surface, camera, pose)

@@ -27,7 +27,7 @@ from scopemap.engine.geometry.least_squares import DenseModel, Options, Problem,
 from scopemap.engine.geometry.se3 import inverse, mean_near, orthonormalised, se3_exp
 from scopemap.engine.geometry.warp import bilateral_filtered, pull
 from scopemap.engine.tracking.pyramid import build_pyramid
-from scopemap.engine.tracking.residuals import Loss, View, normal_equations, residual_images
+from scopemap.engine.tracking.residuals import Loss, PyramidLevel, normal_equations, residual_images
 from scopemap.engine.tracking.smoothing import OMEGA, WEIGHTS
 from scopemap.runner.estimators import create_estimators
 from scopemap_bench import PhantomSpec, write_phantom
@@ -40,7 +40,7 @@ def paper(frames: Iterable[Frame], config: Config, networks: Estimators) -> tupl
     done: list[Frame] = []
     poses: list[np.ndarray] = []  # as estimated: smoothed ones are not used again
     mde: list[np.ndarray] = []  # D_i^mde
-    keyframe, T_world_keyframe = list[View](), np.eye(4)
+    keyframe, T_world_keyframe = list[PyramidLevel](), np.eye(4)
     volume = TsdfVolume(config.fusion)
     for i, frame in enumerate(frames):
         # ---- MAPIS-Depth
@@ -81,7 +81,7 @@ def refined(
     return np.where(weight > 0, weight * warped + (1 - weight) * mde, mde)
 
 
-def aligned(keyframe: list[View], current: list[View]) -> np.ndarray:
+def aligned(keyframe: list[PyramidLevel], current: list[PyramidLevel]) -> np.ndarray:
     """Return the motion (4, 4) from the keyframe to the current camera, level by level; the last is the coarsest."""
     mean_depth_mm = float(np.nanmean(keyframe[-1].depth_mm))
     T = np.eye(4)  # x^so3 and x^se3, where the coarsest level begins
@@ -91,7 +91,9 @@ def aligned(keyframe: list[View], current: list[View]) -> np.ndarray:
     return orthonormalised(T)
 
 
-def aligned_at_level(keyframe: View, current: View, T_start: np.ndarray, free: int, mean_depth_mm: float) -> np.ndarray:
+def aligned_at_level(
+    keyframe: PyramidLevel, current: PyramidLevel, T_start: np.ndarray, free: int, mean_depth_mm: float
+) -> np.ndarray:
     """Return the motion with the least photometric error by its first `free` parameters, rotation first."""
     same_light = grey = np.array([1.0, 0.0])
     loss = Loss(np.ones(2), 1e6, grey, np.array([True, False]), 0.0)  # least squares of grey values

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.frame import Frame, percentiles
+from scopemap.engine.frame import Frame, percentiles_uint8
 
 CAMERA = PinholeCamera(50.0, 50.0, 19.5, 14.5, 40, 30)
 
@@ -40,4 +40,4 @@ def test_a_part_of_another_shape_is_refused_by_name(part: str, shape: tuple[int,
 def test_percentiles_of_levels_are_those_of_numpy(count: int) -> None:
     levels = np.random.default_rng(count).integers(0, 40, (1, count)).astype(np.uint8)
     shares = [0.0, 0.5, 50.0, 99.5, 100.0]
-    np.testing.assert_allclose(percentiles(levels, shares), np.percentile(levels, shares), atol=1e-9)
+    np.testing.assert_allclose(percentiles_uint8(levels, shares), np.percentile(levels, shares), atol=1e-9)

@@ -27,7 +27,7 @@ _TEXTURE = 600
 
 
 @dataclass(frozen=True)
-class View:
+class PlaneImage:
     """What one pose sees: rgb (H, W, 3) uint8, depth (H, W) float32 mm."""
 
     rgb: np.ndarray
@@ -41,16 +41,16 @@ def pose(
     return se3(so3_exp(np.array(turn_rad)), np.array(at_mm))
 
 
-def see(T_world_camera: np.ndarray) -> View:
+def see(T_world_camera: np.ndarray) -> PlaneImage:
     rays = CAMERA.rays.astype(np.float64) @ T_world_camera[:3, :3].T
     depth = (PLANE_MM - T_world_camera[2, 3]) / rays[..., 2]
     on_plane = T_world_camera[:3, 3] + depth[..., None] * rays
     texel = (on_plane[..., :2] * _TEXELS_PER_MM + _TEXTURE / 2).astype(np.float32)
     rgb = cv2.remap(_texture(), texel[..., 0], texel[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-    return View(rgb, depth.astype(np.float32), T_world_camera)
+    return PlaneImage(rgb, depth.astype(np.float32), T_world_camera)
 
 
-def true_flow(view: View, other: View) -> np.ndarray:
+def true_flow(view: PlaneImage, other: PlaneImage) -> np.ndarray:
     """Where each pixel of `view` is seen in `other`, minus the pixel: (H, W, 2) float32."""
     T_other_camera = inverse(other.T_world_camera) @ view.T_world_camera
     points = transform(T_other_camera, CAMERA.rays.astype(np.float64) * view.depth_mm[..., None])

@@ -9,11 +9,11 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.geometry.rendering import render_points
-from scopemap.report.depth_figures import MASKED_GREY, colour_depth, colour_share, percentiles
+from scopemap.report.depth_figures import MASKED_GREY, colour_depth, colour_range, colour_share
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
     TRUTH_COLOUR,
-    MeshView,
+    Viewpoint,
     content,
     cropped,
     draw_path,
@@ -39,9 +39,9 @@ def draw_depth_change(
     leaves; the others are grey. Their depth is to be NaN, as unknown depth is, which is black: neither counts. Methods
     share the scales of depth and of difference, whose far end is the 98th percentile.
     """
-    near_mm, far_mm = percentiles([depth for pair in depths_mm.values() for depth in pair])
+    near_mm, far_mm = colour_range([depth for pair in depths_mm.values() for depth in pair])
     changes_mm = {method: np.abs(current - previous) for method, (previous, current) in depths_mm.items()}
-    most_mm = percentiles(list(changes_mm.values()))[1]
+    most_mm = colour_range(list(changes_mm.values()))[1]
     rows = [dict(images)]
     for method, depths in depths_mm.items():
         change_mm = changes_mm[method][np.isfinite(changes_mm[method])]
@@ -91,7 +91,7 @@ def draw_reconstruction(
 
 
 def _enlarged(
-    mesh: trimesh.Trimesh, view: MeshView, picture: np.ndarray, zoom: tuple[float, float, float]
+    mesh: trimesh.Trimesh, view: Viewpoint, picture: np.ndarray, zoom: tuple[float, float, float]
 ) -> np.ndarray:
     """Draw the square of `draw_reconstruction` on a view's picture (H, H, 3), in place, and return it as large."""
     left, top, shown = content(picture)
@@ -100,7 +100,7 @@ def _enlarged(
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * side + [x - 0.5, y - 0.5]
     Sheet.over(picture).line(corners, BAR_COLOUR, 2)
     camera = view.camera.cropped(x, y, side, side).resized(view.camera.width, view.camera.height)
-    return mesh_picture(mesh, MeshView(view.T_world_camera, camera))
+    return mesh_picture(mesh, Viewpoint(view.T_world_camera, camera))
 
 
 def draw_registered_clouds(clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], file: Path, *, where: str) -> None:

@@ -33,7 +33,7 @@ _CELL_PX = (320, 256)
 
 
 @dataclass(frozen=True)
-class _View:
+class _RenderedPair:
     """A frame of the second run with both surfaces, and their difference over the distance, (H, W), NaN: not both."""
 
     index: int
@@ -49,7 +49,7 @@ class TwoRuns:
     figures: dict[str, Any]
     first: np.ndarray
     second: np.ndarray
-    views: list[_View]
+    views: list[_RenderedPair]
 
     def lines(self) -> list[str]:
         """Return the figures in words."""
@@ -155,7 +155,7 @@ def _similarity(first: np.ndarray, second: np.ndarray) -> Similarity:
     return Similarity(scale, R, to_mm.mean(0) - scale * from_mm.mean(0) @ R.T)
 
 
-def _views(runs: tuple[Result, Result], similarity: Similarity, poses: dict[int, np.ndarray]) -> list[_View]:
+def _views(runs: tuple[Result, Result], similarity: Similarity, poses: dict[int, np.ndarray]) -> list[_RenderedPair]:
     """Return the views of both surfaces from poses in the second run's world; those with nothing in common are not."""
     meshes = [run.mesh for run in runs]
     if not all(len(mesh.faces) for mesh in meshes):
@@ -171,11 +171,11 @@ def _views(runs: tuple[Result, Result], similarity: Similarity, poses: dict[int,
         first, second = (render_mesh(mesh, runs[1].camera, pose) for mesh in (moved, meshes[1]))
         difference = np.abs(first.depth_mm - second.depth_mm) / second.depth_mm
         if np.isfinite(difference).any():
-            found.append(_View(index, first, second, difference))
+            found.append(_RenderedPair(index, first, second, difference))
     return found
 
 
-def _surface_figures(views: list[_View]) -> dict[str, float]:
+def _surface_figures(views: list[_RenderedPair]) -> dict[str, float]:
     if not views:
         return {}
     both = np.concatenate([view.difference[np.isfinite(view.difference)] for view in views])

@@ -14,12 +14,12 @@ from scopemap.engine.config import FusionSettings
 from scopemap.engine.depth.under_highlights import depth_under_highlights
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.agreement import surface_agreement, surface_views, vertex_sigmas
+from scopemap.engine.fusion.agreement import rendered_frames, surface_agreement, vertex_sigmas
 from scopemap.engine.fusion.finish import finished, with_normals_alone
+from scopemap.engine.fusion.frame_selection import FrameSelector
 from scopemap.engine.fusion.frame_store import SpreadFrames
-from scopemap.engine.fusion.free_space import FreeSpace, views_among
+from scopemap.engine.fusion.free_space import FreeSpace, reference_frames
 from scopemap.engine.fusion.moving_tissue import MovingTissue, block_edge_mm
-from scopemap.engine.fusion.new_views import NewViews
 from scopemap.engine.fusion.surface_fusion import FusedSurface, SurfaceFusion, depth_notices
 from scopemap.engine.mapping.correction import FinalFrames
 from scopemap.engine.mapping.multiview_depth import KeyframeDepths
@@ -101,7 +101,7 @@ class SegmentFinishing:
     def find_free_space(self) -> None:
         """Find what frames look through; the pixels that show it are left out."""
         if self._fusion.settings.free_space:
-            some = views_among(list(self._final.T_world_camera))
+            some = reference_frames(list(self._final.T_world_camera))
             self._free_space = FreeSpace(self._final.frames(None, among=some))
 
     def corrected(self) -> Iterator[Frame]:
@@ -117,13 +117,13 @@ class SegmentFinishing:
 
     def chosen(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Yield the final frames that show tissue anew; note where tissue moves in all, and some for `check`."""
-        views = NewViews(self._fusion.settings.every)
+        selector = FrameSelector(self._fusion.settings.every)
         for frame in frames:
             if frame.nonrigidity is not None and frame.T_world_camera is not None:
                 usable_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
                 self._moving.put(usable_mm, frame.nonrigidity, frame.camera, frame.T_world_camera)
             self._checked.put(frame)
-            if (chosen := views.chosen(frame)) is not None:
+            if (chosen := selector.chosen(frame)) is not None:
                 yield chosen
 
     def fuse(self, frames: Iterable[Frame]) -> FusedSurface:
@@ -147,9 +147,9 @@ class SegmentFinishing:
         adjusted : what is known of the adjustment of its keyframes, kept or refused; [] where none was tried.
         """
         mesh = fused.mesh
-        views = surface_views(mesh, self._checked.frames(self._fusion.store))
-        agreement = surface_agreement(views, fused.settings)
-        mesh.vertex_attributes["sigma_mm"] = vertex_sigmas(len(mesh.vertices), views)
+        rendered = rendered_frames(mesh, self._checked.frames(self._fusion.store))
+        agreement = surface_agreement(rendered, fused.settings)
+        mesh.vertex_attributes["sigma_mm"] = vertex_sigmas(len(mesh.vertices), rendered)
         is_checked = bool(adjusted) or self._estimators.anchor.is_measured
         notices = adjusted + self._fusion_notices(fused)
         return SegmentSurface(with_normals_alone(mesh), fused.settings, agreement, is_checked, notices)

@@ -182,11 +182,11 @@ def rows_in_memory(_: str, kind: np.dtype) -> Rows:
 def is_constant(rgb: np.ndarray) -> bool:
     """Return whether an image (H, W, 3) uint8 is black or of one colour, up to noise."""
     smooth = cv2.blur(rgb, (_NOISE_WIDTH_PX, _NOISE_WIDTH_PX))
-    low, high = percentiles(cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY), [0.5, 99.5])
+    low, high = percentiles_uint8(cv2.cvtColor(smooth, cv2.COLOR_RGB2GRAY), [0.5, 99.5])
     return bool(high - low <= _CONSTANT_RANGE)
 
 
-def percentiles(levels: np.ndarray, shares: list[float]) -> list[float]:
+def percentiles_uint8(levels: np.ndarray, shares: list[float]) -> list[float]:
     """Return the percentiles (0..100) of values uint8, any shape but not empty, as numpy interpolates them."""
     below = np.cumsum(np.bincount(levels.ravel(), minlength=256))
     found = []

@@ -17,7 +17,7 @@ from scopemap.engine.cameras.camera import CameraModel
 from scopemap.engine.cameras.rectification import StereoPair
 from scopemap.engine.errors import CalibrationError
 
-Views = tuple[np.ndarray, np.ndarray]
+ImagePair = tuple[np.ndarray, np.ndarray]
 
 _LONGEST_SIDE_PX = 800
 _FEATURES = 1500
@@ -33,7 +33,7 @@ _DEPTH_SHARE = 0.15
 
 
 @dataclass(frozen=True)
-class _Reading:
+class _EpipolarFit:
     """Points of a pair in one geometry: spread of their row differences, px, median disparity, px, and depth, mm."""
 
     rows_px: float
@@ -41,7 +41,7 @@ class _Reading:
     depth_mm: float
 
 
-def check_pair(pair: StereoPair, views: Sequence[Views]) -> str:
+def check_pair(pair: StereoPair, views: Sequence[ImagePair]) -> str:
     """Return what could not be decided about a pair, "" where it is good; `views` (h, w, 3) uint8 of the input's size.
 
     Raises `CalibrationError` where the pictures contradict it: rectified already, wrong way round, or of another pair.
@@ -72,22 +72,22 @@ def check_pair(pair: StereoPair, views: Sequence[Views]) -> str:
     return ""
 
 
-def _as_calibrated(pair: StereoPair, left: np.ndarray, right: np.ndarray, scale: float) -> _Reading:
+def _as_calibrated(pair: StereoPair, left: np.ndarray, right: np.ndarray, scale: float) -> _EpipolarFit:
     R_left, R_right, P_left, P_right = pair.rectification((_side(pair, 0, scale), _side(pair, 1, scale)))
     one = _seen(pair.left, left / scale, R_left, P_left)
     other = _seen(pair.right, right / scale, R_right, P_right)
-    return _reading(one, other, float(-P_right[0, 3]))
+    return _epipolar_fit(one, other, float(-P_right[0, 3]))
 
 
-def _as_they_are(pair: StereoPair, left: np.ndarray, right: np.ndarray, scale: float) -> _Reading:
+def _as_they_are(pair: StereoPair, left: np.ndarray, right: np.ndarray, scale: float) -> _EpipolarFit:
     baseline_mm = float(np.linalg.norm(pair.T_right_left[:3, 3]))
-    return _reading(left, right, pair.left.central.fx * scale * baseline_mm)
+    return _epipolar_fit(left, right, pair.left.central.fx * scale * baseline_mm)
 
 
-def _reading(left: np.ndarray, right: np.ndarray, focal_mm: float) -> _Reading:
+def _epipolar_fit(left: np.ndarray, right: np.ndarray, focal_mm: float) -> _EpipolarFit:
     rows, disparity = left[:, 1] - right[:, 1], float(np.nanmedian(left[:, 0] - right[:, 0]))
     depth_mm = focal_mm / disparity if disparity > 0 else float("nan")
-    return _Reading(float(np.nanpercentile(np.abs(rows), _QUARTILE)), disparity, depth_mm)
+    return _EpipolarFit(float(np.nanpercentile(np.abs(rows), _QUARTILE)), disparity, depth_mm)
 
 
 def _seen(camera: CameraModel, pixels: np.ndarray, R: np.ndarray, P: np.ndarray) -> np.ndarray:
@@ -100,7 +100,7 @@ def _side(pair: StereoPair, axis: int, scale: float) -> int:
     return round(scale * (pair.left.central.width, pair.left.central.height)[axis])
 
 
-def _matched(views: Sequence[Views], scale: float) -> Views:
+def _matched(views: Sequence[ImagePair], scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels (N, 2), (N, 2) of points that both views show, at a scale; of one epipolar geometry."""
     sift, matcher = cv2.SIFT.create(_FEATURES), cv2.BFMatcher()
     found: list[tuple[np.ndarray, np.ndarray]] = []
@@ -121,7 +121,7 @@ def _matched(views: Sequence[Views], scale: float) -> Views:
     return np.concatenate([one for one, _ in found]), np.concatenate([other for _, other in found])
 
 
-def _consistent(left: np.ndarray, right: np.ndarray) -> Views:
+def _consistent(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     _, inside = cv2.findFundamentalMat(left, right, cv2.USAC_MAGSAC, _EPIPOLAR_PX, 0.999, 5000)
     if inside is None:
         return left[:0], right[:0]

@@ -102,7 +102,7 @@ def draw_depths(images: Sequence[np.ndarray], depths_mm: Mapping[str, Sequence[n
     `images` are (H, W, 3) uint8, depths (H, W) mm with NaN = unknown, as many of each kind as images. All share one
     colour scale, from the 2nd to the 98th percentile.
     """
-    near_mm, far_mm = percentiles([depth for depths in depths_mm.values() for depth in depths])
+    near_mm, far_mm = colour_range([depth for depths in depths_mm.values() for depth in depths])
     rows = []
     for number, (image, *depths) in enumerate(zip(images, *depths_mm.values(), strict=True)):
         pictures = [colour_depth(depth, near_mm, far_mm) for depth in depths]
@@ -121,8 +121,8 @@ def draw_renderings(pairs: Mapping[int, tuple[np.ndarray, np.ndarray]], file: Pa
     picture_grid(rows, _CELL_PX).save(file)
 
 
-def percentiles(maps: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of the known values, apart; 1 and 2 without any."""
+def colour_range(maps: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return what the ends of a colour map show: the 2nd and 98th percentile of known values; 1 and 2 without any."""
     known = np.concatenate([values[np.isfinite(values)] for values in maps])
     low, high = np.percentile(known, (2, 98)) if len(known) else (1.0, 2.0)
     return float(low), float(max(high, low + 1e-3))

@@ -9,7 +9,7 @@ import av
 import numpy as np
 
 from scopemap.engine.errors import InputError, reporting
-from scopemap.report.mesh_figures import ESTIMATE_COLOUR, MeshView, draw_path, mesh_picture, view_of, zoomed
+from scopemap.report.mesh_figures import ESTIMATE_COLOUR, Viewpoint, draw_path, mesh_picture, view_of, zoomed
 from scopemap.report.scale_bar import draw_scale_bar
 from scopemap.report.sheet import Sheet
 from scopemap.report.shown_mesh import MOST_FACES, simplified, textured_surface
@@ -77,7 +77,7 @@ def _turning(run: Result, frames: int) -> Iterator[np.ndarray]:
         yield sheet.rgb
 
 
-def _largest_zoom(view: MeshView, points: np.ndarray) -> float:
+def _largest_zoom(view: Viewpoint, points: np.ndarray) -> float:
     """Return the factor by which the focal length of a view may grow until a point (N, 3), world mm, leaves it."""
     pixels = view.project(points)[1] - [view.camera.cx, view.camera.cy]
     return float(_FILLED * view.camera.cx / max(np.abs(pixels).max(), 1e-6))

@@ -30,7 +30,7 @@ _MARGIN_PX = 15
 
 
 @dataclass(frozen=True)
-class MeshView:
+class Viewpoint:
     """Viewpoint of a picture of a mesh: pose (4, 4) in the world, mm, and a pinhole camera."""
 
     T_world_camera: np.ndarray
@@ -82,14 +82,14 @@ def _draw_line(sheet: Sheet, places: np.ndarray, colour: str, thickness_px: int)
     sheet.dots(start, colour, 2 + thickness_px)
 
 
-def inside_view(T_world_camera: np.ndarray, field_of_view_rad: float = 1.6) -> MeshView:
+def inside_view(T_world_camera: np.ndarray, field_of_view_rad: float = 1.6) -> Viewpoint:
     """Return the square view of a camera at `T_world_camera` (4, 4)."""
     focal_px = 0.5 * _SIDE_PX / np.tan(0.5 * field_of_view_rad)
     centre_px = 0.5 * (_SIDE_PX - 1)
-    return MeshView(T_world_camera, PinholeCamera(focal_px, focal_px, centre_px, centre_px, _SIDE_PX, _SIDE_PX))
+    return Viewpoint(T_world_camera, PinholeCamera(focal_px, focal_px, centre_px, centre_px, _SIDE_PX, _SIDE_PX))
 
 
-def view_from_behind(T_world_camera: np.ndarray, positions_mm: np.ndarray) -> MeshView:
+def view_from_behind(T_world_camera: np.ndarray, positions_mm: np.ndarray) -> Viewpoint:
     """Return the view along a camera (4, 4) from so far behind that the positions (N, 3), mm, are in view."""
     known = positions_mm[np.isfinite(positions_mm).all(axis=1)]
     R, centre = T_world_camera[:3, :3], T_world_camera[:3, 3]
@@ -99,12 +99,12 @@ def view_from_behind(T_world_camera: np.ndarray, positions_mm: np.ndarray) -> Me
     tangent = 0.8 * 0.5 * (view.camera.width - 1) / view.camera.fx
     needed_mm = np.abs(local[:, :2]).max(axis=1) / tangent - local[:, 2]
     behind_mm = float(needed_mm.max()) + 0.25 * float(np.ptp(local, axis=0).max()) + 1.0
-    return MeshView(se3(R, centre - behind_mm * R[:, 2]), view.camera)
+    return Viewpoint(se3(R, centre - behind_mm * R[:, 2]), view.camera)
 
 
 def outside_views(
     mesh: trimesh.Trimesh, T_world_camera: np.ndarray, positions_mm: np.ndarray | None = None
-) -> Mapping[str, MeshView]:
+) -> Mapping[str, Viewpoint]:
     """Return two views of the whole mesh from opposite sides, upright for the camera at `T_world_camera` (4, 4).
 
     Positions (N, 3), mm, are in view, too; those of NaN do not count.
@@ -118,20 +118,20 @@ def outside_views(
     return {name: view_of(T_world_camera[:3, :3], centre, radius, yaw_rad, -0.45) for name, yaw_rad in sides.items()}
 
 
-def view_of(R: np.ndarray, centre_mm: np.ndarray, radius_mm: float, yaw_rad: float, pitch_rad: float) -> MeshView:
+def view_of(R: np.ndarray, centre_mm: np.ndarray, radius_mm: float, yaw_rad: float, pitch_rad: float) -> Viewpoint:
     """Return a view of a whole ball, rotated from the orientation R (3, 3)."""
     R_view = R @ so3_exp(np.array([0.0, yaw_rad, 0.0])) @ so3_exp(np.array([pitch_rad, 0.0, 0.0]))
     # From 4 radii away the ball fills a field of view of 2 asin(1/4).
     return inside_view(se3(R_view, centre_mm - 4.0 * radius_mm * R_view[:, 2]), 2.1 * float(np.arcsin(0.25)))
 
 
-def zoomed(view: MeshView, factor: float) -> MeshView:
+def zoomed(view: Viewpoint, factor: float) -> Viewpoint:
     """Return a view with its focal length times a factor."""
     camera = view.camera
     return replace(view, camera=replace(camera, fx=factor * camera.fx, fy=factor * camera.fy))
 
 
-def mesh_picture(mesh: trimesh.Trimesh, view: MeshView, *, smooth: bool = True) -> np.ndarray:
+def mesh_picture(mesh: trimesh.Trimesh, view: Viewpoint, *, smooth: bool = True) -> np.ndarray:
     """Return the (H, W, 3) uint8 picture of a mesh, lit by a lamp at the camera, on white.
 
     Both sides of a triangle are drawn; triangles partly behind the camera are left out. A mesh without vertex colours
@@ -166,7 +166,7 @@ def on_white(rendering: Rendering) -> np.ndarray:
 
 
 def draw_path(
-    picture: np.ndarray, view: MeshView, positions_mm: np.ndarray, colour: str, *, thickness_px: int = 2
+    picture: np.ndarray, view: Viewpoint, positions_mm: np.ndarray, colour: str, *, thickness_px: int = 2
 ) -> None:
     """Draw a path of positions (N, 3), world mm, over a picture (H, W, 3) uint8 of a view, in place, its start a dot.
 

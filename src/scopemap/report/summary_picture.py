@@ -19,7 +19,7 @@ from scopemap.report.facts import PicturedFrame, ReportFacts
 from scopemap.report.frame_pictures import WHOLLY_USABLE
 from scopemap.report.mesh_figures import (
     ESTIMATE_COLOUR,
-    MeshView,
+    Viewpoint,
     cropped,
     draw_path,
     inside_view,
@@ -159,7 +159,7 @@ def _mesh_row(run: Result, mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
     return pictures | {"from the middle of the path": inside}
 
 
-def _with_path(mesh: trimesh.Trimesh, view: MeshView, path_mm: np.ndarray, scaled: bool) -> np.ndarray:
+def _with_path(mesh: trimesh.Trimesh, view: Viewpoint, path_mm: np.ndarray, scaled: bool) -> np.ndarray:
     """Return a picture of a mesh and a path; scaled : with a scale bar that holds at the middle of the mesh."""
     picture = mesh_picture(mesh, view, smooth=False)
     draw_path(picture, view, path_mm, ESTIMATE_COLOUR)
@@ -187,7 +187,7 @@ def _submap_rows(facts: ReportFacts) -> list[dict[str, np.ndarray]]:
     return [{t: shown[t] for t in titles[row : row + _COLUMNS]} for row in range(0, len(titles), _COLUMNS)]
 
 
-def _opened(mesh: trimesh.Trimesh, view: MeshView) -> trimesh.Trimesh:
+def _opened(mesh: trimesh.Trimesh, view: Viewpoint) -> trimesh.Trimesh:
     """Return a mesh without the faces that turn their backs to a view: near walls do not hide what is behind them."""
     to_view = view.T_world_camera[:3, 3] - np.asarray(mesh.triangles_center)
     kept = (np.asarray(mesh.face_normals) * to_view).sum(axis=1) > 0

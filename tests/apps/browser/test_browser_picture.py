@@ -37,7 +37,7 @@ def run_of_large_frames(root: Path) -> Path:
 
 def click_on_picture(shown: ShownWindow, page: ResultPage, pixel: tuple[float, float], eye: np.ndarray) -> None:
     """Click on a pixel of the picture in the scene, looking from anywhere, (3,) mm in the camera of the frame."""
-    picture, pose = shown.nodes[PICTURE], pose_of(page._view.index)
+    picture, pose = shown.nodes[PICTURE], pose_of(page._shown.index)
     # Where the picture is and how large is what the browser draws.
     middle = transform(inverse(pose), np.array(picture.position)[None])[0]
     size = np.array([picture.render_width, picture.render_height])

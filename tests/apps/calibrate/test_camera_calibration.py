@@ -20,10 +20,10 @@ from scopemap.apps.calibrate.camera_calibration import (
     with_deviations,
 )
 from scopemap.apps.calibrate.targets import (
-    BoardView,
     CharucoBoard,
     Checkerboard,
     Corners,
+    DetectedBoard,
     Search,
     Target,
     edge_width_px,
@@ -48,7 +48,7 @@ def searched(board: Target, pictures: dict[int, np.ndarray]) -> Search:
         search.looked_at += 1
         if corners is not None:
             width_px = edge_width_px(grey, corners.pixels)
-            search.views.append(BoardView(index, f"{index}.png", corners, width_px))
+            search.views.append(DetectedBoard(index, f"{index}.png", corners, width_px))
     return search
 
 
@@ -119,7 +119,7 @@ def test_deviations_are_as_large_as_errors_also_where_the_plate_bends() -> None:
             # By so much the plate bends from view to view: errors of the corners of one view are alike.
             pixels = studio.corners_px(pose, bow_mm=rng.normal(0, 0.05))
             corners = Corners(CHECKERBOARD.corners_mm, pixels + rng.normal(0, 0.05, pixels.shape))
-            views.append(BoardView(i, "", corners, 1.0))
+            views.append(DetectedBoard(i, "", corners, 1.0))
         fit = with_deviations(fit_camera(views, SIZE, form, near=PINHOLE), views)
         off = np.array(list(fit.parameters.values())) - true
         shares.append(off / np.array(list(fit.deviations.values())))

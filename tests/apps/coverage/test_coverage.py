@@ -16,7 +16,7 @@ import trimesh
 
 from scopemap.apps.coverage.coverage import BLIND, CAUTION, NOT_SEEN, Coverage, coverage, regions
 from scopemap.apps.coverage.layout import Cavity, Lumen, binned
-from scopemap.apps.coverage.unseen import features, views_of
+from scopemap.apps.coverage.unseen import face_visibility, features
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
@@ -144,7 +144,7 @@ def test_the_map_has_the_hole_and_its_table(holed: Path, tmp_path: Path) -> None
 
 def test_the_views_of_a_wall_are_those_of_geometry(whole: Path) -> None:
     run = Result(whole)
-    views = views_of(run, run.mesh)
+    views = face_visibility(run, run.mesh)
     middle = run.mesh.triangles_center
     ring = np.flatnonzero((np.abs(middle[:, 2] - 50) < 3) & (np.abs(middle[:, 0]) > 8))
     # At the edge of the picture, 53 or 47 degrees across, the camera is 15 or 19 mm behind the ring.

@@ -27,7 +27,7 @@ from scopemap.engine.fusion.agreement import (
     FrameAgreement,
     agreement_figures,
     compare_rendering,
-    surface_views,
+    rendered_frames,
     vertex_sigmas,
 )
 from scopemap.engine.geometry.rendering import render_mesh
@@ -187,8 +187,8 @@ def test_a_vertex_is_as_uncertain_as_the_frames_that_see_it() -> None:
         return replace(seen, depth_sigma_mm=np.full((64, 80), 0.3, np.float32), T_world_camera=np.eye(4))
 
     wall = _wall()
-    views = surface_views(wall, [frame(0, 50.0), frame(1, 50.4)])
-    sigmas = vertex_sigmas(len(wall.vertices), views).reshape(68, 84)
+    rendered = rendered_frames(wall, [frame(0, 50.0), frame(1, 50.4)])
+    sigmas = vertex_sigmas(len(wall.vertices), rendered).reshape(68, 84)
     seen = np.isfinite(sigmas)
     assert seen[2:-2, 2:-2].all()
     assert not seen[:1].any()  # outside of the picture

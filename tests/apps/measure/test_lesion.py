@@ -14,7 +14,7 @@ from scopemap.apps.measure.intervals import SIGMAS
 from scopemap.apps.measure.lesion import carried_masks, measure_lesion, shaft_width
 from scopemap.apps.measure.measure import Known, known_scale
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.geometry.lesion_shape import LesionView, extents, view_shape
+from scopemap.engine.geometry.lesion_shape import LesionShape, extents, lesion_shape
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import transform
 from scopemap.result.result import Result
@@ -38,8 +38,8 @@ def hemisphere(aside_mm: float, lean: float) -> tuple[np.ndarray, np.ndarray]:
     return seen, np.where(seen, ball, wall)
 
 
-def shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera = WIDE) -> LesionView:
-    found = view_shape(mask, depth_mm, camera)
+def shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera = WIDE) -> LesionShape:
+    found = lesion_shape(mask, depth_mm, camera)
     assert found is not None
     return found
 
@@ -79,7 +79,7 @@ def test_what_is_behind_an_outline_does_not_count() -> None:
     exact = shape(mask, depth_mm).diameter
     rim = mask & ~(cv2.erode(mask.astype(np.uint8), np.ones((3, 3))) > 0)
     assert shape(mask, np.where(rim, 80.0, depth_mm)).diameter == pytest.approx(exact, rel=0.02)
-    assert view_shape(mask, np.where(mask, np.nan, depth_mm), WIDE) is None
+    assert lesion_shape(mask, np.where(mask, np.nan, depth_mm), WIDE) is None
 
 
 def test_the_width_of_a_shaft_is_that_beside_its_tip(tmp_path: Path) -> None:

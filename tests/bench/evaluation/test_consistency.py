@@ -22,7 +22,7 @@ from scopemap_bench.evaluation.consistency import (
     mean_change,
     projected_depth,
 )
-from tests.support.plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, View, pose, see, true_flow
+from tests.support.plane_scene import CAMERA, EVERYWHERE, PLANE_MM, SIX_PIXELS_MM, PlaneImage, pose, see, true_flow
 
 STILL = [pose()] * 4
 ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0)) for k in range(3)]
@@ -31,7 +31,7 @@ TILTED_ASIDE = [pose(at_mm=(k * SIX_PIXELS_MM, 0.0, 0.0), turn_rad=(0.0, 0.4, 0.
 WANDERING = [pose(at_mm=(k, -k, 0.5 * k), turn_rad=(0.02 * k, 0.03 * k, -0.05 * k)) for k in range(3)]
 
 
-def links(views: list[View], flow_sign: float = 1.0) -> list[FrameCorrespondences | None]:
+def links(views: list[PlaneImage], flow_sign: float = 1.0) -> list[FrameCorrespondences | None]:
     matcher = FrameMatcher(CAMERA)
     flows = [None, *(flow_sign * true_flow(view, before) for before, view in itertools.pairwise(views))]
     return [matcher.match(view.rgb, EVERYWHERE, flow) for view, flow in zip(views, flows, strict=True)]

@@ -14,17 +14,17 @@ from scopemap_bench.evaluation.consistency import (
     orb_features,
 )
 from tests.support import plane_scene as scene
-from tests.support.plane_scene import CAMERA, SIX_PIXELS_MM, View, pose, see, true_flow
+from tests.support.plane_scene import CAMERA, SIX_PIXELS_MM, PlaneImage, pose, see, true_flow
 
 START = see(pose())
 ASIDE = see(pose(at_mm=(SIX_PIXELS_MM, 0.0, 0.0)))
 
 
-def matched(previous: View, current: View) -> Matches:
+def matched(previous: PlaneImage, current: PlaneImage) -> Matches:
     return match_features(orb_features(previous.rgb), orb_features(current.rgb), CAMERA)
 
 
-def exact_matches(previous: View, current: View) -> Matches:
+def exact_matches(previous: PlaneImage, current: PlaneImage) -> Matches:
     """Pixels of `current` on a grid, and where exactly they are in `previous`."""
     v, u = np.mgrid[20:160:20, 20:220:20]
     current_px = np.stack([u.ravel(), v.ravel()], -1)

@@ -12,7 +12,7 @@ import pytest
 from scopemap import open_sequence, reconstruct
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.free_space import FreeSpace, views_among
+from scopemap.engine.fusion.free_space import FreeSpace, reference_frames
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from tests.support.tiny_phantom import FRAMES, with_true_depth, write_tiny
 
@@ -39,7 +39,7 @@ def _frame(index: int, left_mm: float, colour: tuple[int, int, int], pose_error_
 
 def _shares(frames: list[Frame]) -> tuple[float, float]:
     """Return which shares of the strip and of the wall are left out."""
-    free_space = FreeSpace(frames[place] for place in views_among(range(len(frames))))
+    free_space = FreeSpace(frames[place] for place in reference_frames(range(len(frames))))
     kept = np.array([free_space.without(frame).valid for frame in frames])
     front = np.array([frame.depth_mm for frame in frames]) < WALL_MM
     return float((~kept[front]).mean()), float((~kept[~front]).mean())
@@ -105,8 +105,8 @@ def test_depths_that_differ_in_scale_contradict_nothing_by_themselves() -> None:
 
 
 def test_views_are_spread_and_their_number_is_bounded() -> None:
-    assert views_among(range(10)) == list(range(10))
-    some = views_among(range(100_000))
+    assert reference_frames(range(10)) == list(range(10))
+    some = reference_frames(range(100_000))
     assert len(some) == 256
     assert (some[0], some[-1]) == (0, 99_999)
 

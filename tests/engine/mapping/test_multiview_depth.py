@@ -11,7 +11,7 @@ from scopemap.engine.flow.dis import DisFlow
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from scopemap.engine.mapping.multiview_depth import (
     KeyframeDepths,
-    StereoView,
+    PosedImage,
     choose_neighbours,
     normalised_contrast,
     triangulate_depth,
@@ -54,10 +54,10 @@ def _seen(T_world_camera: np.ndarray, shift_mm: float = 0.0) -> tuple[np.ndarray
     return cv2.merge([grey] * 3), ((point - origin) @ T_world_camera[:3, 2]).astype(np.float32)
 
 
-def _view(number: int, error: float | np.ndarray = 0.0, shift_mm: float = 0.0, gain: float = 1.0) -> StereoView:
+def _image(number: int, error: float | np.ndarray = 0.0, shift_mm: float = 0.0, gain: float = 1.0) -> PosedImage:
     rgb, depth_mm = _seen(_pose(number), shift_mm)
     rgb = np.clip(gain * rgb, 0, 255).astype(np.uint8)
-    return StereoView(normalised_contrast(rgb), (depth_mm * np.exp(error)).astype(np.float32), _pose(number))
+    return PosedImage(normalised_contrast(rgb), (depth_mm * np.exp(error)).astype(np.float32), _pose(number))
 
 
 def _bias() -> np.ndarray:
@@ -72,8 +72,8 @@ def _error(depth_mm: np.ndarray) -> float:
 
 
 def test_a_wrong_depth_is_corrected_to_a_fraction() -> None:
-    wrong = _view(MIDDLE, _bias())
-    neighbours = [_view(number, _bias(), gain=0.8 if number % 2 else 1.0) for number in (2, 3, 5, 6)]
+    wrong = _image(MIDDLE, _bias())
+    neighbours = [_image(number, _bias(), gain=0.8 if number % 2 else 1.0) for number in (2, 3, 5, 6)]
     found = triangulate_depth(wrong, neighbours, CAMERA, DisFlow())
     assert _error(wrong.depth_mm) > 0.05
     assert _error(found.depth_mm) < 0.2 * _error(wrong.depth_mm)
@@ -82,31 +82,31 @@ def test_a_wrong_depth_is_corrected_to_a_fraction() -> None:
 
 def test_tissue_that_moves_is_not_triangulated() -> None:
     """The wall slides to and fro by as much as the camera moves: neighbours contradict each other."""
-    neighbours = [_view(number, shift_mm=3.0 * (-1) ** number) for number in (1, 2, 3, 5, 6, 7)]
-    assert triangulate_depth(_view(MIDDLE), neighbours, CAMERA, DisFlow()) is None
+    neighbours = [_image(number, shift_mm=3.0 * (-1) ** number) for number in (1, 2, 3, 5, 6, 7)]
+    assert triangulate_depth(_image(MIDDLE), neighbours, CAMERA, DisFlow()) is None
 
 
 def test_a_wall_without_texture_is_not_triangulated() -> None:
     """Flow sees nothing there, so neighbours would agree on whatever depth they start from."""
-    flat = [_view(number, 0.2)._replace(contrast=np.full((128, 160, 3), 128, np.uint8)) for number in range(2, 7)]
+    flat = [_image(number, 0.2)._replace(contrast=np.full((128, 160, 3), 128, np.uint8)) for number in range(2, 7)]
     assert triangulate_depth(flat[2], [flat[0], flat[1], flat[3], flat[4]], CAMERA, DisFlow()) is None
 
 
 def test_what_one_neighbour_sees_alone_keeps_its_depth() -> None:
-    view, neighbours = _view(MIDDLE, 0.1), [_view(number, 0.1) for number in (2, 3, 5, 6)]
+    image, neighbours = _image(MIDDLE, 0.1), [_image(number, 0.1) for number in (2, 3, 5, 6)]
     for neighbour in neighbours[1:]:
         neighbour.depth_mm[:, :60] = np.nan
-    found = triangulate_depth(view, neighbours, CAMERA, DisFlow())
+    found = triangulate_depth(image, neighbours, CAMERA, DisFlow())
     assert np.abs(found.log_factor[20:-20, 90:140]).mean() > 0.08
     assert np.abs(found.log_factor[20:-20, 12:30]).mean() < 0.06
     assert found.sigma[20:-20, 12:30].mean() > 2 * found.sigma[20:-20, 90:140].mean()
 
 
 def test_one_neighbour_is_not_enough() -> None:
-    assert triangulate_depth(_view(MIDDLE), [_view(2)], CAMERA, DisFlow()) is None
-    blind = _view(6)
+    assert triangulate_depth(_image(MIDDLE), [_image(2)], CAMERA, DisFlow()) is None
+    blind = _image(6)
     blind.depth_mm[:] = np.nan
-    assert triangulate_depth(_view(MIDDLE), [_view(2), blind], CAMERA, DisFlow()) is None
+    assert triangulate_depth(_image(MIDDLE), [_image(2), blind], CAMERA, DisFlow()) is None
 
 
 def test_neighbours_are_on_both_sides_and_have_parallax() -> None:
@@ -129,7 +129,7 @@ def test_frames_and_keyframes_that_fail_take_the_depth_of_the_keyframes_around_t
 
     poses = {number: _pose(number) for number in range(FRAMES)}
     depths = KeyframeDepths(read, poses, [1, MIDDLE, 7], CAMERA, DisFlow())
-    found = [depths.depth(number, _view(number, _bias()).depth_mm) for number in range(FRAMES)]
+    found = [depths.depth(number, _image(number, _bias()).depth_mm) for number in range(FRAMES)]
     depths.close()
     assert depths.notice.values == {"triangulated": 3 if black is None else 2, "keyframes": 3}
     assert all(one is not None for one in found)

@@ -11,7 +11,7 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.engine.tracking.residuals import Loss, View, depth_residuals, normal_equations
+from scopemap.engine.tracking.residuals import Loss, PyramidLevel, depth_residuals, normal_equations
 from scopemap.engine.tracking.track import KeyframeDecision
 from scopemap.engine.tracking.tracker import Tracker
 
@@ -26,17 +26,17 @@ def _plane_mm(normal: np.ndarray, away_mm: float) -> np.ndarray:
     return away_mm / (CAMERA.rays @ normal)
 
 
-def _view(depth_mm: np.ndarray) -> View:
+def _level(depth_mm: np.ndarray) -> PyramidLevel:
     shape = depth_mm.shape
     intrinsics = np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy])
     blank = np.zeros((2, *shape), np.float32)
-    return View(
+    return PyramidLevel(
         blank, np.ones(shape, np.float32), depth_mm.astype(np.float32), np.zeros((*shape, 2), np.float32), intrinsics
     )
 
 
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
-REFERENCE, CURRENT = _view(_plane_mm(np.array([0.26, -0.16, 0.95]), 39.5)), _view(_plane_mm(NORMAL, 40.0))
+REFERENCE, CURRENT = _level(_plane_mm(np.array([0.26, -0.16, 0.95]), 39.5)), _level(_plane_mm(NORMAL, 40.0))
 MOTION = se3_exp(np.array([0.01, -0.02, 0.015, 0.5, -0.3, 0.8]))
 
 
@@ -75,7 +75,7 @@ def test_unknown_depth_edges_and_other_tissue_do_not_count() -> None:
     spoilt = depth_mm.copy()
     spoilt[10:20, 10:20] = np.nan  # unknown
     spoilt[30:40, 30:60] = 60.0  # something else, farther away
-    found = depth_residuals(_view(depth_mm), _view(spoilt), np.eye(4), UNIT_MM)
+    found = depth_residuals(_level(depth_mm), _level(spoilt), np.eye(4), UNIT_MM)
     # Each pixel reads the four around where it lands.
     assert np.isnan(found[9:20, 9:20]).all()
     assert np.isnan(found[29:40, 29:60]).all()

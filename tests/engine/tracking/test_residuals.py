@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scopemap.engine.geometry.se3 import se3_exp
-from scopemap.engine.tracking.residuals import Loss, View, normal_equations, residual_images
+from scopemap.engine.tracking.residuals import Loss, PyramidLevel, normal_equations, residual_images
 
 UNIT_MM = 40.0
 AFFINE = np.array([1.1, 0.05])
@@ -15,7 +15,7 @@ MOTION = se3_exp(np.array([0.01, -0.02, 0.015, 0.5, -0.3, 0.8]))
 HUGE = 1e6  # a Huber threshold beyond all residuals: least squares
 
 
-def _view(seed: int, size: tuple[int, int] = (30, 40)) -> View:
+def _level(seed: int, size: tuple[int, int] = (30, 40)) -> PyramidLevel:
     random = np.random.default_rng(seed)
     images = [cv2.GaussianBlur(random.normal(size=size), (0, 0), 3).astype(np.float32) * 5 for _ in range(2)]
     depth = (UNIT_MM + 8 * cv2.GaussianBlur(random.normal(size=size), (0, 0), 5) * 10).astype(np.float32)
@@ -23,7 +23,7 @@ def _view(seed: int, size: tuple[int, int] = (30, 40)) -> View:
     weight[5:8, 10:14] = 0
     depth[20, 5:9] = np.nan
     slope = 0.002 * random.normal(size=(*size, 2)).astype(np.float32)
-    return View(np.stack(images), weight, depth, slope, np.array([35.0, 36.0, 19.2, 14.8]))
+    return PyramidLevel(np.stack(images), weight, depth, slope, np.array([35.0, 36.0, 19.2, 14.8]))
 
 
 def _loss(threshold: float = HUGE, gamma: float = 0.4, sigma: tuple[float, float] = (1.0, 0.5)) -> Loss:
@@ -46,7 +46,7 @@ def _lamp(points: np.ndarray, moved: np.ndarray, T: np.ndarray, gamma: float) ->
     return (light(moved, normal @ T[:3, :3].T) / light(points, normal)) ** gamma
 
 
-REFERENCE, CURRENT = _view(1), _view(2)
+REFERENCE, CURRENT = _level(1), _level(2)
 
 
 def _moved(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -46,7 +46,7 @@ _KEPT = 10
 _LEAST_PARALLAX_PX = 1.0
 
 
-class _View(NamedTuple):
+class _PosedFrame(NamedTuple):
     """A frame with a pose: its number, (H, W, 3) uint8, its usable pixels (H, W) bool, the pose (4, 4)."""
 
     number: int
@@ -56,7 +56,7 @@ class _View(NamedTuple):
 
 
 class _Matches(NamedTuple):
-    """Pixels (n, 2) of an earlier view and where flow takes them in a later one."""
+    """Pixels (n, 2) of an earlier frame and where flow takes them in a later one."""
 
     past: np.ndarray
     now: np.ndarray
@@ -77,7 +77,7 @@ class FailureMeter:
 
     def __init__(self, camera: PinholeCamera) -> None:
         self._camera, self._flow = camera, DisFlow()
-        self._earlier: deque[_View] = deque(maxlen=_SEARCHED)
+        self._earlier: deque[_PosedFrame] = deque(maxlen=_SEARCHED)
         self._log_depths: deque[float] = deque(maxlen=_KEPT)
         self._off_px: list[float] = []
 
@@ -86,9 +86,9 @@ class FailureMeter:
         if T_world_camera is None:
             self._off_px.append(math.inf)
             return
-        view = _View(len(self._off_px), rgb, valid, T_world_camera)
-        self._off_px.append(self._off(view))
-        self._earlier.append(view)
+        frame = _PosedFrame(len(self._off_px), rgb, valid, T_world_camera)
+        self._off_px.append(self._off(frame))
+        self._earlier.append(frame)
 
     @property
     def is_contradicted(self) -> bool:
@@ -102,13 +102,13 @@ class FailureMeter:
         name = "frames_until_contradicted"
         return {name: counts[LIMIT_PX]} | {f"{name}_at_{limit:g}_px": count for limit, count in counts.items()}
 
-    def _off(self, view: _View) -> float:
+    def _off(self, frame: _PosedFrame) -> float:
         """Return how far flow is from the segments, median, px; infinite where depth jumps, 0 where too few tell."""
-        found = self._moved_from(view)
+        found = self._moved_from(frame)
         if found is None:
             return 0.0
         past, matches = found
-        T_now_past = inverse(view.T_world_camera) @ past.T_world_camera
+        T_now_past = inverse(frame.T_world_camera) @ past.T_world_camera
         rays = self._camera.unproject(matches.past.astype(float)) @ T_now_past[:3, :3].T
         off_px, log_depth = self._compared(rays, matches.now, T_now_past[:3, 3])
         usual = float(np.median(self._log_depths)) if self._log_depths else log_depth
@@ -118,19 +118,19 @@ class FailureMeter:
                 return math.inf
         return off_px
 
-    def _moved_from(self, view: _View) -> tuple[_View, _Matches] | None:
-        """Return the view to compare with, and the matches; None where none has enough. Those before it are forgotten.
+    def _moved_from(self, frame: _PosedFrame) -> tuple[_PosedFrame, _Matches] | None:
+        """Return the frame to compare with, and the matches; None where none has enough. Those before it are forgotten.
 
-        Where too little of it is left in sight, the latest view takes over.
+        Where too little of it is left in sight, the latest frame takes over.
         """
-        earlier = [past for past in self._earlier if view.number - past.number >= _STEP]
-        place, matches = 0, self._matches(earlier[0], view) if earlier else _NO_MATCHES
+        earlier = [past for past in self._earlier if frame.number - past.number >= _STEP]
+        place, matches = 0, self._matches(earlier[0], frame) if earlier else _NO_MATCHES
         if earlier and len(matches.past) < _FEWEST:
-            place, matches = len(earlier) - 1, self._matches(earlier[-1], view)
+            place, matches = len(earlier) - 1, self._matches(earlier[-1], frame)
         if len(matches.past) < _FEWEST:
             return None
         for later in range(place + 1, len(earlier)):
-            closer = self._matches(earlier[later], view)
+            closer = self._matches(earlier[later], frame)
             if closer.motion_px < _MOTION_PX:
                 break
             place, matches = later, closer
@@ -138,11 +138,11 @@ class FailureMeter:
             self._earlier.popleft()
         return earlier[place], matches
 
-    def _matches(self, past: _View, view: _View) -> _Matches:
+    def _matches(self, past: _PosedFrame, frame: _PosedFrame) -> _Matches:
         points = np.argwhere(past.valid)[:, ::-1]
         points = points[(points % _SPACING_PX == _SPACING_PX // 2).all(1)]
-        flows = self._flow.estimate_both(past.rgb, view.rgb)
-        number, pixels = match_corners(points, flows, usable_pixels(view.valid), _CONSISTENCY_PX)
+        flows = self._flow.estimate_both(past.rgb, frame.rgb)
+        number, pixels = match_corners(points, flows, usable_pixels(frame.valid), _CONSISTENCY_PX)
         return _Matches(points[number], pixels)
 
     def _compared(self, rays: np.ndarray, pixels: np.ndarray, t_mm: np.ndarray) -> tuple[float, float]:

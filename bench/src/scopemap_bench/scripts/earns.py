@@ -54,7 +54,7 @@ IDEAS = (
     "tracking.keyframe_choice._MIN_KEYFRAME_MOTION=0.0",  # and for motion
     "tracking.relocalisation._CLOSE_UP_RANGE=0.0",  # a close-up is told from other losses
     "depth.under_highlights._LARGEST=0.0",  # depth under highlights is that around them
-    "fusion.new_views._LEAST_NEW=0.0",  # frames that show nothing anew are not fused
+    "fusion.frame_selection._LEAST_NEW=0.0",  # frames that show nothing anew are not fused
 )
 """Constants of the engine that turn off an idea without a setting: what it does."""
 CLINICAL = (

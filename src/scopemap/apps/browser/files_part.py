@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.shown_result import ShownResult
 from scopemap.apps.browser.window import BrowserWindow, escaped
 from scopemap.apps.export.formats import FORMATS, export_run
 from scopemap.report.page import PAGE, PICTURE, page_to_send
@@ -34,21 +34,21 @@ _BESIDE = (PICTURE, "mesh.ply", "mesh.glb", "trajectory.tum", "frames.csv", "pro
 class FilesPart:
     """Controls of the report and of exports."""
 
-    def __init__(self, view: ResultView) -> None:
-        self._view, window, gui = view, view.window, view.window.gui
-        page = view.whole.folder / PAGE
+    def __init__(self, shown: ShownResult) -> None:
+        self._shown, window, gui = shown, shown.window, shown.window.gui
+        page = shown.whole.folder / PAGE
         window.files.clear()
         if page.is_file() and window.anonymous:
             gui.add_markdown(f"The report, which names the video, is in the result's folder: {PAGE}")
         elif page.is_file():
-            window.files.update({_PLACE + name: view.whole.folder / name for name in (PAGE, *_BESIDE)})
+            window.files.update({_PLACE + name: shown.whole.folder / name for name in (PAGE, *_BESIDE)})
             link = f'<a href="{_PLACE}{PAGE}" target="_blank" rel="noopener" style="color:#228be6">Open the report</a>'
             gui.add_html(f'<div style="margin:4px 8px;font-size:15px">{link}</div>')
             self._on_press("Download the report", partial(self._send, page))
             gui.add_markdown("It is one file to keep, print or send.")
-        if not view.surface.is_empty:
+        if not shown.surface.is_empty:
             self._which = gui.add_markdown("")
-            view.follow(submap=self._say_which, sizes=self._say_which)
+            shown.follow(submap=self._say_which, sizes=self._say_which)
             self._say_which()
             for label, name in _SURFACES.items():
                 self._on_press(label, partial(self._write, name))
@@ -58,23 +58,23 @@ class FilesPart:
         self._words = gui.add_markdown("")
 
     def _say_which(self) -> None:
-        view = self._view
-        self._which.content = escaped(surface_words(view.run))
+        shown = self._shown
+        self._which.content = escaped(surface_words(shown.run))
 
     def _on_press(self, label: str, call: Callable[[Any], None]) -> None:
         """Make a button whose press calls with the browser that it came from."""
-        window = self._view.window
+        window = self._shown.window
         window.gui.add_button(label).on_click(lambda event: window.do(call, event.client))
 
     def _write(self, name: str, client: Any) -> None:
-        run = self._view.run
+        run = self._shown.run
         out = export_place(run.folder, name)
         words = f"writing {out.name}"
-        self._view.window.job(words, writer(run.folder, name, out), lambda found: self._send(out, client))
+        self._shown.window.job(words, writer(run.folder, name, out), lambda found: self._send(out, client))
 
     def _send(self, file: Path, client: Any) -> None:
         """Say where a file or folder is, and send it, a folder as ZIP, to a browser, unless it is too large."""
-        where = f"RESULT/{file.parent.name}/{file.name}" if self._view.window.anonymous else str(file)
+        where = f"RESULT/{file.parent.name}/{file.name}" if self._shown.window.anonymous else str(file)
         parts = [file] if file.is_file() else [part for part in sorted(file.rglob("*")) if part.is_file()]
         is_sent = client is not None and sum(part.stat().st_size for part in parts) <= _MOST_SENT
         if is_sent:
@@ -89,7 +89,7 @@ class FilesPart:
 
     def _name(self, file: Path) -> str:
         """Return the name of a file that is sent: that of the video, and what it is."""
-        video = video_name(self._view.window, self._view.whole)
+        video = video_name(self._shown.window, self._shown.whole)
         ending = file.suffix if file.is_file() else ".zip"
         return f"{video}{ending}" if file.stem.split("_")[0] in _SURFACES.values() else f"{video}_{file.stem}{ending}"
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from scopemap.apps.browser.marks import CLICKED
-from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.shown_result import ShownResult
 from scopemap.apps.browser.surface_colours import is_albedo, looking_frames
 from scopemap.engine.errors import InputError
 from scopemap.engine.fusion.agreement import lit_like
@@ -28,16 +28,16 @@ _MOST_SHARP = 12
 
 
 class FrameImages:
-    """Images of the frames of a result, as `ResultView` shows it."""
+    """Images of the frames of a result, as `ShownResult` shows it."""
 
-    def __init__(self, view: ResultView) -> None:
-        self._view = view
+    def __init__(self, shown: ShownResult) -> None:
+        self._shown = shown
         self._reread: dict[int, np.ndarray] = {}
 
     @cached_property
     def depth_range_mm(self) -> tuple[float, float]:
         """Depth at the ends of the colours: red, blue."""
-        depths = [frame.depth_mm[::4, ::4].ravel() for frame in looking_frames(self._view.whole)]
+        depths = [frame.depth_mm[::4, ::4].ravel() for frame in looking_frames(self._shown.whole)]
         known = np.concatenate([*depths, np.empty(0, np.float32)])
         known = known[np.isfinite(known)]
         near, far = np.percentile(known, _PERCENTILES) if len(known) else (1.0, 100.0)
@@ -47,7 +47,7 @@ class FrameImages:
         """Return the picture (h, w, 3) uint8 of a frame, or that of the nearest one that has one, and its number."""
         if index in self._reread:
             return index, self._reread[index]
-        whole = self._view.whole
+        whole = self._shown.whole
         if not whole.pictured:
             return None
         nearest = min(whole.pictured, key=lambda number: abs(number - index))
@@ -61,7 +61,7 @@ class FrameImages:
         """
         if index not in self._reread:
             try:
-                found = sharp_picture(self._view.whole.folder, index)
+                found = sharp_picture(self._shown.whole.folder, index)
             except InputError:
                 found = None
             if found is None:
@@ -75,18 +75,18 @@ class FrameImages:
 
         Each says what it is. mark : pixel (2,) that is marked in all of them.
         """
-        view, camera = self._view, self._view.whole.camera
-        found, depth_mm, parts = self.picture(index), view.run.depth.read(index), []
+        shown, camera = self._shown, self._shown.whole.camera
+        found, depth_mm, parts = self.picture(index), shown.run.depth.read(index), []
         picture = None if found is None else found[1]
         if found is not None:
             is_own = found[0] == index
             parts.append(("picture" if is_own else f"picture of frame {found[0]}", found[1], is_own))
         if depth_mm is not None:
             near, far = self.depth_range_mm
-            words = depth_words(near, far, scale_known=view.whole.scale_known)
+            words = depth_words(near, far, scale_known=shown.whole.scale_known)
             parts.append((words, colour_depth(depth_mm, near, far), True))
-        if view.pose is not None and not view.surface.is_empty:
-            parts.append(("surface", self._rendered(view.pose, picture, depth_mm), True))
+        if shown.pose is not None and not shown.surface.is_empty:
+            parts.append(("surface", self._rendered(shown.pose, picture, depth_mm), True))
         if not parts:
             return np.full((8, _WIDTH, 3), _EMPTY, np.uint8)
         # Beside each other, so high that there is room for three.
@@ -101,9 +101,9 @@ class FrameImages:
 
     def _rendered(self, pose: np.ndarray, picture: np.ndarray | None, depth_mm: np.ndarray | None) -> np.ndarray:
         """Return the surface (H, W, 3) uint8 from a pose, lit as the lamp lights the picture where that is known."""
-        camera = self._view.whole.camera
-        seen = render_mesh(self._view.surface.mesh, camera, pose)
-        if picture is not None and depth_mm is not None and is_albedo(self._view.run):
+        camera = self._shown.whole.camera
+        seen = render_mesh(self._shown.surface.mesh, camera, pose)
+        if picture is not None and depth_mm is not None and is_albedo(self._shown.run):
             rgb = cv2.resize(picture, (camera.width, camera.height))
             seen = lit_like(seen, camera, rgb, depth_mm)
         return np.where(np.isnan(seen.depth_mm)[..., None], np.array(_EMPTY, np.uint8), seen.rgb)

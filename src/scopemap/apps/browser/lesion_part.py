@@ -8,8 +8,8 @@ import numpy as np
 
 from scopemap.apps.browser.hand_measures import Reference, frame_of_reference, line_on_surface
 from scopemap.apps.browser.marks import draw_marks
-from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.seen_by import corners_in
+from scopemap.apps.browser.shown_result import ShownResult
 from scopemap.apps.browser.shown_surface import ShownSurface, SurfacePick
 from scopemap.apps.measure.hand_measure import HandMeasure, rounded
 from scopemap.apps.measure.lesion import measure_lesion
@@ -27,19 +27,19 @@ class LesionPart:
 
     def __init__(
         self,
-        view: ResultView,
+        shown: ShownResult,
         reference: Callable[[], Reference | None],
         changed: Callable[[], None],
         keep: Callable[[HandMeasure, np.ndarray], None],
     ) -> None:
-        self._view, self._reference = view, reference
+        self._shown, self._reference = shown, reference
         self._changed, self._keep = changed, keep
         self._picks: list[SurfacePick] = []
         self._frame = -1
-        gui = view.window.gui
+        gui = shown.window.gui
         self._name = gui.add_text("Name of the lesion", "", visible=False)
         self._name.hint = "As it is to be found in the list and the report"
-        self._button = view.window.on(gui.add_button("Measure the lesion", visible=False), self._measure)
+        self._button = shown.window.on(gui.add_button("Measure the lesion", visible=False), self._measure)
 
     @property
     def count(self) -> int:
@@ -48,23 +48,23 @@ class LesionPart:
 
     def begin(self, *, shown: bool) -> None:
         """Begin an outline in the frame that is shown, seen from there; or end it, where the mode is another one."""
-        self._picks, self._frame = [], self._view.index
+        self._picks, self._frame = [], self._shown.index
         if shown:
-            if self._view.pose is None:
-                self._view.note("This frame has no pose in this submap: choose a tracked frame first.")
+            if self._shown.pose is None:
+                self._shown.note("This frame has no pose in this submap: choose a tracked frame first.")
             else:
-                self._view.look_from_frame()
-                self._view.note(f"A lesion is outlined in one frame: the view is now that of frame {self._frame}.")
+                self._shown.look_from_frame()
+                self._shown.note(f"A lesion is outlined in one frame: the view is now that of frame {self._frame}.")
         self._show()
 
     def add(self, pick: SurfacePick) -> None:
         """Take a corner that was clicked; of another frame a new outline begins."""
-        if self._view.index != self._frame:
-            self._picks, self._frame = [], self._view.index
-        pixel = corners_in(self._view.surface, self._frame, [pick])[0]
-        camera = self._view.whole.camera
+        if self._shown.index != self._frame:
+            self._picks, self._frame = [], self._shown.index
+        pixel = corners_in(self._shown.surface, self._frame, [pick])[0]
+        camera = self._shown.whole.camera
         if not (np.isfinite(pixel).all() and (pixel >= 0).all() and (pixel < [camera.width, camera.height]).all()):
-            self._view.note(f"Frame {self._frame} does not show this place: press Look from here, in Frames.")
+            self._shown.note(f"Frame {self._frame} does not show this place: press Look from here, in Frames.")
             return
         self._picks.append(pick)
         self._show()
@@ -75,14 +75,14 @@ class LesionPart:
         self._show()
 
     def _show(self) -> None:
-        view = self._view
+        shown = self._shown
         self._button.visible = self._name.visible = len(self._picks) >= _FEWEST
-        points = np.array([view.surface.position(pick) for pick in self._picks])
-        draw_marks(view.window.scene, _OUTLINE, points, view.surface.size_mm)
+        points = np.array([shown.surface.position(pick) for pick in self._picks])
+        draw_marks(shown.window.scene, _OUTLINE, points, shown.surface.size_mm)
         self._changed()
 
     def _measure(self) -> None:
-        surface, frame, picks = self._view.surface, self._frame, [*self._picks]
+        surface, frame, picks = self._shown.surface, self._frame, [*self._picks]
         reference, name = self._reference(), self._name.value.strip()
 
         def measure() -> tuple[HandMeasure, np.ndarray]:
@@ -91,11 +91,11 @@ class LesionPart:
 
         def then(found: tuple[HandMeasure, np.ndarray]) -> None:
             self._picks, self._name.value = [], ""
-            self._view.note(str(found[0].found[0]))
+            self._shown.note(str(found[0].found[0]))
             self._show()
             self._keep(*found)
 
-        self._view.window.job("measuring the lesion", measure, then)
+        self._shown.window.job("measuring the lesion", measure, then)
 
 
 def lesion_by_hand(

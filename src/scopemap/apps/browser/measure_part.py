@@ -18,7 +18,7 @@ from scopemap.apps.browser.lesion_part import LesionPart
 from scopemap.apps.browser.marks import REFERENCE, draw_marks
 from scopemap.apps.browser.measured_list import MeasuredList, short
 from scopemap.apps.browser.picture_part import PicturePart
-from scopemap.apps.browser.result_view import LOOKING, ResultView
+from scopemap.apps.browser.shown_result import LOOKING, ShownResult
 from scopemap.apps.browser.shown_surface import SurfacePick
 from scopemap.apps.browser.window import typed_number
 from scopemap.apps.measure.hand_measure import HandMeasure
@@ -38,8 +38,8 @@ _REFERRED = "/page/reference"
 class MeasurePart:
     """Controls of measuring; `add` takes a place that was clicked. mode : what a click is for."""
 
-    def __init__(self, view: ResultView, images: FrameImages) -> None:
-        self._view, window, gui = view, view.window, view.window.gui
+    def __init__(self, shown: ShownResult, images: FrameImages) -> None:
+        self._shown, window, gui = shown, shown.window, shown.window.gui
         self.mode: Mode = "Look"
         self._picks: list[SurfacePick] = []
         self._reference: Reference | None = None
@@ -49,7 +49,7 @@ class MeasurePart:
         self._back = window.on(gui.add_button(_BACK, visible=False), self._go_to_reference)
         modes = gui.add_button_group("Measure", get_args(Mode)[1:])
         modes.on_click(lambda event: window.do(self._choose, modes.value))
-        self.picture = PicturePart(view, images)
+        self.picture = PicturePart(shown, images)
         self._points = points = gui.add_button_group("Points", ["Undo", "Clear"], visible=False)
         points.on_click(lambda event: window.do(self._take_back, points.value))
         self._area = window.on(gui.add_button("Measure the area", visible=False), self._measure)
@@ -59,15 +59,15 @@ class MeasurePart:
         forget = gui.add_button("Forget the reference", visible=False, color="gray")
         self._forget = window.on(forget, self._forget_reference)
         self._lesion = LesionPart(
-            view, lambda: self._reference, self._say_mode, lambda one, line: self._measured.add(one, line)
+            shown, lambda: self._reference, self._say_mode, lambda one, line: self._measured.add(one, line)
         )
-        self._measured = MeasuredList(view)
-        view.follow(submap=self._follow_surface)
+        self._measured = MeasuredList(shown)
+        shown.follow(submap=self._follow_surface)
         self._follow_surface()
 
     @property
     def _is_known(self) -> bool:
-        return self._view.whole.scale_known or self._reference is not None
+        return self._shown.whole.scale_known or self._reference is not None
 
     def add(self, pick: SurfacePick) -> None:
         """Take a place that was clicked on the surface, by what a click is for."""
@@ -89,7 +89,7 @@ class MeasurePart:
     def _choose(self, mode: str) -> None:
         self.mode = next(known for known in get_args(Mode) if known == mode)
         self._picks, self._is_told = [], False
-        self._view.note("")
+        self._shown.note("")
         self._lesion.begin(shown=self.mode == "Lesion")
         self._show()
 
@@ -101,7 +101,7 @@ class MeasurePart:
         self._show()
 
     def _measure(self) -> None:
-        surface, picks, reference = self._view.surface, [*self._picks], self._reference
+        surface, picks, reference = self._shown.surface, [*self._picks], self._reference
         frame = self.picture.frame
 
         def work() -> tuple[HandMeasure, np.ndarray]:
@@ -113,63 +113,63 @@ class MeasurePart:
             # The ends of a distance stay: of known length, it becomes the reference.
             if self.mode != "Distance":
                 self._picks = []
-            self._view.note(", ".join(f"{found.what}: {short(found)}" for found in one.found))
+            self._shown.note(", ".join(f"{found.what}: {short(found)}" for found in one.found))
             self._show()
             self._measured.add(one, line)
 
-        self._view.window.job("measuring", work, then)
+        self._shown.window.job("measuring", work, then)
 
     def _use_as_reference(self) -> None:
         length_mm, is_empty = typed_number(self._length.value), not self._length.value.strip()
         if not (length_mm > 0 or (is_empty and self._is_told)):
             self._is_told = is_empty
-            self._view.note(_EMPTY if is_empty else "Type the length in mm, such as 2.5.")
+            self._shown.note(_EMPTY if is_empty else "Type the length in mm, such as 2.5.")
             return
         first, second = self._picks
         reference = Reference((first, second), length_mm if length_mm > 0 else None)
         self._measured.keep_reference(reference)
         self._picks, self._length.value = [], ""
         self._refer_to(reference)
-        self._view.note("The reference is set. Now measure with two clicks.")
+        self._shown.note("The reference is set. Now measure with two clicks.")
 
     def _forget_reference(self) -> None:
         self._measured.keep_reference(None)
         self._refer_to(None)
-        self._view.note("The reference is forgotten.")
+        self._shown.note("The reference is forgotten.")
 
     def _refer_to(self, reference: Reference | None) -> None:
         """Use a reference, or none, and say what sizes are by it."""
         self._reference, self._elsewhere = reference, self._measured.kept_reference()[1]
-        self._view.say_sizes("" if reference is None else sizes_by(reference.length_mm))
+        self._shown.say_sizes("" if reference is None else sizes_by(reference.length_mm))
         self._measured.show(reference)
         self._show()
 
     def _follow_surface(self) -> None:
         self._picks = []
         self._refer_to(self._measured.kept_reference()[0])
-        self._view.note(self._where_reference_is())
+        self._shown.note(self._where_reference_is())
         self._lesion.begin(shown=self.mode == "Lesion")
 
     def _where_reference_is(self) -> str:
         """Return on which surface the reference is, where that is another than the one shown; else ""."""
-        one, whole = self._elsewhere, self._view.whole
+        one, whole = self._elsewhere, self._shown.whole
         return "" if one is None else _ELSEWHERE.format(part=part_words(whole, one), back=_BACK)
 
     def _go_to_reference(self) -> None:
         one = self._elsewhere
-        if one is not None and (number := submap_of(self._view.whole, one)) is not None:
-            self._view.show_frame_of(number, one.frame)
+        if one is not None and (number := submap_of(self._shown.whole, one)) is not None:
+            self._shown.show_frame_of(number, one.frame)
 
     def _show(self) -> None:
-        view, picks, scene = self._view, self._picks, self._view.window.scene
+        shown, picks, scene = self._shown, self._picks, self._shown.window.scene
         two = self.mode == "Distance" and len(picks) == 2
         self._length.visible = self._refer.visible = two
         self._forget.visible = self._reference is not None
         elsewhere = self._elsewhere
-        self._back.visible = elsewhere is not None and submap_of(view.whole, elsewhere) is not None
+        self._back.visible = elsewhere is not None and submap_of(shown.whole, elsewhere) is not None
         self._area.visible = self.mode == "Area" and len(picks) >= _FEWEST
         self._hint.content = _CHOOSE if self._is_known else _UNKNOWN
-        size_mm = view.surface.size_mm
+        size_mm = shown.surface.size_mm
         draw_marks(scene, _PICKED, self._places(picks), size_mm)
         reference = self._reference
         ends = self._places(list(reference.picks) if reference else [])
@@ -178,14 +178,14 @@ class MeasurePart:
         self._say_mode()
 
     def _places(self, picks: list[SurfacePick]) -> np.ndarray:
-        return np.array([self._view.surface.position(pick) for pick in picks])
+        return np.array([self._shown.surface.position(pick) for pick in picks])
 
     def _say_mode(self) -> None:
         """Say what the next click does, and offer to take back where there is something."""
         count = self._lesion.count if self.mode == "Lesion" else len(self._picks)
         # They stay where they are: what came up in their place was clicked instead.
         self._points.visible = self.mode != "Look"
-        self._view.clicks_are_for(self._next_click(count))
+        self._shown.clicks_are_for(self._next_click(count))
 
     def _next_click(self, count: int) -> str:
         if self.mode == "Look":

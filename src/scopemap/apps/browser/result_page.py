@@ -12,8 +12,8 @@ from scopemap.apps.browser.frame_images import FrameImages
 from scopemap.apps.browser.frame_part import FramePart
 from scopemap.apps.browser.measure_part import MeasurePart
 from scopemap.apps.browser.next_steps import NextRun, arguments_again
-from scopemap.apps.browser.result_view import ResultView
 from scopemap.apps.browser.run_page import RunPage
+from scopemap.apps.browser.shown_result import ShownResult
 from scopemap.apps.browser.surface_part import SurfacePart
 from scopemap.apps.browser.unseen_part import UnseenPart
 from scopemap.apps.browser.verdict_part import VerdictPart
@@ -43,29 +43,29 @@ class ResultPage:
     def open(self, window: BrowserWindow) -> None:
         """Make the elements."""
         self._window, gui = window, window.gui
-        self._view = view = ResultView(window, self._run, self._workspace)
-        view.add_headline()
-        view.add_note()
+        self._shown = shown = ShownResult(window, self._run, self._workspace)
+        shown.add_headline()
+        shown.add_note()
         self._ways = gui.add_button_group("", self._ways_now())
         self._ways.on_click(lambda event: window.do(self._go, self._ways.value))
-        view.follow(measuring=self._show_ways)
-        images, tabs = FrameImages(view), gui.add_tab_group()
+        shown.follow(measuring=self._show_ways)
+        images, tabs = FrameImages(shown), gui.add_tab_group()
         with tabs.add_tab("Verdict"):
-            VerdictPart(view, self._run_again)
+            VerdictPart(shown, self._run_again)
             self._add_ways_on()
         with tabs.add_tab("Surface"):
-            SurfacePart(view)
+            SurfacePart(shown)
             gui.add_divider()
-            UnseenPart(view)
+            UnseenPart(shown)
         with tabs.add_tab("Frames"):
-            self._frames = FramePart(view, images)
+            self._frames = FramePart(shown, images)
         with tabs.add_tab("Measure"):
-            self._measure = MeasurePart(view, images)
+            self._measure = MeasurePart(shown, images)
         with tabs.add_tab("Files"):
-            FilesPart(view)
+            FilesPart(shown)
         window.scene.on_click()(self._clicked)
-        view.show_row(view.row)
-        view.look_at_all()
+        shown.show_row(shown.row)
+        shown.look_at_all()
 
     def tick(self) -> None:
         """Nothing changes by itself."""
@@ -83,10 +83,10 @@ class ResultPage:
     def click(self, origin: np.ndarray, direction: np.ndarray) -> None:
         """Take a click by its ray, (3,) each, in the world of the submap that is shown, mm."""
         ray, frames = self._measure.picture.ray(origin, direction), self._frames
-        pick = None if ray is None else self._view.surface.pick(*ray)
+        pick = None if ray is None else self._shown.surface.pick(*ray)
         assert frames is not None
         if pick is None:
-            self._view.note("There is no surface there.")
+            self._shown.note("There is no surface there.")
         elif self._measure.mode == "Look":
             frames.list_that_saw(pick)
         else:
@@ -101,15 +101,15 @@ class ResultPage:
         others = {path.name: path for path in workspace.finished if path.resolve() != here}
         if others:
             names = list(others)
-            shown = [f"result {n}" for n in range(1, len(names) + 1)] if window.anonymous else names
-            chosen = gui.add_dropdown("Other result", shown)
+            titles = [f"result {n}" for n in range(1, len(names) + 1)] if window.anonymous else names
+            chosen = gui.add_dropdown("Other result", titles)
             button = gui.add_button("Compare with it")
-            window.on_button(button, lambda: self._compare(others[names[shown.index(chosen.value)]]))
+            window.on_button(button, lambda: self._compare(others[names[titles.index(chosen.value)]]))
 
     def _ways_now(self) -> tuple[str, ...]:
         # Not more than two: they stay in one row, and the tabs where they are.
         first = _WHOLE if self._workspace is None else _BACK
-        return (first, _STOP) if self._view.measuring else (first,)
+        return (first, _STOP) if self._shown.measuring else (first,)
 
     def _show_ways(self) -> None:
         if self._ways.options != self._ways_now():
@@ -119,7 +119,7 @@ class ResultPage:
         if way == _BACK:
             self._window.start()
         elif way == _WHOLE:
-            self._view.look_at_all()
+            self._shown.look_at_all()
         else:
             self._measure.stop()
 

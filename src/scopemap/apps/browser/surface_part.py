@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 
 from scopemap.apps.browser.legends import ramp_html, words_html
-from scopemap.apps.browser.result_view import MODEL, ResultView
 from scopemap.apps.browser.scene import PATH_COLOUR, draw_path, quaternion
+from scopemap.apps.browser.shown_result import MODEL, ShownResult
 from scopemap.apps.browser.shown_surface import facing_of
 from scopemap.apps.browser.surface_colours import Colouring, colourings, in_relief, stops_of
 from scopemap.apps.browser.unlit_mesh import unlit_glb, unlit_textured_glb
@@ -44,7 +44,7 @@ _BORDERED = "White lines: the borders of what was probably not seen."
 
 
 @dataclass(frozen=True)
-class _Covered:
+class _CoveredSurface:
     """The closed surface in the colours of what was seen, and the borders (N, 2, 3) of what was not."""
 
     mesh: trimesh.Trimesh
@@ -61,13 +61,13 @@ class _Covered:
 class SurfacePart:
     """Controls of the surface, which is drawn when they change."""
 
-    def __init__(self, view: ResultView) -> None:
-        self._view, window, gui = view, view.window, view.window.gui
-        self._covered: _Covered | None = None
-        if len(view.whole.submaps) > 1:
-            self._names = [_submap_words(view, number) for number in range(len(view.whole.submaps[:_MOST_SUBMAPS]))]
+    def __init__(self, shown: ShownResult) -> None:
+        self._shown, window, gui = shown, shown.window, shown.window.gui
+        self._covered: _CoveredSurface | None = None
+        if len(shown.whole.submaps) > 1:
+            self._names = [_submap_words(shown, number) for number in range(len(shown.whole.submaps[:_MOST_SUBMAPS]))]
             window.on(gui.add_dropdown("Submap", self._names), self._choose_submap)
-            gui.add_markdown(strip_words(view))
+            gui.add_markdown(strip_words(shown))
         self._by = window.on(gui.add_dropdown("Colour by", self._options()), self._colour)
         self._words = gui.add_markdown("")
         self._legend = gui.add_html("", visible=False)
@@ -77,16 +77,16 @@ class SurfacePart:
         self._frusta = window.on(
             gui.add_checkbox("Camera at keyframes", initial_value=False), lambda value: self._draw_path()
         )
-        window.on(gui.add_button("Look at the whole surface", color="gray"), view.look_at_all)
-        view.follow(submap=self._follow_submap)
+        window.on(gui.add_button("Look at the whole surface", color="gray"), shown.look_at_all)
+        shown.follow(submap=self._follow_submap)
         self._follow_submap()
 
     def _options(self) -> list[str]:
-        found = list(colourings(self._view.surface))
-        return found if self._view.surface.is_empty else [*found, _COVERAGE]
+        found = list(colourings(self._shown.surface))
+        return found if self._shown.surface.is_empty else [*found, _COVERAGE]
 
     def _choose_submap(self, name: str) -> None:
-        self._view.show_submap(self._names.index(name))
+        self._shown.show_submap(self._names.index(name))
 
     def _follow_submap(self) -> None:
         self._by.options = self._options()
@@ -96,9 +96,9 @@ class SurfacePart:
 
     def _colour(self, name: str) -> None:
         if name == _COVERAGE:
-            self._view.coverage(self._paint_coverage)
+            self._shown.coverage(self._paint_coverage)
             return
-        found = colourings(self._view.surface)[name]()
+        found = colourings(self._shown.surface)[name]()
         self._explain(found)
         self._covered, self._colouring = None, found
         self._draw()
@@ -115,13 +115,13 @@ class SurfacePart:
         painted = simplified(part, _MOST_FACES)
         self._legend.content, self._legend.visible = words_html(legend_of(found.classes)), True
         self._words.content = f"{_CLOSED} {_BORDERED}" if found.unseen_faces.any() else _CLOSED
-        cameras = self._view.run.tracked["T_world_camera"][:, :3, 3]
+        cameras = self._shown.run.tracked["T_world_camera"][:, :3, 3]
         colours = np.asarray(vertex_colours(painted)[:, :3])
-        self._covered = _Covered(painted, colours, facing_of(painted, cameras), unseen_borders(found, cameras))
+        self._covered = _CoveredSurface(painted, colours, facing_of(painted, cameras), unseen_borders(found, cameras))
         self._draw()
 
     def _draw(self) -> None:
-        surface, scene = self._view.surface, self._view.window.scene
+        surface, scene = self._shown.surface, self._shown.window.scene
         if surface.is_empty:
             scene.remove_by_name(_SURFACE)
             self._words.content = "There is no surface."
@@ -135,7 +135,7 @@ class SurfacePart:
 
     def _coloured(self) -> bytes:
         """Return the surface as GLB: with its texture, or with the colours that mean something."""
-        surface, relief = self._view.surface, self._relief.value
+        surface, relief = self._shown.surface, self._relief.value
         found = self._colouring
         if found.picture and (textured := surface.textured) is not None:
             return unlit_textured_glb(textured, surface.texture(pale=found.pale, relief=relief))
@@ -143,8 +143,8 @@ class SurfacePart:
         return unlit_glb(surface.vertices, surface.faces, in_relief(surface.facing, colours) if relief else colours)
 
     def _draw_path(self) -> None:
-        view, scene = self._view, self._view.window.scene
-        tracked = view.run.tracked
+        shown, scene = self._shown, self._shown.window.scene
+        tracked = shown.run.tracked
         poses = tracked["T_world_camera"]
         scene.remove_by_name(_PATH)
         scene.remove_by_name(_KEYFRAMES)
@@ -155,9 +155,9 @@ class SurfacePart:
             for row in keyframes[:: -(-len(keyframes) // _MOST_FRUSTA) or 1]:
                 scene.add_camera_frustum(
                     f"{_KEYFRAMES}/{row}",
-                    view.vertical_fov,
-                    view.whole.camera.width / view.whole.camera.height,
-                    scale=_FRUSTUM_SHARE * view.surface.size_mm,
+                    shown.vertical_fov,
+                    shown.whole.camera.width / shown.whole.camera.height,
+                    scale=_FRUSTUM_SHARE * shown.surface.size_mm,
                     color=PATH_COLOUR,
                     thickness=1.5,
                     thickness_units="screen",
@@ -168,16 +168,16 @@ class SurfacePart:
                 )
 
 
-def strip_words(view: ResultView) -> str:
+def strip_words(shown: ShownResult) -> str:
     """Return in words which part of the video is in which submap."""
-    times_s = view.whole.frames["time_s"]
+    times_s = shown.whole.frames["time_s"]
     parts = [
         f"{times_s[part.first]:.1f} to {times_s[part.last]:.1f} s: submap {part.submap + 1}"
-        for part in video_parts(view.whole)
+        for part in video_parts(shown.whole)
     ]
     return "Parts of the video: " + "; ".join(parts) + ". The submaps' relative poses are unknown."
 
 
-def _submap_words(view: ResultView, number: int) -> str:
-    count, submap = int((view.whole.frames.submap == number).sum()), view.whole.submaps[number]
+def _submap_words(shown: ShownResult, number: int) -> str:
+    count, submap = int((shown.whole.frames.submap == number).sum()), shown.whole.submaps[number]
     return f"{number + 1}: {count} frames, {LEVEL_WORDS[level_of_submap(submap)]}"

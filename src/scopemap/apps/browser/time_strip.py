@@ -6,7 +6,7 @@ import html
 
 import numpy as np
 
-from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.shown_result import ShownResult
 from scopemap.report.sheet import rgb_of
 from scopemap.report.summary_picture import TONES
 from scopemap.result.frame_table import ROTATED
@@ -28,11 +28,11 @@ _COLOURS = {
 class TimeStrip:
     """The strip of a result: a picture of it, and what its colours mean."""
 
-    def __init__(self, view: ResultView) -> None:
-        self._view, frames = view, view.whole.frames.only(np.array(view.rows, int))
+    def __init__(self, shown: ShownResult) -> None:
+        self._shown, frames = shown, shown.whole.frames.only(np.array(shown.rows, int))
         self._kinds: list[str] = []
         self._borders: list[int] = []
-        levels, last = [one.level for one in view.whole.segments], -1
+        levels, last = [one.level for one in shown.whole.segments], -1
         for submap, segment in zip(frames.submap.tolist(), frames["segment"].tolist(), strict=True):
             kind = "rotation only" if submap == ROTATED else "lost" if submap < 0 else "in another submap"
             if submap == 0:
@@ -46,10 +46,10 @@ class TimeStrip:
     def legend(self) -> str:
         """The colours that occur, as HTML in one line."""
         box = '<span style="display:inline-block;width:11px;height:11px;margin:0 5px 0 12px;background:'
-        shown = [
+        boxes = [
             f'{box}{colour}"></span>{html.escape(kind)}' for kind, colour in _COLOURS.items() if kind in self._kinds
         ]
-        return f'<div style="font-size:12px;line-height:1">{"".join(shown)}</div>'
+        return f'<div style="font-size:12px;line-height:1">{"".join(boxes)}</div>'
 
     def picture(self) -> np.ndarray:
         """Return the strip, (18, 1440, 3) uint8, with a dark line at the frame that is shown; segments are apart."""
@@ -60,8 +60,8 @@ class TimeStrip:
         for border in self._borders:
             at = border * width // len(self._kinds)
             out[:, max(at - 1, 0) : at + 2] = 255
-        if self._view.row in self._view.rows:
-            at = (2 * self._view.rows.index(self._view.row) + 1) * width // (2 * len(self._kinds))
+        if self._shown.row in self._shown.rows:
+            at = (2 * self._shown.rows.index(self._shown.row) + 1) * width // (2 * len(self._kinds))
             out[:, max(at - _CURSOR_PX, 0) : at + _CURSOR_PX] = 255
             out[:, max(at - _CURSOR_PX // 2, 0) : at + _CURSOR_PX // 2] = 0
         return out

@@ -12,7 +12,7 @@ import trimesh
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.shown_result import ShownResult
 from scopemap.apps.browser.window import escaped
 
 if TYPE_CHECKING:
@@ -35,47 +35,47 @@ _LIFT = 0.01
 class UnseenPart:
     """Controls of what was not seen."""
 
-    def __init__(self, view: ResultView) -> None:
-        self._view, gui = view, view.window.gui
-        self._ask = view.window.on(
-            gui.add_button("What was not seen", disabled=view.surface.is_empty),
-            lambda: view.coverage(self._list),
+    def __init__(self, shown: ShownResult) -> None:
+        self._shown, gui = shown, shown.window.gui
+        self._ask = shown.window.on(
+            gui.add_button("What was not seen", disabled=shown.surface.is_empty),
+            lambda: shown.coverage(self._list),
         )
         self._words = gui.add_markdown("It takes some seconds. Colour by coverage shows it on the surface.")
         self._outer = gui.add_folder(None, visible=False)
         with self._outer:
             self._place = gui.add_folder(None)
-        self._number = view.number
-        view.follow(submap=self._follow_surface)
+        self._number = shown.number
+        shown.follow(submap=self._follow_surface)
 
     def _follow_surface(self) -> None:
         """Forget what is said of another submap; that of another segment's time stays: it is of the whole submap."""
-        self._view.window.scene.remove_by_name(_MARK)
-        if self._number != self._view.number:
-            self._number = self._view.number
+        self._shown.window.scene.remove_by_name(_MARK)
+        if self._number != self._shown.number:
+            self._number = self._shown.number
             self._clear()
 
     def _clear(self) -> None:
         self._place.remove()
         with self._outer:
-            self._place = self._view.window.gui.add_folder(None, visible=False)
-        self._view.window.scene.remove_by_name(_MARK)
-        self._ask.disabled, self._words.content = self._view.surface.is_empty, ""
+            self._place = self._shown.window.gui.add_folder(None, visible=False)
+        self._shown.window.scene.remove_by_name(_MARK)
+        self._ask.disabled, self._words.content = self._shown.surface.is_empty, ""
         self._outer.visible = False
 
     def _list(self, found: Coverage) -> None:
         self._clear()
-        shown = found.spots[:_MOST_LISTED]
-        largest = f" The largest {len(shown)}:" if len(found.spots) > len(shown) else ""
+        listed = found.spots[:_MOST_LISTED]
+        largest = f" The largest {len(listed)}:" if len(found.spots) > len(listed) else ""
         self._words.content = escaped(f"{found.statement}{largest}")
-        large = [spot for spot in shown if share_of(found, spot) >= _LEAST_SHARE]
-        small = shown[len(large) :]
+        large = [spot for spot in listed if share_of(found, spot) >= _LEAST_SHARE]
+        small = listed[len(large) :]
         self._outer.visible = self._place.visible = True
         with self._place:
-            self._view.window.gui.add_image(map_picture(found), label=_MAPS[found.layout.kind])
+            self._shown.window.gui.add_image(map_picture(found), label=_MAPS[found.layout.kind])
             self._add(found, large, 1)
             if small:
-                with self._view.window.gui.add_folder(f"{len(small)} smaller", expand_by_default=False):
+                with self._shown.window.gui.add_folder(f"{len(small)} smaller", expand_by_default=False):
                     self._add(found, small, len(large) + 1)
 
     def _add(self, found: Coverage, spots: Sequence[BlindSpot], first: int) -> None:
@@ -85,18 +85,18 @@ class UnseenPart:
             label = f"{number}. near frame {spot.frame}, {share} % of what was not seen"
             area = f"{np.format_float_positional(float(f'{spot.area:.3g}'), trim='-')} mm² "
             hint = f"{area if found.unit == 'mm' else ''}{spot.where(along)}"
-            button = self._view.window.gui.add_button(label, hint=hint, color="gray")
-            self._view.window.on(button, self._fly, number, spot, found)
+            button = self._shown.window.gui.add_button(label, hint=hint, color="gray")
+            self._shown.window.on(button, self._fly, number, spot, found)
 
     def _fly(self, number: int, spot: BlindSpot, found: Coverage) -> None:
-        view, place = self._view, unseen_place(found, spot)
-        view.show_frame(spot.frame)
-        view.look_from_spot(place)
-        scene = view.window.scene
+        shown, place = self._shown, unseen_place(found, spot)
+        shown.show_frame(spot.frame)
+        shown.look_from_spot(place)
+        scene = shown.window.scene
         lines = unseen_outline(found, place)
         scene.add_line_segments(f"{_MARK}/outline", lines, _INK, thickness=4.0, thickness_units="screen")
         scene.add_label(f"{_MARK}/words", f"blind spot {number}", position=tuple(place), anchor="bottom-center")
-        view.note(f"Blind spot {number}, seen from frame {spot.frame}, the nearest.")
+        shown.note(f"Blind spot {number}, seen from frame {spot.frame}, the nearest.")
 
 
 def share_of(found: Coverage, spot: BlindSpot) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from scopemap.apps.browser.next_steps import NextRun, next_runs, source_of
-from scopemap.apps.browser.result_view import ResultView
+from scopemap.apps.browser.shown_result import ShownResult
 from scopemap.apps.browser.window import escaped, typed_number
 from scopemap.engine.notices import Level
 from scopemap.report.plain_step import plain_step
@@ -21,10 +21,10 @@ _CHOOSE = "choose"
 class VerdictPart:
     """The facts, the cautions and the notes; `again` is called with an option and its value where one is chosen."""
 
-    def __init__(self, view: ResultView, again: Callable[[NextRun, str], None]) -> None:
-        self._view, self._again = view, again
-        gui, found = view.window.gui, verdict(view.whole)
-        self._can_run = view.workspace is not None and source_of(view.whole) is not None
+    def __init__(self, shown: ShownResult, again: Callable[[NextRun, str], None]) -> None:
+        self._shown, self._again = shown, again
+        gui, found = shown.window.gui, verdict(shown.whole)
+        self._can_run = shown.workspace is not None and source_of(shown.whole) is not None
         if found.level == "good":
             gui.add_markdown(_GOOD)
         for reason in found.reasons:
@@ -41,24 +41,24 @@ class VerdictPart:
         if self._can_run:
             self._improve(found.reasons)
         with gui.add_folder("Details", expand_by_default=False):
-            facts = summary_facts(view.whole).items()
+            facts = summary_facts(shown.whole).items()
             gui.add_markdown("\n".join(f"- **{name}**: {escaped(fact)}" for name, fact in facts))
 
     def _add(self, reason: Reason) -> None:
         words = " ".join(filter(None, (reason.text, plain_step(reason.next_step))))
-        self._view.window.gui.add_markdown(f"**{_NAMES[reason.level]}.** {escaped(words)}")
+        self._shown.window.gui.add_markdown(f"**{_NAMES[reason.level]}.** {escaped(words)}")
 
     def _improve(self, reasons: list[Reason]) -> None:
         """Offer the runs that the reasons name, each option once."""
-        runs = [run for reason in reasons for run in next_runs(reason.next_step, self._view.whole)]
+        runs = [run for reason in reasons for run in next_runs(reason.next_step, self._shown.whole)]
         offered = {(run.option, run.choices): run for run in runs}
         if offered:
-            with self._view.window.gui.add_folder("Improve this result"):
+            with self._shown.window.gui.add_folder("Improve this result"):
                 for run in offered.values():
                     self._offer(run)
 
     def _offer(self, run: NextRun) -> None:
-        gui, window = self._view.window.gui, self._view.window
+        gui, window = self._shown.window.gui, self._shown.window
         if run.number is not None:
             number = gui.add_text(run.question, "")
             window.on(gui.add_button(run.label()), lambda: self._again_with(run, number.value))
@@ -74,9 +74,9 @@ class VerdictPart:
     def _again_chosen(self, run: NextRun, value: str) -> None:
         """Start the run with what was chosen, if something was."""
         if value == _CHOOSE:
-            self._view.note(f"{run.question} Choose one first.")
+            self._shown.note(f"{run.question} Choose one first.")
         elif value == run.stated:
-            self._view.note(f"This result was run as: {value}. Choose another endoscope first.")
+            self._shown.note(f"This result was run as: {value}. Choose another endoscope first.")
         else:
             self._again(run, value)
 
@@ -88,4 +88,4 @@ class VerdictPart:
         if low <= value <= high:
             self._again(run, f"{value:g}")
         else:
-            self._view.note(f"{run.question}: type a number from {low:g} to {high:g} first.")
+            self._shown.note(f"{run.question}: type a number from {low:g} to {high:g} first.")

@@ -10,7 +10,15 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from scopemap.apps.calibrate.targets import BoardView, Corners, LeftOut, Search, Target, select_views, views_per_pixel
+from scopemap.apps.calibrate.targets import (
+    Corners,
+    DetectedBoard,
+    LeftOut,
+    Search,
+    Target,
+    select_views,
+    views_per_pixel,
+)
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.lenses import FisheyeCamera, OpenCvCamera
 from scopemap.engine.errors import CalibrationError, InputError
@@ -94,7 +102,9 @@ class Fit:
         return {name: float(known[name]) for name in ("fx", "fy", "cx", "cy", *self.form.terms)}
 
 
-def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, near: CameraModel | None = None) -> Fit:
+def fit_camera(
+    views: list[DetectedBoard], size: tuple[int, int], form: LensForm, near: CameraModel | None = None
+) -> Fit:
     """Return the camera of `form` with the smallest reprojection error, from `near` or several starts."""
     w, h = size
     starts: list[PinholeCamera | None] = [near.central] if near is not None else []
@@ -114,7 +124,7 @@ def fit_camera(views: list[BoardView], size: tuple[int, int], form: LensForm, ne
     return best
 
 
-def with_deviations(fit: Fit, views: list[BoardView]) -> Fit:
+def with_deviations(fit: Fit, views: list[DetectedBoard]) -> Fit:
     """Return `fit` with standard deviations by the bootstrap (Efron 1979): fits to resampled views, 20 of them."""
     size, rng = (fit.camera.width, fit.camera.height), np.random.default_rng(0)
     drawn = [[views[i] for i in rng.integers(0, len(views), len(views))] for _ in range(_RESAMPLES)]
@@ -138,7 +148,7 @@ def choose_form(errors_px: dict[LensForm, float]) -> LensForm:
     return best
 
 
-def held_out_error_px(views: list[BoardView], size: tuple[int, int], form: LensForm, near: CameraModel) -> float:
+def held_out_error_px(views: list[DetectedBoard], size: tuple[int, int], form: LensForm, near: CameraModel) -> float:
     """Return the RMS reprojection error, px, in views that the form was not fitted to (5 folds); inf: a fit failed."""
     try:
         fit = fit_camera(views, size, form, near)
@@ -154,8 +164,8 @@ def held_out_error_px(views: list[BoardView], size: tuple[int, int], form: LensF
 
 
 def without_outliers(
-    views: list[BoardView], size: tuple[int, int], form: LensForm
-) -> tuple[list[BoardView], list[LeftOut]]:
+    views: list[DetectedBoard], size: tuple[int, int], form: LensForm
+) -> tuple[list[DetectedBoard], list[LeftOut]]:
     """Return the views that agree on a camera of `form`, without stray corners, and the others: a third at most."""
     kept, out = list(views), list[LeftOut]()
     while True:
@@ -172,7 +182,9 @@ def without_outliers(
     return [view for view in kept if len(view.corners) >= _FEWEST_CORNERS], out
 
 
-def _attempt(views: list[BoardView], size: tuple[int, int], form: LensForm, start: PinholeCamera | None) -> Fit | None:
+def _attempt(
+    views: list[DetectedBoard], size: tuple[int, int], form: LensForm, start: PinholeCamera | None
+) -> Fit | None:
     """Return OpenCV's fit from `start`, None: its own guess; None where it fails."""
     # Rows, not columns: OpenCV 5 fits no fisheye to columns.
     boards = [view.corners.board_mm.astype(np.float32)[None] for view in views]
@@ -243,7 +255,7 @@ class CameraCalibration:
     """
 
     fit: Fit
-    views: list[BoardView]
+    views: list[DetectedBoard]
     held_out_px: dict[LensForm, float]
     left_out: list[LeftOut]
     blurred: list[LeftOut]
@@ -352,6 +364,6 @@ def warnings_about(fit: Fit, covered: float) -> list[str]:
     return found
 
 
-def _check_count(views: list[BoardView], found: str, advice: str) -> None:
+def _check_count(views: list[DetectedBoard], found: str, advice: str) -> None:
     if len(views) < FEWEST_VIEWS:
         raise InputError(f"calibrating: {found}, at least {FEWEST_VIEWS} needed: {advice}")

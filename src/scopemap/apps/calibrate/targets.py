@@ -179,7 +179,7 @@ Listener = Callable[[int, int | None], None]
 
 
 @dataclass(frozen=True)
-class BoardView:
+class DetectedBoard:
     """The target in one frame: number and file ("" for none) of the frame, corners, width of their edges in px."""
 
     index: int
@@ -195,14 +195,14 @@ class Search:
     size: tuple[int, int]
     every: int = 1
     looked_at: int = 0
-    views: list[BoardView] = field(default_factory=list)
+    views: list[DetectedBoard] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class LeftOut:
     """A view that was not used, and why."""
 
-    view: BoardView
+    view: DetectedBoard
     reason: str
 
 
@@ -231,7 +231,7 @@ def find_views(
         grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         corners = target.find(grey)
         if corners is not None:
-            search.views.append(BoardView(frame.index, frame.name, corners, edge_width_px(grey, corners.pixels)))
+            search.views.append(DetectedBoard(frame.index, frame.name, corners, edge_width_px(grey, corners.pixels)))
         if listener is not None:
             listener(search.looked_at, total)
     return search
@@ -248,7 +248,7 @@ def edge_width_px(grey: np.ndarray, pixels: np.ndarray) -> float:
     return float(np.median(widths[v, u]))
 
 
-def select_views(views: list[BoardView], size: tuple[int, int]) -> tuple[list[BoardView], list[LeftOut]]:
+def select_views(views: list[DetectedBoard], size: tuple[int, int]) -> tuple[list[DetectedBoard], list[LeftOut]]:
     """Return at most 40 sharp `views` of frames of `size` (width, height) that differ, and the blurred ones."""
     edge_px = np.array([view.edge_px for view in views])
     usual = float(np.percentile(edge_px, 25))
@@ -274,7 +274,7 @@ def select_views(views: list[BoardView], size: tuple[int, int]) -> tuple[list[Bo
     return [sharp[i] for i in chosen], blurred
 
 
-def views_per_pixel(views: list[BoardView], size: tuple[int, int], across: int = 160) -> np.ndarray:
+def views_per_pixel(views: list[DetectedBoard], size: tuple[int, int], across: int = 160) -> np.ndarray:
     """Return how many views have a pixel within their corners: (h, w) int, the image on a grid `across` wide."""
     scale = across / size[0]
     count = np.zeros((max(1, round(size[1] * scale)), across), dtype=int)
@@ -284,14 +284,14 @@ def views_per_pixel(views: list[BoardView], size: tuple[int, int], across: int =
     return count
 
 
-def _pose(view: BoardView, size: tuple[int, int]) -> np.ndarray:
+def _pose(view: DetectedBoard, size: tuple[int, int]) -> np.ndarray:
     """Position (2), log extent, and elongation (2), which changes with the tilt, of the target in the image."""
     pixels = view.corners.pixels / np.sqrt(size[0] * size[1])
     (xx, xy), (_, yy) = np.cov(pixels.T)
     return np.array([*pixels.mean(axis=0), 0.5 * np.log(xx + yy), (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
 
 
-def _cells(view: BoardView, size: tuple[int, int]) -> np.ndarray:
+def _cells(view: DetectedBoard, size: tuple[int, int]) -> np.ndarray:
     """Which cells of a grid over the image hold a corner, flat bool."""
     bins = (_CELLS_ACROSS, max(1, round(_CELLS_ACROSS * size[1] / size[0])))
     x, y = view.corners.pixels.T

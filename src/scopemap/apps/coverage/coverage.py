@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter, label
 from scipy.spatial import cKDTree
 
 from scopemap.apps.coverage.layout import CLOCK_BINS, Layout, binned, column_of, examined_space
-from scopemap.apps.coverage.unseen import Views, features, unseen_probability, views_of
+from scopemap.apps.coverage.unseen import FaceVisibility, face_visibility, features, unseen_probability
 from scopemap.apps.measure.measure import Measure
 from scopemap.apps.measure.surface_finding import SurfaceFinding
 from scopemap.engine.errors import InputError, reporting
@@ -255,7 +255,7 @@ def coverage(result: Result | Path | str) -> Coverage:
     run = _checked(result)
     space = examined_space(run)
     surface, layout, row, hours, inside = space.surface, space.layout, space.row, space.hours, space.inside
-    tracked, views = run.frames.only(run.frames.tracked), views_of(run, surface)
+    tracked, views = run.frames.only(run.frames.tracked), face_visibility(run, surface)
     known = features(surface, views, space.present, layout)
     counted = np.flatnonzero((row >= 0) & (row < len(inside)) & (space.area > 0))
     counted = counted[inside[row[counted], column_of(hours[counted])]]
@@ -323,7 +323,9 @@ def _share(faces: _Faces, first: int, last: int, step: float, odds: float, lower
     return Share(first * step, last * step, share, max(low - lower, 0.0), high, hidden + seen)
 
 
-def _chart(faces: _Faces, inside: np.ndarray, views: Views, counted: np.ndarray, layout: Layout) -> CoverageMap:
+def _chart(
+    faces: _Faces, inside: np.ndarray, views: FaceVisibility, counted: np.ndarray, layout: Layout
+) -> CoverageMap:
     """Return the map, whose spots are numbered in no order; counted : numbers of the faces in the views."""
 
     def sums(weights: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ WEIGHTS = np.array([2.165, -5.401, 0.102, -0.571, -0.147, -1.902])
 
 
 @dataclass(frozen=True)
-class Views:
+class FaceVisibility:
     """How frames see the faces (F,) of a surface.
 
     cosine : the largest of the angle between normal and line of sight, 0 where none sees the face. jump : the smallest
@@ -44,7 +44,7 @@ class Views:
     share: np.ndarray
 
 
-def views_of(run: Result, surface: trimesh.Trimesh) -> Views:
+def face_visibility(run: Result, surface: trimesh.Trimesh) -> FaceVisibility:
     """Return how the tracked frames of a run whose depth it kept, at most 200 of them, see a surface, world mm."""
     centres, normals, camera = surface.triangles_center, surface.face_normals, run.camera
     cosine, share = np.zeros((2, len(centres)))
@@ -72,7 +72,7 @@ def views_of(run: Result, surface: trimesh.Trimesh) -> Views:
         distance_mm[seen] = np.minimum(distance_mm[seen], length)
         jump[seen] = np.minimum(jump[seen], _depth_range(depth_mm, camera.fx)[pixel])
         share[seen] += 1 / len(frames)
-    return Views(cosine, jump, distance_mm, share)
+    return FaceVisibility(cosine, jump, distance_mm, share)
 
 
 def _depth_range(depth_mm: np.ndarray, focal_px: float) -> np.ndarray:
@@ -88,15 +88,15 @@ def _depth_range(depth_mm: np.ndarray, focal_px: float) -> np.ndarray:
     return np.asarray((high - low) * (_JUMP_RAD * focal_px / size))
 
 
-def features(surface: trimesh.Trimesh, views: Views, present: np.ndarray, layout: Layout) -> np.ndarray:
+def features(surface: trimesh.Trimesh, seen: FaceVisibility, present: np.ndarray, layout: Layout) -> np.ndarray:
     """Return what the regression is of, (F, 6): the first three but the constant are means over a face's surroundings.
 
     present : (F,) bool, whether the run's own surface is there. layout : its radius is the unit of distances.
     """
-    jump = np.log(np.clip(views.jump, *_JUMPS))
-    around = _smoothed(surface, np.column_stack([views.cosine, jump, present]))
-    radii = np.minimum(views.distance_mm / layout.radius_mm, _MOST_RADII)
-    in_cavity = present & (views.share > 0) & (layout.kind == "cavity")
+    jump = np.log(np.clip(seen.jump, *_JUMPS))
+    around = _smoothed(surface, np.column_stack([seen.cosine, jump, present]))
+    radii = np.minimum(seen.distance_mm / layout.radius_mm, _MOST_RADII)
+    in_cavity = present & (seen.share > 0) & (layout.kind == "cavity")
     return np.column_stack([np.ones(len(radii)), around, radii, in_cavity])
 
 

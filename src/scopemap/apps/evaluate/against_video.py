@@ -21,9 +21,9 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.agreement import FrameAgreement, agreement_figures, compare_rendering, lit_like
 from scopemap.engine.fusion.finish import finished
+from scopemap.engine.fusion.frame_selection import FrameSelector
 from scopemap.engine.fusion.frame_store import FrameStore
-from scopemap.engine.fusion.free_space import FreeSpace, views_among
-from scopemap.engine.fusion.new_views import NewViews
+from scopemap.engine.fusion.free_space import FreeSpace, reference_frames
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion
 from scopemap.engine.geometry.rendering import Rendering, render_mesh, render_points
 from scopemap.engine.geometry.se3 import transform
@@ -113,8 +113,8 @@ class RunFrames:
                 self._store.put(replace(frame, T_world_camera=pose))
                 self.indices.append(frame.index)
         left_out = any(notice.code == "fusion-free-space" for notice in notices_of(folder.provenance))
-        views = views_among(self.indices) if left_out else []
-        self._free_space = FreeSpace(self._store.frames(views))
+        references = reference_frames(self.indices) if left_out else []
+        self._free_space = FreeSpace(self._store.frames(references))
 
     def close(self) -> None:
         """Delete the unnamed file."""
@@ -128,7 +128,7 @@ class RunFrames:
     def _fused(self, fused: Collection[int]) -> trimesh.Trimesh:
         """Return the surface of the frames with these numbers."""
         fusion = SurfaceFusion(self._fusion, self._store, corrected=True)
-        frames = NewViews(self._fusion.every).among(self.frames(fused))
+        frames = FrameSelector(self._fusion.every).among(self.frames(fused))
         surface = fusion.fuse(frames, self._store.median_depth_mm(fused))
         return finished(surface.mesh, surface.settings)
 

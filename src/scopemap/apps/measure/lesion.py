@@ -21,7 +21,7 @@ from scopemap.apps.measure.intervals import LogChanges
 from scopemap.apps.measure.measure import WIDE, Known, KnownScale, Measure, known_scale
 from scopemap.engine.cameras.rectification import Rectifier
 from scopemap.engine.errors import InputError, SettingsError, check_shape
-from scopemap.engine.geometry.lesion_shape import LesionView, view_shape
+from scopemap.engine.geometry.lesion_shape import LesionShape, lesion_shape
 from scopemap.engine.geometry.rendering import render_mesh, vertex_colours
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.input.camera_files.reading import read_calibration
@@ -93,25 +93,27 @@ def measure_lesion(
     given = Path(masks) if isinstance(masks, Path | str) else np.asarray(masks)
     of_frames = _masks_of_folder(run, given) if isinstance(given, Path) and given.is_dir() else None
     shown = carried_masks(run, *_mask_of_frame(run, given, frame)) if of_frames is None else of_frames
-    views = {index: view for index, mask in shown.items() if (view := _view(run, index, mask)) is not None}
-    if not views:
+    shapes = {index: shape for index, mask in shown.items() if (shape := _shape(run, index, mask)) is not None}
+    if not shapes:
         raise InputError(
             f"no frame of {run.folder} sees the whole lesion with its depth: it is cut off, smaller than {_LEAST_PX} "
             "pixels, or its depth is unknown"
         )
-    own = views.get(frame) if of_frames is None and frame is not None else None
+    own = shapes.get(frame) if of_frames is None and frame is not None else None
     if own is not None:  # a frame of another diameter shows a part of it
-        views = {n: view for n, view in views.items() if abs(np.log(view.diameter / own.diameter)) < _MOST_DIFFERENCE}
+        shapes = {
+            n: shape for n, shape in shapes.items() if abs(np.log(shape.diameter / own.diameter)) < _MOST_DIFFERENCE
+        }
     found = []
     for figure, (name, power, common) in _FIGURES.items():
-        value, sigma = _combined(views, shown, figure, common)
+        value, sigma = _combined(shapes, shown, figure, common)
         changes = scale.from_views.times(LogChanges.of_own(sigma)).to_power(power)
         unit = scale.unit if power == 1 else scale.square
         found.append(Measure.of(name, value / scale.divisor**power, changes, unit, _OF_VIEWS))
-    found.append(_height(views, found[0], scale))
-    counted = {index: shown[index] for index in views}
+    found.append(_height(shapes, found[0], scale))
+    counted = {index: shown[index] for index in shapes}
     sizes_px = np.array([mask.sum() for mask in counted.values()])
-    best = list(counted)[int((_facing(views) * sizes_px).argmax())]
+    best = list(counted)[int((_facing(shapes) * sizes_px).argmax())]
     return MeasuredLesion(found, scale.words, counted, _outline(run, best, counted[best]))
 
 
@@ -272,43 +274,43 @@ def _marked(run: Result, frame: int, mask: np.ndarray, pose: np.ndarray) -> trim
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
 
-def _view(run: Result, index: int, mask: np.ndarray) -> LesionView | None:
+def _shape(run: Result, index: int, mask: np.ndarray) -> LesionShape | None:
     """Return the sizes of a lesion in a frame; None where it is cut off, too small, or its depth unknown."""
     depth_mm = run.depth.read(index)
     inner = mask[_EDGE_PX:-_EDGE_PX, _EDGE_PX:-_EDGE_PX]
     if depth_mm is None or inner.sum() < mask.sum() or mask.sum() < _LEAST_PX:
         return None
-    return view_shape(mask, depth_mm, run.camera)
+    return lesion_shape(mask, depth_mm, run.camera)
 
 
 def _combined(
-    views: dict[int, LesionView], masks: dict[int, np.ndarray], figure: str, common: float
+    shapes: dict[int, LesionShape], masks: dict[int, np.ndarray], figure: str, common: float
 ) -> tuple[float, float]:
     """Return a figure by all frames, and its relative standard deviation (of a length) without that of the scale."""
     power = _FIGURES[figure][1]
-    values = np.array([getattr(view, figure) for view in views.values()])
-    width_px = np.array([2 * np.sqrt(masks[index].sum() / np.pi) for index in views])
+    values = np.array([getattr(shape, figure) for shape in shapes.values()])
+    width_px = np.array([2 * np.sqrt(masks[index].sum() / np.pi) for index in shapes])
     outline = np.sqrt(2) * _OUTLINE_PX / width_px
-    apart = np.array([view.sigma for view in views.values()])
-    weights = _facing(views) ** 2 / (outline**2 + apart**2 + common**2)
+    apart = np.array([shape.sigma for shape in shapes.values()])
+    weights = _facing(shapes) ** 2 / (outline**2 + apart**2 + common**2)
     value = _weighted_median(values, weights)
     spread = 1.48 * _weighted_median(np.abs(np.log(values / value)), weights) / power
     return value, float(np.sqrt(spread**2 + np.average(outline**2 + apart**2, weights=weights) + common**2))
 
 
-def _height(views: dict[int, LesionView], diameter: Measure, scale: KnownScale) -> Measure:
+def _height(shapes: dict[int, LesionShape], diameter: Measure, scale: KnownScale) -> Measure:
     """Return the height by all frames that know it, 0 where none does; its interval is by the diameter."""
-    values = np.array([view.height for view in views.values()])
+    values = np.array([shape.height for shape in shapes.values()])
     known = np.isfinite(values)
-    value = _weighted_median(values[known], _facing(views)[known] ** 2) / scale.divisor if known.any() else 0.0
+    value = _weighted_median(values[known], _facing(shapes)[known] ** 2) / scale.divisor if known.any() else 0.0
     value = max(value, 0.0)
     low, high = max(value - _LOWER * diameter.high, 0.0), value + _HIGHER * diameter.high
     return Measure("height", value, low, high, diameter.unit, _OF_RELIEF if high > WIDE * low else "")
 
 
-def _facing(views: dict[int, LesionView]) -> np.ndarray:
-    """Return the cosines (N,) at which views see the wall, at least 0.1, also where it is unknown."""
-    return np.nan_to_num([view.facing for view in views.values()]).clip(_LEAST_FACING, 1)
+def _facing(shapes: dict[int, LesionShape]) -> np.ndarray:
+    """Return the cosines (N,) at which the frames see the wall, at least 0.1, also where it is unknown."""
+    return np.nan_to_num([shape.facing for shape in shapes.values()]).clip(_LEAST_FACING, 1)
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:

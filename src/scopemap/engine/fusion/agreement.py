@@ -97,7 +97,7 @@ def agreement_figures(agreements: Iterable[FrameAgreement]) -> dict[str, float]:
     return figures
 
 
-class SurfaceView(NamedTuple):
+class RenderedFrame(NamedTuple):
     """A frame with depth and pose, the vertices (V, 3) of a surface, world mm, and its rendering."""
 
     frame: Frame
@@ -105,20 +105,20 @@ class SurfaceView(NamedTuple):
     rendering: Rendering
 
 
-def surface_views(mesh: trimesh.Trimesh, frames: list[Frame]) -> list[SurfaceView]:
-    """Return the views of a fusion's surface at some of its frames; [] without a surface or frames."""
-    views = []
+def rendered_frames(mesh: trimesh.Trimesh, frames: list[Frame]) -> list[RenderedFrame]:
+    """Return renderings of a fusion's surface at some of its frames; [] without a surface or frames."""
+    found = []
     for frame in frames if len(mesh.faces) else []:
         if frame.T_world_camera is not None and frame.depth_mm is not None:
             rendering = render_mesh(mesh, frame.camera, frame.T_world_camera)
-            views.append(SurfaceView(frame, np.asarray(mesh.vertices), rendering))
-    return views
+            found.append(RenderedFrame(frame, np.asarray(mesh.vertices), rendering))
+    return found
 
 
-def surface_agreement(views: list[SurfaceView], settings: FusionSettings) -> dict[str, float]:
+def surface_agreement(frames: list[RenderedFrame], settings: FusionSettings) -> dict[str, float]:
     """Return the figures of a fusion's surface with some of its frames; {} without any."""
     agreements = []
-    for frame, _, rendering in views:
+    for frame, _, rendering in frames:
         depth_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
         if settings.without_light:
             rendering = lit_like(rendering, frame.camera, frame.rgb, depth_mm)
@@ -126,7 +126,7 @@ def surface_agreement(views: list[SurfaceView], settings: FusionSettings) -> dic
     return agreement_figures(agreements) if agreements else {}
 
 
-def vertex_sigmas(count: int, views: list[SurfaceView]) -> np.ndarray:
+def vertex_sigmas(count: int, frames: list[RenderedFrame]) -> np.ndarray:
     """Return the standard deviation of each vertex along the lines of sight, (V,) float32, mm; NaN: no frame sees it.
 
     It is the root mean square, over the frames that see the vertex, of what their depth and the surface differ by or of
@@ -134,7 +134,7 @@ def vertex_sigmas(count: int, views: list[SurfaceView]) -> np.ndarray:
     count : of the vertices, V.
     """
     total, seen_by = np.zeros(count), np.zeros(count)
-    for frame, vertices, rendering in views:
+    for frame, vertices, rendering in frames:
         assert frame.T_world_camera is not None
         in_camera = transform(inverse(frame.T_world_camera), vertices)
         pixels, shown = frame.camera.project(in_camera), rendering.depth_mm

@@ -21,31 +21,31 @@ from scopemap.engine.geometry.median import median
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.notices import Notice
 
-_MOST_VIEWS = 256  # by hand: 50 KB each
-_FEW_VIEWS = 16  # by hand: of a short clip
-_FRAMES_PER_VIEW = 4  # by hand: one frame of so many is a view
+_MOST_REFERENCES = 256  # by hand: 50 KB each
+_FEW_REFERENCES = 16  # by hand: of a short clip
+_FRAMES_PER_REFERENCE = 4  # by hand: one frame of so many is a reference
 _CELLS = 64  # by hand: along the longer side of the picture: one pixel of each cell is looked at
-_ASKED = 16  # by hand: views that a frame is compared with, spread over those that show a third of its points
-_SHARE = 1 / 3  # by hand: of the frame's points, and of the views that see a point
-_LEAST_VIEWS = 2  # by hand: never on the word of one
-# Share of the depth by which a view is farther that looks through a point, at least; and in robust standard deviations
-# of what frame and view differ by.
+_ASKED = 16  # by hand: references that a frame is compared with, spread over those that show a third of its points
+_SHARE = 1 / 3  # by hand: of the frame's points, and of the references that see a point
+_LEAST_REFERENCES = 2  # by hand: never on the word of one
+# Share of the depth by which a reference is farther that looks through a point, at least; and in robust standard
+# deviations of what frame and reference differ by.
 _TOLERANCE = 0.05  # by hand
 _SIGMAS = 3.0  # three standard deviations: 0.3 % of Gaussian errors
-# A region is left out that has so many points which at least half of the views contradict by twice that.
+# A region is left out that has so many points which at least half of the references contradict by twice that.
 _LEAST_POINTS = 8  # by hand
 _CERTAIN = 2.0  # by hand
-# Difference of colour to the views from which on something else is there, and over that of the frame's median point:
-# tissue that moved has its colour.
+# Difference of colour to the references from which on something else is there, and over that of the frame's median
+# point: tissue that moved has its colour.
 _OTHER_COLOUR = 0.3  # by hand
 _TIMES_USUAL = 5.0  # by hand
 _DARK = 8.0  # by hand: grey levels, up to which colours are noise
-_SOME_POINTS = 40  # by hand: one of so many tells whether a view sees a frame's points
-_SOME_RATIOS = 8  # by hand: and what frame and view differ by
+_SOME_POINTS = 40  # by hand: one of so many tells whether a reference sees a frame's points
+_SOME_RATIOS = 8  # by hand: and what frame and reference differ by
 _AROUND = np.ones((3, 3), np.uint8)  # a pixel and its eight neighbours
 
 
-class _View(NamedTuple):
+class _CoarseFrame(NamedTuple):
     """Smallest and largest depth around each cell of a frame, (h, w) float32, mm, 0: unknown; its number and matrix.
 
     colour : (h, w, 2) float32, as `_colour`. P : (3, 4), takes a point of the world, mm, to its place in cells times
@@ -59,18 +59,21 @@ class _View(NamedTuple):
     P: np.ndarray
 
 
-def views_among(indices: Sequence[int]) -> list[int]:
+def reference_frames(indices: Sequence[int]) -> list[int]:
     """Return the numbers of frames, spread over those of a submap, that tell what other frames look through."""
-    count = min(len(indices), max(len(indices) // _FRAMES_PER_VIEW, _FEW_VIEWS), _MOST_VIEWS)
+    count = min(len(indices), max(len(indices) // _FRAMES_PER_REFERENCE, _FEW_REFERENCES), _MOST_REFERENCES)
     return [indices[place] for place in np.linspace(0, len(indices) - 1, count).astype(int)]
 
 
 class FreeSpace:
-    """Leaves out what other frames of the same submap look through; `views` are some of these, with depth and pose."""
+    """Leaves out what other frames of the same submap look through.
 
-    def __init__(self, views: Iterable[Frame]) -> None:
-        self._views = [_view(frame) for frame in views if frame.T_world_camera is not None]
-        self._P = np.array([view.P for view in self._views]).reshape(-1, 3, 4)
+    references : some of these frames, with depth and pose; `reference_frames` chooses them.
+    """
+
+    def __init__(self, references: Iterable[Frame]) -> None:
+        self._references = [_coarse(frame) for frame in references if frame.T_world_camera is not None]
+        self._P = np.array([reference.P for reference in self._references]).reshape(-1, 3, 4)
         self._frames, self._left_out, self._pixels = 0, 0, 0
 
     @property
@@ -83,9 +86,10 @@ class FreeSpace:
     def without(self, frame: Frame) -> Frame:
         """Return a frame with depth and pose whose usable pixels and highlights lack what others look through.
 
-        Pixels next to such a region, and to instruments that the depth network found, go with it. Without views, none.
+        Pixels next to such a region, and to instruments that the depth network found, go with it. Without references,
+        none.
         """
-        if not self._views:
+        if not self._references:
             return frame
         self._pixels += int(np.count_nonzero(frame.valid))
         found = self._looked_through(frame)
@@ -110,15 +114,15 @@ class FreeSpace:
         points_mm = transform(frame.T_world_camera, frame.camera.rays[some][known] * depth_mm[known, None])
         colour = _colour(frame)[known]
         counts = np.zeros((len(points_mm), 4))
-        for view in self._asked(frame.index, points_mm):
-            _count(points_mm, colour, view, counts)
+        for reference in self._asked(frame.index, points_mm):
+            _count(points_mm, colour, reference, counts)
         seen, contradict, clearly, difference = counts.T
         difference /= np.maximum(seen, 1)
         usual = np.median(difference[seen > 0]) if seen.any() else 0.0
         other_colour = difference >= max(_OTHER_COLOUR, _TIMES_USUAL * usual)
         region, certain = np.zeros(known.shape, np.uint8), np.zeros(known.shape, bool)
-        region[known] = other_colour | ((contradict >= _LEAST_VIEWS) & (contradict >= _SHARE * seen))
-        certain[known] = other_colour & (clearly >= _LEAST_VIEWS) & (2 * clearly >= seen)
+        region[known] = other_colour | ((contradict >= _LEAST_REFERENCES) & (contradict >= _SHARE * seen))
+        certain[known] = other_colour & (clearly >= _LEAST_REFERENCES) & (2 * clearly >= seen)
         if frame.instruments is not None:
             region, certain = region | frame.instruments[some], certain | frame.instruments[some]
         count, labels = cv2.connectedComponents(region)
@@ -127,20 +131,20 @@ class FreeSpace:
         closed = cv2.morphologyEx(kept[labels].astype(np.uint8), cv2.MORPH_CLOSE, _AROUND)
         return cv2.dilate(closed, _AROUND) > 0
 
-    def _asked(self, index: int, points_mm: np.ndarray) -> list[_View]:
-        """Return the views to compare a frame with, whose points are (N, 3) mm, world."""
+    def _asked(self, index: int, points_mm: np.ndarray) -> list[_CoarseFrame]:
+        """Return the references to compare a frame with, whose points are (N, 3) mm, world."""
         if not len(points_mm):
             return []
         some = points_mm[::_SOME_POINTS]
         column, row, z = np.moveaxis(self._P[:, :, :3] @ some.T + self._P[:, :, 3:], 1, 0)
-        shapes = np.array([view.nearest_mm.shape for view in self._views])[:, :, None]
+        shapes = np.array([reference.nearest_mm.shape for reference in self._references])[:, :, None]
         inside = (z > 0) & (column >= 0) & (row >= 0) & (column < shapes[:, 1] * z) & (row < shapes[:, 0] * z)
         sees = np.flatnonzero(inside.mean(1) >= _SHARE).tolist()
-        others = [self._views[place] for place in sees if self._views[place].number != index]
+        others = [self._references[place] for place in sees if self._references[place].number != index]
         return others if len(others) <= _ASKED else [others[n * len(others) // _ASKED] for n in range(_ASKED)]
 
 
-def _view(frame: Frame) -> _View:
+def _coarse(frame: Frame) -> _CoarseFrame:
     assert frame.depth_mm is not None
     assert frame.T_world_camera is not None
     step_px, some = _step_px(frame.valid.shape), _centres(frame.valid.shape)
@@ -154,7 +158,7 @@ def _view(frame: Frame) -> _View:
     seen = known[some]
     P = place @ inverse(frame.T_world_camera)[:3]
     nearest, farthest = (np.where(seen, mm, np.float32(0)) for mm in (nearest, farthest))
-    return _View(frame.index, nearest, farthest, _colour(frame), P)
+    return _CoarseFrame(frame.index, nearest, farthest, _colour(frame), P)
 
 
 def _colour(frame: Frame) -> np.ndarray:
@@ -175,7 +179,7 @@ def _centres(shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 @inner_kernel
 def _place(points_mm: np.ndarray, n: int, P: np.ndarray, nearest_mm: np.ndarray) -> tuple[int, int, float]:
-    """Return row, column and depth, mm, of a point in the cells of a view; a depth of 0 where that knows nothing."""
+    """Return row, column and depth, mm, of a point in the cells of a reference; depth 0 where that knows nothing."""
     x, y, z_mm = points_mm[n, 0], points_mm[n, 1], points_mm[n, 2]
     depth_mm = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z_mm + P[2, 3]
     if depth_mm <= 0:
@@ -189,13 +193,13 @@ def _place(points_mm: np.ndarray, n: int, P: np.ndarray, nearest_mm: np.ndarray)
 
 
 @kernel
-def _count(points_mm: np.ndarray, colour: np.ndarray, view: _View, counts: np.ndarray) -> None:
-    """Add to `counts` (N, 4) whether a view confirms or contradicts points (N, 3), contradicts, clearly contradicts.
+def _count(points_mm: np.ndarray, colour: np.ndarray, other: _CoarseFrame, counts: np.ndarray) -> None:
+    """Add to `counts` (N, 4) whether another confirms or contradicts points (N, 3), contradicts, clearly contradicts.
 
-    The last is the difference to their colour (N, 2) there. What frame and view differ by in the median is a difference
-    of scale, and does not count.
+    The last is the difference to their colour (N, 2) there. What both differ by in the median is a difference of
+    scale, and does not count.
     """
-    P, nearest_mm, farthest_mm, view_colour = view.P, view.nearest_mm, view.farthest_mm, view.colour
+    P, nearest_mm, farthest_mm, other_colour = other.P, other.nearest_mm, other.farthest_mm, other.colour
     ratios, known = np.empty(len(points_mm) // _SOME_RATIOS + 1), 0
     for n in range(0, len(points_mm), _SOME_RATIOS):
         i, j, depth_mm = _place(points_mm, n, P, nearest_mm)
@@ -215,5 +219,5 @@ def _count(points_mm: np.ndarray, colour: np.ndarray, view: _View, counts: np.nd
             counts[n, 0] += 1
             counts[n, 1] += behind > tolerance
             counts[n, 2] += behind > _CERTAIN * tolerance
-            red, blue = colour[n, 0] - view_colour[i, j, 0], colour[n, 1] - view_colour[i, j, 1]
+            red, blue = colour[n, 0] - other_colour[i, j, 0], colour[n, 1] - other_colour[i, j, 1]
             counts[n, 3] += math.sqrt(red * red + blue * blue)

@@ -16,9 +16,9 @@ from scopemap.engine.config import FusionSettings
 from scopemap.engine.depth.under_highlights import small_highlights
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.albedo import AlbedoPainter
+from scopemap.engine.fusion.frame_selection import FrameSelector
 from scopemap.engine.fusion.frame_store import FrameStore, median_depth_of
 from scopemap.engine.fusion.mesh import extract_mesh
-from scopemap.engine.fusion.new_views import NewViews
 from scopemap.engine.fusion.tsdf import (
     BLOCK,
     KEY_OFFSET,
@@ -229,7 +229,7 @@ class SurfaceFusion:
         self.coarser_beyond: int | None = None
         """Blocks in all volumes beyond which their voxels become larger; None: no limit."""
         self._volumes = dict[int, TsdfVolume]()
-        self._views = NewViews(settings.every)
+        self._selector = FrameSelector(settings.every)
 
     @property
     def at_once(self) -> bool:
@@ -256,7 +256,7 @@ class SurfaceFusion:
         self._volumes.pop(map_number, None)
 
     def put(self, frame: Frame, map_number: int = 0) -> None:
-        """Store a frame, and fuse it in its map's volume if it has a pose and `NewViews` chooses it; or one of both."""
+        """Store a frame, and fuse it in its map's volume if it has a pose and `FrameSelector` chooses it; or either."""
         if self.at_end or self.keeps_frames:
             self.store.put(frame)
         self.replay(frame, map_number)
@@ -265,7 +265,7 @@ class SurfaceFusion:
         """Take a frame that is stored as `put` takes it: it is fused at once where frames are."""
         if not self.at_once or frame.T_world_camera is None or self.is_full:
             return
-        if (chosen := self._views.chosen(frame, map_number)) is not None:
+        if (chosen := self._selector.chosen(frame, map_number)) is not None:
             if map_number not in self._volumes:
                 # Where voxels are set the largest depth follows them alone: the scene is not known yet.
                 median_mm = None if self.settings.voxel_mm else median_depth_of(chosen)
@@ -281,7 +281,7 @@ class SurfaceFusion:
         self.store.clear()
 
     def fuse(self, frames: Iterable[Frame], median_mm: float | None, map_number: int = 0) -> FusedSurface:
-        """Return the surface of stored frames, as `NewViews` chose them, or of those fused at once.
+        """Return the surface of stored frames, as `FrameSelector` chose them, or of those fused at once.
 
         frames : all are consumed. median_mm : of the depth of those that the TSDF parameters follow. map_number : of
         those fused at once.

@@ -1,4 +1,4 @@
-"""Sizes of a lesion on a wall, as one view shows it: from its mask, depth and the camera."""
+"""Sizes of a lesion on a wall, as one frame shows it: from its mask, depth and the camera."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _PROTRUSION = 0.5  # by phantoms
 
 
 @dataclass(frozen=True)
-class LesionView:
-    """A lesion as a view shows it, mm and mm2; NaN: unknown.
+class LesionShape:
+    """Sizes of a lesion as one frame shows it, mm and mm2; NaN: unknown.
 
     diameter, cross : the largest, and the largest across it. height : of its top over the plane of the wall beside it.
     along, area : over a cap with this outline and height. facing : cosine at which that plane is seen. sigma : standard
@@ -57,8 +57,8 @@ def extents(points: np.ndarray) -> tuple[float, float]:
     return largest, _farthest((points - points[first]) @ across.T)[0]
 
 
-def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) -> LesionView | None:
-    """Return the sizes of a lesion in a view; None where too little of its depth is known.
+def lesion_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) -> LesionShape | None:
+    """Return the sizes of a lesion in a frame; None where too little of its depth is known.
 
     mask : (H, W) bool. depth_mm : (H, W), NaN = unknown. Depth errs most along the line of sight, so the diameter by
     depth is joined with that across the line of sight, which is nearly as large as lesions are round; each has its
@@ -93,7 +93,7 @@ def view_shape(mask: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) ->
     # Over the ellipse that is as long and wide, in the picture.
     length, width = extents(np.column_stack([pixels, np.zeros(len(pixels))]))
     base = diameter * cross * mask.sum() / (length * width)
-    return LesionView(diameter, cross, along, float(base + np.pi * rise**2), height, facing, apart)
+    return LesionShape(diameter, cross, along, float(base + np.pi * rise**2), height, facing, apart)
 
 
 def _slant(first: np.ndarray, last: np.ndarray) -> float:

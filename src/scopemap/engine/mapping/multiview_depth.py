@@ -55,7 +55,7 @@ _PROPAGATED_EVERY = 2
 # Keyframes to each side whose depth a frame takes over. With 1 the largest step of depth between frames was twice as
 # large on cecum_t1_a and two phantoms (0.14 and 0.06 mm), and depth less accurate.
 _REACH = 2
-_CACHED_VIEWS = 24  # by hand, for memory: the result does not depend on it
+_CACHED_IMAGES = 24  # by hand, for memory: the result does not depend on it
 # Standard deviations of Gaussian windows, px: of local contrast, of the disagreement's mean, of the result, and of
 # the result where little is measured.
 _CONTRAST_PX = 6.0  # by hand
@@ -64,7 +64,7 @@ _SMOOTHING_PX = 2.0  # by hand
 _WIDE_PX = 16.0  # by hand
 
 
-class StereoView(NamedTuple):
+class PosedImage(NamedTuple):
     """A frame for triangulation.
 
     contrast : (H, W, 3) uint8, grey values with normalised local contrast, from `normalised_contrast`. depth_mm :
@@ -122,12 +122,12 @@ def choose_neighbours(
 
 
 def triangulate_depth(
-    view: StereoView, neighbours: Iterable[StereoView], camera: PinholeCamera, flow: FlowEstimator
+    image: PosedImage, neighbours: Iterable[PosedImage], camera: PinholeCamera, flow: FlowEstimator
 ) -> TriangulatedDepth | None:
-    """Return the triangulated depth of a view; None where its neighbours disagree or are fewer than two."""
-    neighbours, total = list(neighbours), np.zeros_like(view.depth_mm)
+    """Return the triangulated depth of an image; None where its neighbours disagree or are fewer than two."""
+    neighbours, total = list(neighbours), np.zeros_like(image.depth_mm)
     for _ in range(_WARPS):
-        start = view._replace(depth_mm=view.depth_mm * np.exp(total))
+        start = image._replace(depth_mm=image.depth_mm * np.exp(total))
         estimates = _estimates(start, neighbours, camera, flow)
         if len(estimates) < 2:
             return None
@@ -135,12 +135,12 @@ def triangulate_depth(
         known, few = _around(compared), np.float32(0.01)  # where few can be compared depth stays
         with np.errstate(divide="ignore"):
             variance = (_around(scatter) + few * PRIOR_SIGMA**2) / (known + few) + 1 / information
-        if not np.sqrt(np.median(variance[np.isfinite(view.depth_mm)])) <= MAX_SIGMA:
+        if not np.sqrt(np.median(variance[np.isfinite(image.depth_mm)])) <= MAX_SIGMA:
             return None
         shrunk = (total + log_factor) * PRIOR_SIGMA**2 / (PRIOR_SIGMA**2 + variance)
         total = _smoothed(shrunk, information)
     sigma = np.sqrt(1 / (1 / variance + PRIOR_SIGMA**-2))
-    return TriangulatedDepth(view.depth_mm * np.exp(total), sigma.astype(np.float32), total)
+    return TriangulatedDepth(image.depth_mm * np.exp(total), sigma.astype(np.float32), total)
 
 
 def propagate_depth(
@@ -180,7 +180,7 @@ class KeyframeDepths:
         flow: FlowEstimator,
     ) -> None:
         self._poses, self._order, self.keyframes = T_world_camera, sorted(T_world_camera), list(keyframes)
-        self._stereo_view = lru_cache(_CACHED_VIEWS)(partial(self._read, view))
+        self._posed_image = lru_cache(_CACHED_IMAGES)(partial(self._read, view))
         self._camera, self._flow = camera, flow
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="depth")
         self._found: dict[int, Future[TriangulatedDepth | None]] = {}
@@ -212,9 +212,9 @@ class KeyframeDepths:
         """How many keyframes were triangulated; complete after the last frame."""
         return Notice("depth-triangulated", {"triangulated": self.triangulated, "keyframes": len(self.keyframes)})
 
-    def _read(self, view: Callable[[int], tuple[np.ndarray, np.ndarray]], index: int) -> StereoView:
+    def _read(self, view: Callable[[int], tuple[np.ndarray, np.ndarray]], index: int) -> PosedImage:
         rgb, depth_mm = view(index)
-        return StereoView(normalised_contrast(rgb), depth_mm, self._poses[index])
+        return PosedImage(normalised_contrast(rgb), depth_mm, self._poses[index])
 
     def _weights(self, index: int, keyframes: Sequence[int]) -> list[tuple[int, float]]:
         """Return the keyframes that count in the depth of a frame, and how much: a tent over their order.
@@ -227,29 +227,29 @@ class KeyframeDepths:
         return [(n, float(1 - d / _REACH)) for n, d in zip(keyframes, far, strict=True) if d < _REACH]
 
     def _triangulate(self, keyframe: int) -> TriangulatedDepth | None:
-        view = self._stereo_view(keyframe)
+        image = self._posed_image(keyframe)
         place = bisect_left(self._order, keyframe)
         near = self._order[max(0, place - _SEARCHED_FRAMES) : place + 1 + _SEARCHED_FRAMES]
-        chosen = choose_neighbours(keyframe, view.depth_mm, self._camera, {n: self._poses[n] for n in near})
-        found = triangulate_depth(view, map(self._stereo_view, chosen), self._camera, self._flow)
+        chosen = choose_neighbours(keyframe, image.depth_mm, self._camera, {n: self._poses[n] for n in near})
+        found = triangulate_depth(image, map(self._posed_image, chosen), self._camera, self._flow)
         self.triangulated += found is not None
         return found
 
 
 def _estimates(
-    view: StereoView, neighbours: Sequence[StereoView], camera: PinholeCamera, flow: FlowEstimator
+    image: PosedImage, neighbours: Sequence[PosedImage], camera: PinholeCamera, flow: FlowEstimator
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return each neighbour's ln factor of a view's depth, and its information, 0 = unknown, (H, W) float32."""
+    """Return each neighbour's ln factor of an image's depth, and its information, 0 = unknown, (H, W) float32."""
     # Flow of a picture without texture is what it started from.
-    grey = view.contrast[..., 0].astype(np.float32)
+    grey = image.contrast[..., 0].astype(np.float32)
     spread = _around(grey**2) - _around(grey) ** 2
     textured, found = spread > _MIN_SPREAD**2, []
     for neighbour in neighbours:
-        T = inverse(neighbour.T_world_camera) @ view.T_world_camera
-        seen = project(view.depth_mm, np.isfinite(neighbour.depth_mm), T, _intrinsics(camera))
+        T = inverse(neighbour.T_world_camera) @ image.T_world_camera
+        seen = project(image.depth_mm, np.isfinite(neighbour.depth_mm), T, _intrinsics(camera))
         warped = cv2.remap(neighbour.contrast, seen.x, seen.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        warped = np.where(seen.usable[..., None] > 0, warped, view.contrast)
-        log_factor, slope, across = epipolar_error(flow.estimate_small(view.contrast, warped), seen)
+        warped = np.where(seen.usable[..., None] > 0, warped, image.contrast)
+        log_factor, slope, across = epipolar_error(flow.estimate_small(image.contrast, warped), seen)
         # A neighbourhood that moves across the epipolar lines moves along them as well.
         variance_px = np.float32(_FLOW_SIGMA_PX**2) + across + _around(across)
         information = slope / (variance_px + np.float32(VIEW_SIGMA**2) * slope)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from scopemap.engine.config import MaskSettings
-from scopemap.engine.frame import Frame, is_constant, percentiles
+from scopemap.engine.frame import Frame, is_constant, percentiles_uint8
 from scopemap.engine.masking.overlays import OverlayFinder
 from scopemap.engine.notices import Notice
 
@@ -178,7 +178,9 @@ def specular(darkest: np.ndarray, field: np.ndarray) -> np.ndarray:
     """
     if not field.any():
         return np.zeros_like(field)
-    surroundings = _local_median(np.where(field, darkest, percentiles(darkest[field], [50.0])[0]).astype(np.uint8))
+    surroundings = _local_median(
+        np.where(field, darkest, percentiles_uint8(darkest[field], [50.0])[0]).astype(np.uint8)
+    )
     return (darkest > _HIGHLIGHT_RATIO * surroundings) & (darkest > _DARKEST_HIGHLIGHT)
 
 

@@ -15,7 +15,7 @@ from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.corner_pose import nonrigidity, pose_from_correspondences, reprojection_error_px
 from scopemap.engine.tracking.features import RelativePose
 from scopemap.engine.tracking.pyramid import build_pyramid
-from scopemap.engine.tracking.residuals import View
+from scopemap.engine.tracking.residuals import PyramidLevel
 from scopemap.engine.tracking.rtdl import Alignment, Motion, align, judge, least_correlation
 from scopemap.engine.tracking.track import TrackingLoss
 
@@ -44,7 +44,7 @@ class Keyframe:
 
     frame: Frame
     T_world_camera: np.ndarray
-    pyramid: list[View]
+    pyramid: list[PyramidLevel]
     depth_mm: float
     measured: bool
     map: int
@@ -110,7 +110,7 @@ class KeyframeAligner:
         if self._matcher is not None:
             self._matcher.set_keyframe(keyframe.frame if self.has_corners(keyframe) else None, frame, T_frame_keyframe)
 
-    def align(self, keyframe: Keyframe, frame: Frame) -> tuple[Alignment, list[View] | None]:
+    def align(self, keyframe: Keyframe, frame: Frame) -> tuple[Alignment, list[PyramidLevel] | None]:
         """Return the alignment by corners, else the photometric one, and the frame's pyramid where it was needed.
 
         Where corners fail and features are searched next, predicted poses are judged, and only good ones are aligned.
@@ -132,7 +132,9 @@ class KeyframeAligner:
         best = max(found, key=lambda alignment: alignment.agreement)
         return (best if by_corners is None else replace(best, coverage=by_corners.coverage)), pyramid
 
-    def align_from(self, keyframe: Keyframe, frame: Frame, pyramid: list[View], relative: RelativePose) -> Alignment:
+    def align_from(
+        self, keyframe: Keyframe, frame: Frame, pyramid: list[PyramidLevel], relative: RelativePose
+    ) -> Alignment:
         """Return the alignment from the pose by features: by corners, else photometric; pyramid : of the frame."""
         T_start, matches = relative.T_current_reference, len(relative.pairs)
         if self.has_corners(keyframe):
@@ -160,7 +162,7 @@ class KeyframeAligner:
             nonrigidity=nonrigidity(correspondences, frame.camera, T, depth_sigma),
         )
 
-    def pyramid(self, keyframe: Keyframe, frame: Frame) -> list[View]:
+    def pyramid(self, keyframe: Keyframe, frame: Frame) -> list[PyramidLevel]:
         """Return the pyramid of a frame that is aligned to a keyframe."""
         # The keyframe's points are moved: the frame's own depth counts only if it is measured.
         return build_pyramid(frame if keyframe.measured else replace(frame, depth_mm=None), self._settings)

@@ -12,7 +12,7 @@ from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.kernels import kernel
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
-from scopemap.engine.tracking.residuals import View
+from scopemap.engine.tracking.residuals import PyramidLevel
 
 # By hand: grey levels per residual unit without local normalisation: residuals of order one either way.
 _GREY_UNIT = 32.0
@@ -24,12 +24,12 @@ _NOISE_LEVEL = 2.0  # by hand: grey levels of local deviation below which an are
 
 def build_pyramid(
     frame: Frame, settings: TrackingSettings, *, use_slope: bool = False, levels: int | None = None
-) -> list[View]:
+) -> list[PyramidLevel]:
     """Return the levels from `finest_level` (first) to the coarsest (last), each half the size of the one before.
 
     use_slope : take tangent planes from the depth; only for measured depth, since slopes of predicted depth follow the
     colour of the tissue. Else every plane is parallel to the image. levels : number of levels; None: down to a short
-    side of 16 px. A frame without depth gives views that can be aligned to a reference, but cannot be one.
+    side of 16 px. A frame without depth gives a pyramid that can be aligned to a reference, but cannot be one.
     """
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     weight = frame.valid.astype(np.float32)
@@ -39,11 +39,11 @@ def build_pyramid(
     finest = min(settings.finest_level, settings.levels - 1)
     count = settings.levels if levels is None else finest + levels
     camera = frame.camera
-    views: list[View] = []
+    pyramid: list[PyramidLevel] = []
     for level in range(count):
         if level > 0:
             width, height = camera.width // 2, camera.height // 2
-            if views and min(width, height) < _MIN_SIDE_PX:
+            if pyramid and min(width, height) < _MIN_SIDE_PX:
                 break
             # An odd last row or column has no partner: without it, pixels, depth and camera halve alike.
             camera = replace(camera, width=2 * width, height=2 * height)
@@ -55,8 +55,8 @@ def build_pyramid(
         if level >= finest:
             slope = _slope(depth, camera) if use_slope else np.zeros((*depth.shape, 2), np.float32)
             intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-            views.append(View(_channels(grey, weight), weight, depth, slope, intrinsics))
-    return views
+            pyramid.append(PyramidLevel(_channels(grey, weight), weight, depth, slope, intrinsics))
+    return pyramid
 
 
 def texture(frame: Frame, settings: TrackingSettings) -> float:
@@ -64,9 +64,9 @@ def texture(frame: Frame, settings: TrackingSettings) -> float:
 
     Tissue that fills the picture, heavy blur and fluid leave noise alone.
     """
-    view = build_pyramid(replace(frame, depth_mm=None), settings, levels=1)[0]
-    weight = view.weight.sum()
-    return float(np.sqrt((view.channels[1] ** 2 * view.weight).sum() / weight)) if weight else 0.0
+    level = build_pyramid(replace(frame, depth_mm=None), settings, levels=1)[0]
+    weight = level.weight.sum()
+    return float(np.sqrt((level.channels[1] ** 2 * level.weight).sum() / weight)) if weight else 0.0
 
 
 def _slope(depth_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:

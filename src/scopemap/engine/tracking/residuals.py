@@ -34,7 +34,7 @@ _MAX_SURFACE_SPREAD = 0.1  # by hand: of four neighbouring depths on one surface
 _MAX_DEPTH_DIFFERENCE = 0.1  # by hand: of associated points, relative
 
 
-class View(NamedTuple):
+class PyramidLevel(NamedTuple):
     """One image of one pyramid level, the input of the kernels.
 
     channels : (C, H, W) float32; `Loss` has the parameters of each.
@@ -313,7 +313,12 @@ def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[n
 
 
 def normal_equations(
-    reference: View, current: View, T_current_reference: np.ndarray, affine: np.ndarray, loss: Loss, unit_mm: float
+    reference: PyramidLevel,
+    current: PyramidLevel,
+    T_current_reference: np.ndarray,
+    affine: np.ndarray,
+    loss: Loss,
+    unit_mm: float,
 ) -> NormalEquations:
     """Linearise the loss around a motion (4, 4) and a brightness change (gain, bias); translation in `unit_mm`."""
     hessian, gradient, cost, weight = _accumulate(reference, current, T_current_reference, affine, loss, unit_mm)

@@ -19,7 +19,7 @@ from scopemap.engine.geometry.se3 import orthonormalised, se3_exp
 from scopemap.engine.tracking.residuals import (
     PARAMETERS,
     Loss,
-    View,
+    PyramidLevel,
     compared_pixels,
     depth_residuals,
     normal_equations,
@@ -77,7 +77,9 @@ class Alignment:
         return self.inlier_share * self.overlap
 
 
-def align(reference: list[View], current: list[View], T_start: np.ndarray, settings: TrackingSettings) -> Alignment:
+def align(
+    reference: list[PyramidLevel], current: list[PyramidLevel], T_start: np.ndarray, settings: TrackingSettings
+) -> Alignment:
     """Return the alignment of two pyramids (finest level first), from the first guess `T_start` (4, 4).
 
     The coarsest level turns the camera (equation 10); the finer ones start from that rotation (6) and move it (12).
@@ -105,13 +107,15 @@ def least_correlation(settings: TrackingSettings) -> float:
     return _MIN_CORRELATION if settings.picture_checks else -1.0
 
 
-def _correlation(reference: list[View], current: list[View], motion: Motion, settings: TrackingSettings) -> float:
+def _correlation(
+    reference: list[PyramidLevel], current: list[PyramidLevel], motion: Motion, settings: TrackingSettings
+) -> float:
     """Return the correlation at the finest of these levels; infinite where measured depth takes part."""
     by_shape = settings.photometry.depth_weight > 0 and np.isfinite(current[0].depth_mm).any()
     return math.inf if by_shape else judge(reference, current, motion).correlation
 
 
-def judge(reference: list[View], current: list[View], motion: Motion, iterations: int = 0) -> Alignment:
+def judge(reference: list[PyramidLevel], current: list[PyramidLevel], motion: Motion, iterations: int = 0) -> Alignment:
     """Return how well a motion aligns two pyramids at their finest level; the other levels are not read."""
     expected, used, usable = compared_pixels(reference[0], current[0], motion.T_current_reference)
     sigma = robust_sigma(used, _MIN_SIGMA)
@@ -130,7 +134,12 @@ def _loss(sigma: np.ndarray, settings: TrackingSettings) -> Loss:
 
 
 def _align_level(
-    reference: View, current: View, motion: Motion, settings: TrackingSettings, rotation_only: bool, unit_mm: float
+    reference: PyramidLevel,
+    current: PyramidLevel,
+    motion: Motion,
+    settings: TrackingSettings,
+    rotation_only: bool,
+    unit_mm: float,
 ) -> tuple[Motion, int]:
     loss = _loss(np.ones(len(reference.channels)), settings)
     start = residual_images(reference, current, motion.T_current_reference, motion.affine, loss)

@@ -27,7 +27,7 @@ from scopemap.engine.tracking.keyframe_alignment import (
 from scopemap.engine.tracking.keyframe_choice import KeyframeChoice
 from scopemap.engine.tracking.pyramid import build_pyramid
 from scopemap.engine.tracking.relocalisation import Relocaliser, depth_ratio, is_close_up, nearer_keyframe
-from scopemap.engine.tracking.residuals import View
+from scopemap.engine.tracking.residuals import PyramidLevel
 from scopemap.engine.tracking.rtdl import Alignment
 from scopemap.engine.tracking.sharpness import SharpnessMonitor
 from scopemap.engine.tracking.track import FrameTracker, KeyframeDecision, Track, TrackingLoss
@@ -250,7 +250,7 @@ class Tracker(FrameTracker):
         return Keyframe(frame, frame.T_world_camera, pyramid, mean_mm, measured, self._motion.map)
 
     def _found(
-        self, frame: Frame, pyramid: list[View] | None, sharpness: float, *, failed: bool
+        self, frame: Frame, pyramid: list[PyramidLevel] | None, sharpness: float, *, failed: bool
     ) -> tuple[Keyframe, Alignment] | None:
         """Return the keyframe in which features find a frame, and its accepted alignment; None without any.
 

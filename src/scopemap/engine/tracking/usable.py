@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from scopemap.engine.config import TrackingSettings
-from scopemap.engine.frame import Frame, percentiles
+from scopemap.engine.frame import Frame, percentiles_uint8
 from scopemap.engine.tracking.causes import LossCause
 from scopemap.engine.tracking.keyframe_alignment import MIN_TEXTURE
 from scopemap.engine.tracking.pyramid import texture
@@ -23,7 +23,7 @@ def too_few_pixels(frame: Frame, settings: TrackingSettings) -> TrackingLoss | N
     share = float(frame.valid.mean())
     if share >= settings.min_valid_share:
         return None
-    low, middle = percentiles(frame.rgb[::2, ::2].max(axis=2), [20.0, 50.0])
+    low, middle = percentiles_uint8(frame.rgb[::2, ::2].max(axis=2), [20.0, 50.0])
     reason = f"only {share:.0%} of the image is usable"
     if middle < _DARK_LEVEL:
         return TrackingLoss(LossCause.TOO_DARK, f"{reason}, it is too dark")

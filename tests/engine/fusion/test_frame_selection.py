@@ -9,7 +9,7 @@ import pytest
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Frame
-from scopemap.engine.fusion.new_views import NewViews
+from scopemap.engine.fusion.frame_selection import FrameSelector
 
 CAMERA = PinholeCamera(fx=150.0, fy=150.0, cx=79.5, cy=63.5, width=160, height=128)
 
@@ -25,11 +25,11 @@ def seen(index: int, *, x_mm: float = 0.0, z_mm: float = 0.0, quality: float = 1
 
 
 def indices(frames: list[Frame], every: int = 0) -> list[int]:
-    return [frame.index for frame in NewViews(every).among(frames)]
+    return [frame.index for frame in FrameSelector(every).among(frames)]
 
 
 def test_one_in_four_frames_of_a_camera_at_rest_counts_for_the_others() -> None:
-    chosen = list(NewViews().among(seen(index) for index in range(10)))
+    chosen = list(FrameSelector().among(seen(index) for index in range(10)))
     assert [frame.index for frame in chosen] == [0, 4, 8]
     assert chosen[0].weight is None
     assert all(np.all(np.asarray(frame.weight) == 4) for frame in chosen[1:])
@@ -52,16 +52,16 @@ def test_a_moving_camera_is_followed_the_same_at_any_scale(unit: float) -> None:
 
 
 def test_the_same_place_in_another_world_is_fused() -> None:
-    views = NewViews()
-    assert views.chosen(seen(0)) is not None
-    assert views.chosen(seen(1)) is None
-    assert views.chosen(seen(2), world=1) is not None
+    selector = FrameSelector()
+    assert selector.chosen(seen(0)) is not None
+    assert selector.chosen(seen(1)) is None
+    assert selector.chosen(seen(2), world=1) is not None
 
 
 def test_every_third_frame_where_that_is_set() -> None:
     frames = [seen(index) for index in range(7)]
     assert indices(frames, every=3) == [0, 3, 6]
-    assert all(frame.weight is None for frame in NewViews(3).among(frames))
+    assert all(frame.weight is None for frame in FrameSelector(3).among(frames))
 
 
 def test_a_frame_without_usable_depth_is_left_out_most_often() -> None:

@@ -41,7 +41,7 @@ _WHOLE_FOV = 0.9
 """Vertical field of view from outside, rad."""
 
 
-class ResultView:
+class ShownResult:
     """A result as it is looked at; `whole` is all of it, `run` the submap whose surface is shown.
 
     rows : of the frames that were used, in the table of the whole result. row : of the frame that is shown.

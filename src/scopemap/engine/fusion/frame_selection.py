@@ -26,21 +26,21 @@ _BLOCK_SHARE = 1 / 8  # by hand: edge of a block of tissue over its distance
 _SHARPER = 1.5  # by hand: ratio of qualities from which on a frame is sharper
 _STEP_PX = 8  # by hand, for time: between the pixels that are looked at
 _SOME = (slice(_STEP_PX // 2, None, _STEP_PX),) * 2  # such pixels, from the middle of the first cell
-_SLOTS = 1 << 16  # guard: memory; a view that is forgotten is fused again
-# Large primes, by which the numbers of a view are mixed.
+_SLOTS = 1 << 16  # guard: memory; a viewing cell that is forgotten is fused again
+# Large primes, by which the numbers of a viewing cell are mixed.
 _FACTORS = np.array([73856093, 19349663, 83492791, 49979687, 86028121, 32452843, 67867967, 15485863])
 
 
-class NewViews:
+class FrameSelector:
     """Chooses the frames that are fused, in order.
 
-    A view is a block of tissue from one direction and distance. Blocks and steps grow with the distance, so that the
-    choice does not depend on the scale. every : choose every n-th frame instead; 0: by views.
+    A viewing cell is a block of tissue from one direction and distance. Blocks and steps grow with the distance, so
+    that the choice does not depend on the scale. every : choose every n-th frame instead; 0: by viewing cells.
     """
 
     def __init__(self, every: int = 0) -> None:
         self._every, self._since = every, max(every - 1, 0)  # frames since the one that was chosen last
-        self._views, self._quality = np.zeros(_SLOTS, np.int64), np.zeros(_SLOTS, np.float32)
+        self._cells, self._quality = np.zeros(_SLOTS, np.int64), np.zeros(_SLOTS, np.float32)
 
     def chosen(self, frame: Frame, world: int = 0) -> Frame | None:
         """Return a frame with depth and pose, weighted by how many it counts for; None where it is left out.
@@ -49,12 +49,12 @@ class NewViews:
         """
         self._since += 1
         if not self._every:
-            views = _views(frame, world)
-            slots = views & (_SLOTS - 1)
-            seen = (self._views[slots] == views) & (_SHARPER * self._quality[slots] >= frame.quality)
+            cells = _viewing_cells(frame, world)
+            slots = cells & (_SLOTS - 1)
+            seen = (self._cells[slots] == cells) & (_SHARPER * self._quality[slots] >= frame.quality)
             if self._since < _LONGEST_GAP and np.count_nonzero(~seen) <= _LEAST_NEW * len(seen):
                 return None
-            self._views[slots[~seen]], self._quality[slots[~seen]] = views[~seen], frame.quality
+            self._cells[slots[~seen]], self._quality[slots[~seen]] = cells[~seen], frame.quality
         elif self._since < self._every:
             return None
         count, self._since = self._since, 0
@@ -67,8 +67,8 @@ class NewViews:
         return (chosen for frame in frames if (chosen := self.chosen(frame)) is not None)
 
 
-def _views(frame: Frame, world: int) -> np.ndarray:
-    """Return the views (N,) int64 that some usable pixels of a frame show."""
+def _viewing_cells(frame: Frame, world: int) -> np.ndarray:
+    """Return the viewing cells (N,) int64 that some usable pixels of a frame show."""
     assert frame.depth_mm is not None
     assert frame.T_world_camera is not None
     depth_mm = np.asarray(frame.depth_mm)[_SOME]
