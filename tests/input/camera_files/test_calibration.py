@@ -14,6 +14,7 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
 from scopemap.engine.errors import CalibrationError
 from scopemap.input.camera_files.calibration import Calibration
+from scopemap.input.camera_files.lens_models import LENS_MODELS
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.camera_files.writing import write_calibration
 from tests.support.drawn_calibrations import (
@@ -55,11 +56,16 @@ def assert_same(found: CameraModel, expected: CameraModel) -> None:
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: type(c).__name__)
-def test_what_is_written_opencv_reads(camera: CameraModel, tmp_path: Path) -> None:
+def test_what_is_written_is_read_back_and_by_opencv(camera: CameraModel, tmp_path: Path) -> None:
     write_calibration(camera, tmp_path / "camera.yaml")
+    assert read_calibration(tmp_path / "camera.yaml", SIZE).camera == camera
     storage = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ)
-    plane = camera.plane if isinstance(camera, FovCamera) else camera.central
+    plane = getattr(camera, "plane", camera.central)
     np.testing.assert_array_equal(storage.getNode("camera_matrix").mat(), plane.matrix)
+
+
+def test_each_lens_of_the_table_is_drawn() -> None:
+    assert {lens.camera for lens in LENS_MODELS} <= {type(camera) for camera in CAMERAS}
 
 
 NUMBER = st.floats(-1e6, 1e6)

@@ -123,7 +123,7 @@ def test_zeros_and_the_same_coefficients_twice_are_no_contradiction(form: str, t
         (mat(**{**INTRINSICS, "Skew": 30.0}), "a skew of 30"),
         ({**NAMED, "skew": 30.0}, "a skew of 30"),
         (basalt("kb4", **numbered("k", 1, KB), k5=0.1), "k5"),
-        ({"K": K, "model": "fisheye", "D": [*KB, 0.1]}, "Kannala-Brandt lens has four coefficients, found 5"),
+        ({"K": K, "model": "fisheye", "D": [*KB, 0.1]}, "Kannala-Brandt lens has 4 coefficients, found 5"),
         ({**NAMED, "model": "FisheyeRadTanThinPrism", "params": [0.1, 0.2]}, "'params'"),
         ({**NAMED, "cam_model": "Ocam"}, "'ocam', but it has no polynomial"),
         ({"cx": CX, "cy": CY, "a0": -400.0, "a2": 8e-4}, "begins with -400"),

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from scopemap.input.camera_files.conversions import Values
+from scopemap.input.camera_files.lens_models import LENS_MODELS
 from scopemap.input.camera_files.parsing import SEPARATORS, Fields, as_number, mappings_below, numbers_in, plain_name
 from scopemap.input.camera_files.programs import PROGRAMS, Program
 
-_ORDER = {"opencv": ("k1", "k2", "p1", "p2", "k3"), "fisheye": ("k1", "k2", "k3", "k4"), "fov": ("omega",)}
 _OUR_NAMES = {"width": "image_width", "height": "image_height", "lens": "distortion_coefficients"}
 # What conversions start from.
-_USED_UP = ("f", "b1", "b2", "sensor", *_ORDER["opencv"], *_ORDER["fisheye"], "omega")
+_USED_UP = ("f", "b1", "b2", "sensor", *(term for lens in LENS_MODELS for term in lens.terms))
 _LONGEST_QUOTE = 40
 _MOST_QUOTED = 9
 
@@ -187,8 +187,8 @@ def _in_order(model: str, names: list[str], values: Values) -> list[float]:
             expected = f"{len(names)} coefficients ({' '.join(names) or 'none'})"
             raise ValueError(f"its lens, {model}, has {expected}, found {len(listed)}{_quoted(listed)}")
         named = dict(zip(names, listed, strict=False))
-    order = names if tuple(names) == _ORDER[model][:4] else _ORDER[model]
-    return [named.get(name, 0.0) if name in names else 0.0 for name in order]
+    lens = next(lens for lens in LENS_MODELS if lens.name == model)
+    return lens.in_order({name: named.get(name, 0.0) for name in names})
 
 
 def _quoted(numbers: list[float]) -> str:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from scopemap.input.camera_files.lens_models import LENS_MODELS, OPENCV, LensModel
 from scopemap.input.camera_files.parsing import Fields, is_number, numbers_in, plain_name
-
-Kind = Literal["fisheye", "fov", "opencv", ""]
 
 LISTS = (
     "distortion_coefficients", "D", "D1", "K_dist", "distCoeffs", "dist", "DL", "dist_coeff", "dist_coefs",
@@ -30,14 +29,9 @@ _MATRIX_COUNTS = (9, 12, 16)
 _RADIAL = "k"
 _TANGENTIAL = ("p", "t", "r")
 _LISTED = ("d", "kc", "dist")
-_MOST_RADIAL = 6
-_MOST_TANGENTIAL = 2
-_MOST_FISHEYE = 4
-_ALL_RATIONAL = (4, 5, 6)
-# camodocal counts a fisheye's from 2, by the power of the angle before.
 _FROM_TWO = {2, 3, 4, 5}
-_OMEGA = ("omega", "w")
-_STRAY = re.compile(r"(k|p|s|kc)\d{1,2}|tau[xy12]|omega")
+_OWN_NAMES = {name for lens in LENS_MODELS for names in lens.own_names for name in names if len(name) > 1}
+_STRAY = re.compile("|".join([r"(k|p|s|kc)\d{1,2}", "tau[xy12]", *sorted(_OWN_NAMES)]))
 _UNREAD = re.compile(r"(?<!un)dist(?!anc|rib)|coef|radial|tangential|^param(eter)?s$", re.IGNORECASE)
 # Counts, settings and precisions of a lens, and the second camera's, are not its coefficients.
 _BESIDE = re.compile(
@@ -63,12 +57,12 @@ class _Set:
         return self.values[: max((i + 1 for i, value in enumerate(self.values) if value), default=0)]
 
 
-def coefficients_in(places: Sequence[Fields], kind: Kind) -> list[float]:
-    """Return the coefficients in mappings, in the order of the lens of that `kind` ("": the file does not say).
+def coefficients_in(places: Sequence[Fields], lens: LensModel | None) -> list[float]:
+    """Return the coefficients in mappings, in the order of the lens (None: the file does not say which).
 
     Raises `ValueError`, with the name, where a coefficient that is not zero is not used, and where two sets differ.
     """
-    sets = [found for place in places for found in _sets_at(place, kind)]
+    sets = [found for place in places for found in _sets_at(place, lens)]
     chosen = next((found for found in sets if any(found.values)), sets[0] if sets else None)
     if chosen is None:
         chosen = _Set(Fields([]), (), [])
@@ -93,7 +87,7 @@ def _agree(one: _Set, other: _Set) -> bool:
     return len(one.trimmed) == len(other.trimmed) and np.allclose(one.trimmed, other.trimmed, rtol=1e-6, atol=0)
 
 
-def _sets_at(place: Fields, kind: Kind) -> Iterator[_Set]:
+def _sets_at(place: Fields, lens: LensModel | None) -> Iterator[_Set]:
     for name, node in place.nodes(LISTS):
         if (values := numbers_in(node, name)) is not None:
             yield _Set(place, (name,), values)
@@ -105,26 +99,27 @@ def _sets_at(place: Fields, kind: Kind) -> Iterator[_Set]:
     if any(values for _, values in lists):
         radial, tangential = (dict(enumerate(values or [], start=1)) for _, values in lists)
         names = tuple(name for spellings, values in lists if values for name, _ in place.nodes(spellings))
-        yield _Set(place, names, _in_order(radial, tangential, {}, kind))
-    if kind == "fov":
-        for name in _OMEGA:
-            if (omega := place.number((name,))) is not None and not (name == "w" and any(place.nodes(("h",)))):
-                yield _Set(place, (name,), [omega])
-    yield from _named_sets(place, kind)
+        yield _Set(place, names, _in_order(radial, tangential, {}, lens))
+    for names in () if lens is None else lens.own_names:
+        own = [place.number((name,)) for name in names]
+        is_size = "w" in names and any(place.nodes(("h",)))
+        if not is_size and any(value is not None for value in own):
+            yield _Set(place, names, [value or 0.0 for value in own])
+    yield from _named_sets(place, lens)
 
 
-def _named_sets(place: Fields, kind: Kind) -> Iterator[_Set]:
+def _named_sets(place: Fields, lens: LensModel | None) -> Iterator[_Set]:
     """Yield the coefficients that have a name each."""
     radial = _numbered(place, _RADIAL)
     letters = (letter for letter in _TANGENTIAL if letter == "p" or not _is_of_pose(place, letter))
     letter, tangential = next(((at, found) for at in letters if (found := _numbered(place, at))), ("p", {}))
     if radial or tangential:
-        first = 2 if kind == "fisheye" and set(radial) == _FROM_TWO else int(0 not in radial)
+        first = 2 if lens is not None and lens.from_two and set(radial) == _FROM_TWO else int(0 not in radial)
         radial_by_order = {number - first + 1: value for number, value in radial.items()}
         tangential_by_order = {number + int(0 in tangential): value for number, value in tangential.items()}
-        names = {number - first + 1: f"k{number}" for number in radial}
-        names |= {-(number + int(0 in tangential)): f"{letter}{number}" for number in tangential}
-        yield _Set(place, tuple(names.values()), _in_order(radial_by_order, tangential_by_order, names, kind))
+        spelled = {f"k{number - first + 1}": f"k{number}" for number in radial}
+        spelled |= {f"p{number + int(0 in tangential)}": f"{letter}{number}" for number in tangential}
+        yield _Set(place, tuple(spelled.values()), _in_order(radial_by_order, tangential_by_order, spelled, lens))
     for letters_of_list in _LISTED:
         found = _numbered(place, letters_of_list)
         first = int(0 not in found)
@@ -145,33 +140,28 @@ def _numbered(place: Fields, letters: str) -> dict[int, float]:
     return {number: value for number, value in named.items() if value is not None}
 
 
-def _in_order(radial: dict[int, float], tangential: dict[int, float], names: dict[int, str], kind: Kind) -> list[float]:
+def _in_order(
+    radial: dict[int, float], tangential: dict[int, float], spelled: dict[str, str], stated: LensModel | None
+) -> list[float]:
     """Return radial and tangential coefficients, counted from 1, in the order of the lens.
 
-    `names` : of each radial one by its number, of each tangential one by minus its number. Raises `ValueError` where
-    one has no place in the lens, and where the names do not tell which lens it is.
+    spelled : names in the file, by ours. stated : the lens that the file names. Raises `ValueError` where one has no
+    place in the lens, and where the names do not tell which lens it is.
     """
-    most = _MOST_FISHEYE if kind == "fisheye" else _MOST_RADIAL
-    beyond = [names.get(i, f"radial {i}") for i, value in sorted(radial.items()) if value and i > most]
-    most = 0 if kind == "fisheye" else _MOST_TANGENTIAL
-    beyond += [names.get(-i, f"tangential {i}") for i, value in sorted(tangential.items()) if value and i > most]
-    k = [radial.get(i, 0.0) for i in range(1, _MOST_RADIAL + 1)]
-    if kind == "fisheye":
-        if beyond:
-            raise ValueError(f"a Kannala-Brandt lens has k1 k2 k3 k4 alone, found others, too: {', '.join(beyond)}")
-        return k[:_MOST_FISHEYE]
-    if beyond:
-        raise ValueError(f"{beyond[0]} in it has no place in OpenCV's lens: calibrate without it")
-    fourth = names.get(4, "k4")
-    if not kind and k[3] and not tangential:
-        raise ValueError(
-            f"it has {fourth} but no p1, and names no model: OpenCV's or a fisheye's? add `model: fisheye`"
-        )
-    if k[3] and not any(i in radial for i in _ALL_RATIONAL[1:]):
-        raise ValueError(f"{fourth} in it, without k5 and k6, is not OpenCV's, whose k4 divides: calibrate without it")
-    p = [tangential.get(i, 0.0) for i in range(1, _MOST_TANGENTIAL + 1)]
-    terms = [*k[:2], *p, *k[2:]]
-    return terms if any(terms[5:]) else terms[:5] if terms[4] else terms[:4]
+    lens = stated or OPENCV
+    named = {f"k{number}": value for number, value in sorted(radial.items())}
+    named |= {f"p{number}": value for number, value in sorted(tangential.items())}
+    if beyond := [spelled.get(name, name) for name, value in named.items() if value and name not in lens.terms]:
+        alone = f"the {lens.title} lens has {' '.join(lens.terms)} alone"
+        raise ValueError(f"{alone}, found others, too: {', '.join(beyond)}; calibrate without them")
+    if stated is None and named.get("k4") and not tangential:
+        fourth = f"it has {spelled.get('k4', 'k4')} but no p1, and names no model"
+        raise ValueError(f"{fourth}: OpenCV's or a fisheye's? add `model: fisheye`")
+    for name, others in lens.needs.items():
+        if named.get(name) and not any(other in named for other in others):
+            alone = f"{spelled.get(name, name)} in it, without {' and '.join(others)},"
+            raise ValueError(f"{alone} is another term than that of the {lens.title} lens: calibrate without it")
+    return lens.in_order(named)
 
 
 def _is_lens(node: Any) -> bool:

@@ -1,4 +1,4 @@
-"""The lens of a calibration file: its model's name, in any tool's words, and its distortion coefficients.
+"""The lens of a calibration file: its model, in any tool's words (`lens_models.py`), and its distortion coefficients.
 
 Nothing that a file says of its lens is passed over: what is not used is an error by its name (`coefficients.py`).
 """
@@ -9,24 +9,11 @@ import re
 from collections.abc import Sequence
 
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
-from scopemap.engine.cameras.lenses import FisheyeCamera, FovCamera, OpenCvCamera
-from scopemap.input.camera_files.coefficients import LISTS, Kind, coefficients_in, has_numbers
+from scopemap.input.camera_files.coefficients import LISTS, coefficients_in, has_numbers
+from scopemap.input.camera_files.lens_models import OPENCV, OTHER_DISTORTION, OTHER_PROJECTION, lens_called
 from scopemap.input.camera_files.parsing import MOST_TERMS, Fields
 
-# Words come in lower case with blanks between them. These are other lenses even where all coefficients are zero,
-_OTHER_PROJECTION = re.compile(
-    r"\bomni|\bds\b|double ?sphere|\beucm\b|\bucm\b|unified|\bc?mei\b|scaramuzza|ocam|catadioptric|equirect|panoram|"
-    r"spherical|stereographic|equisolid|orthographic|cylind|f ?theta|taylor|cahvor|fisheye ?62|mirror"
-)
 _SCARAMUZZA = re.compile(r"scaramuzza|ocam|omnidirectional")
-# and these where one is not.
-_OTHER_DISTORTION = re.compile(r"thin ?prism|division|inverse|modified|tilt")
-_FISHEYE = re.compile(r"fisheye|fish eye|\bequi(distant)?\b|kannala|\bkb[48]?\b")
-_FOV = re.compile(r"\bfov\b|\batan\b")
-_OPENCV = re.compile(
-    r"opencv|pin ?hole|perspective|plumb ?bob|rad ?tan|radial|tangential|brown|rational|standard|rectified|"
-    r"undistorted|\bnone\b"
-)
 _MODELS = (
     "camera_model", "distortion_model", "lens_model", "model", "model_type", "distortion_type", "type", "camera_type",
     "lens_type", "projection", "projection_model", "projection_type", "intrinsics_model", "intrinsics_type",
@@ -36,7 +23,6 @@ _MODELS = (
 _OF_OTHERS = {"xi": "unified omnidirectional (MEI)", "mirror_parameters": "unified omnidirectional (MEI)"}
 _FLAGS = ("fisheye_model", "fisheye", "is_fisheye")
 _LONGEST_QUOTE = 40
-_WITH_THIN_PRISM = (12, 14)
 
 
 def model_in(levels: Sequence[Fields]) -> str:
@@ -56,7 +42,7 @@ def refuse_other_lens(levels: Sequence[Fields], model: str) -> None:
     if _SCARAMUZZA.search(model):
         looked_for = "looked for as a0 a1 ..., as `polynomial`, and in OCamCalib's own text"
         raise ValueError(f"its model is {model[:_LONGEST_QUOTE]!r}, but it has no polynomial ({looked_for})")
-    if _OTHER_PROJECTION.search(model):
+    if OTHER_PROJECTION.search(model):
         raise _no_counterpart(model)
 
 
@@ -68,8 +54,7 @@ def lens_of(pinhole: PinholeCamera, levels: Sequence[Fields], model: str) -> tup
     places, note = _places(levels), ""
     if not model and (model := "fisheye" if _is_column(places) else ""):
         note = ", its lens taken as a fisheye's: D is 4x1, as cv2.fisheye returns it"
-    kind: Kind = "fisheye" if _FISHEYE.search(model) else "fov" if _FOV.search(model) else "opencv" if model else ""
-    coefficients = coefficients_in(places, kind)
+    coefficients = coefficients_in(places, lens_called(model) or (OPENCV if model else None))
     if not model and any(coefficients) and _is_undecided(places, coefficients):
         raise ValueError(
             "its four coefficients may be k1 k2 p1 p2 of OpenCV's lens or k1 k2 k3 k4 of a fisheye's: "
@@ -87,29 +72,13 @@ def with_lens(pinhole: PinholeCamera, model: str, coefficients: Sequence[float])
     """
     if len(coefficients) > MOST_TERMS:
         raise ValueError(f"it has {len(coefficients)} distortion coefficients, more than any lens")
-    lens = tuple(float(k) for k in coefficients)
-    if _OTHER_PROJECTION.search(model) or (any(lens) and _OTHER_DISTORTION.search(model)):
+    values, lens = tuple(float(k) for k in coefficients), lens_called(model)
+    if OTHER_PROJECTION.search(model) or (any(values) and OTHER_DISTORTION.search(model)):
         raise _no_counterpart(model)
-    if _FISHEYE.search(model):
-        lens = _with_count(lens, 4)
-        if len(lens) != 4:
-            raise ValueError(f"a Kannala-Brandt lens has four coefficients, found {len(lens)}")
-        return FisheyeCamera(pinhole, lens), ""
-    if _FOV.search(model):
-        lens = _with_count(lens, 1)
-        if len(lens) != 1:
-            raise ValueError(f"a lens of the model fov has one coefficient, found {len(lens)}")
-        return FovCamera(pinhole, lens[0]) if lens[0] else pinhole, ""
-    if not any(lens):
-        return pinhole, ""
-    if len(lens) in _WITH_THIN_PRISM:
-        if any(lens[8:]):
-            raise ValueError("the thin-prism and tilt coefficients s1 ... have no counterpart: calibrate without them")
-        lens = lens[:8]
-    camera = OpenCvCamera(pinhole, lens)
-    if model and not _OPENCV.search(model):
-        return camera, f", its lens taken as OpenCV's ({model[:_LONGEST_QUOTE]!r} names none)"
-    return camera, ""
+    if lens is not None or not model or not any(values):
+        return (lens or OPENCV).make(pinhole, values), ""
+    assumed = f", its lens taken as OpenCV's ({model[:_LONGEST_QUOTE]!r} names none)"
+    return OPENCV.make(pinhole, values), assumed
 
 
 def _is_column(places: Sequence[Fields]) -> bool:
@@ -125,11 +94,6 @@ def _is_undecided(places: Sequence[Fields], coefficients: Sequence[float]) -> bo
     matrices = [node for place in places for _, node in place.nodes(LISTS) if isinstance(node, Fields)]
     is_column = any((node.number(("rows",)), node.number(("cols",))) == (4, 1) for node in matrices)
     return is_column or any(any(place.nodes(("DIM",))) for place in places)
-
-
-def _with_count(lens: tuple[float, ...], count: int) -> tuple[float, ...]:
-    """Return `count` coefficients, where only zeros are missing or too many."""
-    return (*lens[:count], *[0.0] * (count - len(lens))) if not any(lens[count:]) else lens
 
 
 def _places(levels: Sequence[Fields]) -> list[Fields]:

@@ -20,6 +20,7 @@ from scopemap.input.camera_files.conversions import (
     of_toolbox_axes,
     with_affinity,
 )
+from scopemap.input.camera_files.lens_models import LENS_MODELS
 
 # What shares of the size count the centre of the first pixel as, where they count from the picture's corner.
 CORNER_PX = 0.5
@@ -215,11 +216,12 @@ PROGRAMS: tuple[Program, ...] = (
     ),
 )  # fmt: skip
 
+_LENSES = ", ".join(f"{lens.name} ({lens.title})" for lens in LENS_MODELS)
 # Programs that write the usual names (`coefficients.py`, `lens.py`, `sizes.py`, `intrinsics.py`) or plain numbers.
 OTHERS: tuple[tuple[str, str, str], ...] = (
     ("OpenCV",
      "YAML, XML, JSON: `camera_matrix` or `K`, `distortion_coefficients` or `D`, `image_width`, `image_height`",
-     "`camera_model`: opencv (default), fisheye (Kannala-Brandt), omnidirectional (Scaramuzza), fov"),
+     f"`camera_model`: {_LENSES}, omnidirectional (Scaramuzza); without one OpenCV"),
     ("ROS", "camera_info, with binning and region", "plumb_bob, rational_polynomial, equidistant"),
     ("COLMAP", "`cameras.txt`, `cameras.bin` of one camera", "all but thin-prism, division, EUCM, panoramic"),
     ("EuRoC", "sensor files", "as Kalibr"),

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
-from scopemap.engine.cameras.lenses import FisheyeCamera, FovCamera, OmnidirectionalCamera, OpenCvCamera
+from scopemap.engine.cameras.lenses import OmnidirectionalCamera
 from scopemap.engine.errors import CalibrationError
+from scopemap.input.camera_files.lens_models import LENS_MODELS, OPENCV
 
 
 def write_calibration(
@@ -26,12 +27,12 @@ def write_calibration(
     standard deviation of fx; `rate_hz` as `fps`. Raises `CalibrationError` for a lens that the format does not know
     and where the file cannot be written.
     """
-    model, terms = _lens(camera)
+    model, plane, terms = _lens(camera)
     # In memory: OpenCV takes no names outside of the system's code page on Windows.
     storage = cv2.FileStorage(".yaml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", camera.width)
     storage.write("image_height", camera.height)
-    storage.write("camera_matrix", (camera.plane if isinstance(camera, FovCamera) else camera.central).matrix)
+    storage.write("camera_matrix", plane.matrix)
     storage.write("camera_model", model)
     for name, values in terms.items():
         storage.write(name, np.array([values]))
@@ -44,15 +45,16 @@ def write_calibration(
         raise CalibrationError(f"cannot write the calibration to {file}: {error.strerror or error}") from None
 
 
-def _lens(camera: CameraModel) -> tuple[str, dict[str, Any]]:
-    """Return the name of a camera's lens, and its own terms by name; `CalibrationError` for one without a name here."""
+def _lens(camera: CameraModel) -> tuple[str, PinholeCamera, dict[str, Any]]:
+    """Return the name of a camera's lens, the camera that takes its plane to pixels, and its own terms by name.
+
+    Raises `CalibrationError` for a lens without a name here.
+    """
     if isinstance(camera, OmnidirectionalCamera):
-        return "omnidirectional", {"polynomial": camera.polynomial, "stretch": camera.stretch}
-    if isinstance(camera, FovCamera):
-        return "fov", {"distortion_coefficients": (camera.omega,)}
-    if isinstance(camera, FisheyeCamera | OpenCvCamera):
-        model = "fisheye" if isinstance(camera, FisheyeCamera) else "opencv"
-        return model, {"distortion_coefficients": camera.distortion}
+        return "omnidirectional", camera.central, {"polynomial": camera.polynomial, "stretch": camera.stretch}
     if isinstance(camera, PinholeCamera):
-        return "opencv", {"distortion_coefficients": (0.0,) * 5}
+        return OPENCV.name, camera, {"distortion_coefficients": (0.0,) * 5}
+    for lens in LENS_MODELS:
+        if isinstance(camera, lens.camera):
+            return lens.name, camera.plane, {"distortion_coefficients": lens.coefficients(camera)}
     raise CalibrationError(f"cannot write the calibration: {type(camera).__name__} is no lens that the format knows")
