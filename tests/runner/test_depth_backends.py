@@ -12,7 +12,8 @@ from scopemap.engine.cameras.rectification import Rectifier
 from scopemap.engine.config import Config, DepthSettings
 from scopemap.engine.depth.shading import ShadingDepth
 from scopemap.engine.errors import SettingsError, WeightsError
-from scopemap.runner.depth_backends import NETWORKS, DepthNetwork, create_depth
+from scopemap.runner.depth_backends import create_depth
+from scopemap.runner.depth_networks import NETWORKS, DepthNetwork
 from scopemap.runner.estimators import missing_weights
 from scopemap.runner.network_cost import network_cost
 

@@ -15,7 +15,7 @@ from scopemap.engine.depth.estimate import DepthEstimator
 from scopemap.engine.errors import WeightsError
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.flow.estimator import FlowEstimator
-from scopemap.engine.flow.flows import create_flow
+from scopemap.engine.flow.flows import FLOWS, create_flow
 from scopemap.engine.mapping.bundle_problem import TRACKED
 from scopemap.engine.mapping.depth_correction import MAX_LOG_FACTOR
 from scopemap.engine.models import device, weights
@@ -23,7 +23,8 @@ from scopemap.engine.tracking.alike import AlikeFeatures
 from scopemap.engine.tracking.features import SiftFeatures
 from scopemap.input.mask_files import masks_of
 from scopemap.input.sequence import Sequence
-from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder, needs_weights
+from scopemap.runner.depth_backends import create_anchor, create_depth, files_folder
+from scopemap.runner.depth_networks import needs_weights
 
 if TYPE_CHECKING:
     from scopemap.input.depth_files import FilesOfInput
@@ -132,10 +133,7 @@ def _networks(config: Config, other_flows: tuple[str, ...]) -> list[tuple[tuple[
         named = {name: () if model and Path(model).is_dir() else (model or name,) for name, model in models.items()}
         needed += [(PACKAGES, names) for names in named.values()]
     flows = {networks.flow, networks.keyframe_flow, *other_flows}
-    if flows & {"raft-small", "raft-large"}:
-        from scopemap.engine.flow import raft
-
-        needed += [(raft.PACKAGES, names) for size, names in raft.CHECKPOINTS.items() if f"raft-{size}" in flows]
+    needed += [flow.needs() for name, flow in FLOWS.items() if name in flows and flow.needs is not None]
     if networks.perceptual == "lpips":
         needed.append((perceptual.PACKAGES, perceptual.CHECKPOINTS))
     return needed

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError, SettingsError
+from scopemap.engine.flow.flows import FLOWS
 from scopemap.engine.mapping.mapper import MOST_OBSERVATIONS
 from scopemap.engine.notices import Notice
 from scopemap.input.sequence import Sequence
-from scopemap.runner.depth_backends import needs_weights
+from scopemap.runner.depth_networks import needs_weights
 
 _MB = 1_000_000
 _M_ARENA_MAX = -8  # of glibc's malloc.h
@@ -31,7 +32,6 @@ _FRAME_BYTES = 5_000
 _OBSERVATION_BYTES = 1_100
 _BLOCK_BYTES = 45_000
 _AHEAD = (2, 1)
-_UNMEASURED = ("raft", "lpips")
 _LEAST_OBSERVATIONS = 50_000
 _LEAST_BLOCKS = 1_000
 
@@ -82,7 +82,8 @@ def memory_plan(config: Config, sequence: Sequence) -> MemoryPlan:
     if memory_mb is None:
         return MemoryPlan()
     used = (config.depth.backend, config.depth.anchor, networks.flow, networks.keyframe_flow, networks.perceptual)
-    if unknown := sorted({name for name in used if name.startswith(_UNMEASURED) or needs_weights(name)}):
+    flows = {name for name, flow in FLOWS.items() if flow.needs is not None}
+    if unknown := sorted({name for name in used if name in flows or name == "lpips" or needs_weights(name)}):
         raise SettingsError(
             f"--memory (run.memory_mb) cannot be guaranteed with {', '.join(unknown)}: PyTorch's own use is not known"
         )

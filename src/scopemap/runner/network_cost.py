@@ -1,6 +1,6 @@
 """What the networks of the extra `networks` will cost a run on a CPU, in one sentence before it starts.
 
-Measured at 400x320 to 1350x1080 px; networks of depth have theirs in `NETWORKS`. RAFT compares all pairs of
+Measured at 400x320 to 1350x1080 px; networks have their own in `NETWORKS` and `FLOWS`. RAFT compares all pairs of
 pixels of an eighth of the working size: a part of its time, and nearly all of its memory, grow with their square.
 """
 
@@ -9,13 +9,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from scopemap.engine.config import Config
+from scopemap.engine.flow.flows import FLOWS
 from scopemap.engine.models.device import choose_device, cpu_threads
 from scopemap.input.sequence import Sequence
-from scopemap.runner.depth_backends import NETWORKS
+from scopemap.runner.depth_networks import NETWORKS
 
-# Seconds of one core: of one flow, for each million pixels and each square of that; of the perceptual distance and of
-# the other stages, for each million pixels.
-_FLOW_S = {"raft-small": (7.5, 2.0), "raft-large": (26.0, 10.5)}
+# Seconds of one core of the perceptual distance and of the other stages, for each million pixels.
 _PERCEPTUAL_S = {"lpips": 0.8}
 _STAGES_S = 2.3
 # GB: of Python with PyTorch and kernels, of the other stages for each million pixels, and of the correlations of one
@@ -33,16 +32,17 @@ def network_cost(config: Config, sequence: Sequence) -> str:
     anchor, every_frame = [depth.anchor] * (depth.anchor != depth.backend), [depth.backend]
     perceptual = [networks.perceptual] * refines
     of_depth = {name: network for name, network in NETWORKS.items() if network.has_weights}
-    used = {*flows, *anchor, *every_frame, *perceptual} & {*_FLOW_S, *of_depth, *_PERCEPTUAL_S}
+    of_flow = {name: flow.seconds for name, flow in FLOWS.items() if flow.needs}
+    used = {*flows, *anchor, *every_frame, *perceptual} & {*of_flow, *of_depth, *_PERCEPTUAL_S}
     if not used or choose_device(networks.device) != "cpu":
         return ""
     c, cores = sequence.camera, cpu_threads()
     mpx = c.width * c.height / 1e6
-    frame_s = sum(a * mpx + b * mpx**2 for a, b in (_FLOW_S.get(name, (0.0, 0.0)) for name in flows))
+    frame_s = sum(a * mpx + b * mpx**2 for a, b in (of_flow[name] for name in flows if name in of_flow))
     frame_s += sum(of_depth[name].seconds for name in every_frame if name in of_depth) + _STAGES_S * mpx
     frame_s += sum(_PERCEPTUAL_S.get(name, 0.0) * mpx for name in perceptual)
     once_s = sum(of_depth[name].seconds for name in anchor if name in of_depth)
-    gb = _START_GB + _STAGES_GB * mpx + _FLOW_GB * mpx**2 * any(name in _FLOW_S for name in flows)
+    gb = _START_GB + _STAGES_GB * mpx + _FLOW_GB * mpx**2 * any(name in of_flow for name in flows)
     gb += sum(of_depth[name].gigabytes for name in {*anchor, *every_frame} & of_depth.keys())
     frames = sequence.used_count
     all_s = "" if frames is None else f", {(once_s + frames * frame_s) / cores / 60:.0f} min for {frames} frames,"

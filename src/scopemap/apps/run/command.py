@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from scopemap.engine.flow.flows import flows_in_words
+from scopemap.runner.depth_networks import networks_in_words
 from scopemap.terminal import options
 from scopemap.terminal.figures import print_json, print_warnings
 from scopemap.terminal.interruption import Interruption
@@ -71,13 +73,11 @@ def run(
     near_far: options.NearFar = None,
     depth: Annotated[
         str | None,
-        typer.Option(help="Depth: scopenet (default), shading, depth-anything, depth-pro, stereo, or files:FOLDER."),
+        typer.Option(help=f"Depth: {networks_in_words()}, stereo, or files:FOLDER."),
     ] = None,
     flow: Annotated[
         str | None,
-        options.advanced(
-            help="Optical flow: dis (default), raft-small, raft-large (both need the extra networks), or none."
-        ),
+        options.advanced(help=f"Optical flow: {flows_in_words()}."),
     ] = None,
     colours: Annotated[
         Literal["texture", "albedo", "raw"] | None,

@@ -22,7 +22,8 @@ class DepthSettings(StageSettings):
     method: str = Field("scopemap", description="chooses advanced settings (below): scopemap, realtime, paper, ...")
     backend: str = Field(
         "scopenet",
-        description="scopenet | shading | depth-anything | depth-pro | files:FOLDER | stereo (of input.stereo=use)",
+        description="depth estimator: one that `scopemap run --help` names at `--depth`, files:FOLDER, or stereo (of "
+        "input.stereo=use)",
     )
     model: str = Field(
         "", description="weights of the network: hub id or folder, for scopenet a .onnx file; empty: the default"
@@ -128,8 +129,7 @@ class NetworkSettings(Settings):
 
     flow: str = Field(
         "dis",
-        description="flow from frame to frame: dis | raft-small | raft-large (both with the extra `networks` and their "
-        "weights) | none",
+        description="flow from frame to frame: one that `scopemap run --help` names at `--flow`",
     )
     keyframe_flow: str = Field(
         "dis",
