@@ -13,7 +13,7 @@ import json
 import warnings
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -22,11 +22,11 @@ from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.config import Config
 from scopemap.engine.errors import InputError, reporting
 from scopemap.engine.fusion.mesh_files import read_mesh, read_textured, save_mesh
+from scopemap.engine.notices import Level
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import Trajectory, write_tum
 from scopemap.result.depth_maps import DepthReader
 from scopemap.result.frame_table import FrameTable
-from scopemap.result.stated_verdict import StatedVerdict
 from scopemap.result.surface_segments import SurfaceSegment, read_segments, save_segments, surface_file
 from scopemap.result.trajectory_folders import read_frames, submap_folders
 from scopemap.result.wording import scale_words
@@ -34,6 +34,13 @@ from scopemap.result.wording import scale_words
 _SCALE_NOT_STATED = "scale unknown (the run does not state it): compare shapes, not sizes"
 _MOST_PX = 1 << 15
 _SHOWN_SETTINGS = 3
+
+
+class StatedVerdict(NamedTuple):
+    """The verdict on a result as its run stated it: the level, and the codes of its reasons, the worst first."""
+
+    level: Level
+    codes: tuple[str, ...]
 
 
 class Result:
