@@ -7,17 +7,15 @@ from typing import Annotated, Literal
 
 import typer
 
+from scopemap.apps.export.formats import FORMATS, export_run, frames_of_lines
 from scopemap.terminal.figures import print_json
 from scopemap.terminal.options import AsJson, InputNow, Quiet, Unit, warn_of_damage
 
-To = Literal[
-    "nerfstudio", "colmap", "endogslam", "endonerf", "gaussians", "pointcloud", "ply", "obj", "stl", "glb",
-    "surfaces", "slicer", "dicom", "tum", "kitti", "euroc", "mcap",
-]  # fmt: skip
-
 
 def export(
-    to: Annotated[To, typer.Option("--to", help="Format to write (docs/exports.md).")],
+    to: Annotated[
+        str, typer.Option("--to", metavar=f"<{'|'.join(FORMATS)}>", help="Format to write (docs/exports.md).")
+    ],
     out: Annotated[
         Path,
         typer.Option(help="File or folder to write, depending on the format (docs/exports.md)."),
@@ -36,8 +34,8 @@ def export(
 
     The export holds the tracked frames, the surface or depth, depending on the format.
     """
-    from scopemap.apps.export.formats import export_run, frames_of_lines
-
+    if to not in FORMATS:
+        raise typer.BadParameter(f"'{to}' is not one of {', '.join(FORMATS)}.", param_hint="--to")
     warn_of_damage(run, silent=quiet)
     scale = export_run(run, to, out, units, axes, source=source)
     lines = frames_of_lines(run, to, out)

@@ -1,24 +1,25 @@
-"""The formats of `scopemap export`: what each is written to, and in which units and axes."""
+"""The formats of `scopemap export`: what each is written to, and in which units and axes.
+
+Nothing is loaded of a format that is not written: the help of the command reads the table.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Literal
 
-from scopemap.apps.export.dicom_stl import write_dicom_stl
-from scopemap.apps.export.image_layouts import write_colmap, write_endogslam, write_endonerf, write_nerfstudio
-from scopemap.apps.export.mcap_bag import write_mcap
-from scopemap.apps.export.points import write_gaussians, write_points
-from scopemap.apps.export.surfaces import Axes, write_glb, write_slicer, write_surface, write_surfaces
-from scopemap.apps.export.trajectories import lines_in_words, write_euroc_file, write_kitti_file, write_kitti_folder
 from scopemap.engine.errors import InputError, SettingsError
-from scopemap.input.trajectory.trajectory import Unit, write_tum
-from scopemap.report.reference_scale import in_mm
-from scopemap.result.result import Result
 
-Write = Callable[[Result, Path, Unit, Axes], None]
+if TYPE_CHECKING:
+    from scopemap.apps.export.surfaces import Axes
+    from scopemap.input.trajectory.trajectory import Unit
+    from scopemap.result.result import Result
+
+    Write = Callable[[Result, Path, Unit, Axes], None]
 
 
 @dataclass(frozen=True)
@@ -39,41 +40,49 @@ class ExportFormat:
     of_frames: bool = False
 
 
+def _by(function: str, *needs: Literal["unit", "axes"]) -> Write:
+    """Return what calls a function of this package, MODULE.NAME, with result, path, and of unit and axes what it needs.
+
+    Its module is loaded by the call.
+    """
+
+    def write(run: Result, out: Path, unit: Unit, axes: Axes) -> None:
+        module, _, name = function.partition(".")
+        given = {"unit": unit, "axes": axes}
+        getattr(import_module(f"scopemap.apps.export.{module}"), name)(run, out, *(given[need] for need in needs))
+
+    return write
+
+
 # Files of poses without numbers, in a folder of their format.
 _UNNUMBERED = {"kitti": "poses.txt", "endogslam": "pose.txt"}
 _ANY_AXES: tuple[Axes, ...] = ("lps", "ras", "opencv", "gltf")
 FORMATS: dict[str, ExportFormat] = {
-    "nerfstudio": ExportFormat(lambda run, out, unit, axes: write_nerfstudio(run, out), ("m",), of_frames=True),
-    "colmap": ExportFormat(lambda run, out, unit, axes: write_colmap(run, out, unit), ("mm", "m"), of_frames=True),
-    "endogslam": ExportFormat(lambda run, out, unit, axes: write_endogslam(run, out), ("mm",), of_frames=True),
-    "endonerf": ExportFormat(lambda run, out, unit, axes: write_endonerf(run, out), ("mm",), of_frames=True),
+    "nerfstudio": ExportFormat(_by("image_layouts.write_nerfstudio"), ("m",), of_frames=True),
+    "colmap": ExportFormat(_by("image_layouts.write_colmap", "unit"), ("mm", "m"), of_frames=True),
+    "endogslam": ExportFormat(_by("image_layouts.write_endogslam"), ("mm",), of_frames=True),
+    "endonerf": ExportFormat(_by("image_layouts.write_endonerf"), ("mm",), of_frames=True),
     "tum": ExportFormat(
-        lambda run, out, unit, axes: write_tum(out, run.tracked.trajectory, unit=unit, comment=run.scale),
-        ("m", "mm"),
-        ending=".txt",
-        is_text=True,
-        of_frames=True,
+        _by("trajectories.write_tum_file", "unit"), ("m", "mm"), ending=".txt", is_text=True, of_frames=True
     ),
     "kitti": ExportFormat(
-        lambda run, out, unit, axes: write_kitti_folder(run, out, unit),
+        _by("trajectories.write_kitti_folder", "unit"),
         ("m", "mm"),
         is_text=True,
-        write_file=lambda run, out, unit, axes: write_kitti_file(run, out, unit),
+        write_file=_by("trajectories.write_kitti_file", "unit"),
         of_frames=True,
     ),
-    "euroc": ExportFormat(
-        lambda run, out, unit, axes: write_euroc_file(run, out), ("m",), ending=".csv", is_text=True, of_frames=True
-    ),
-    "ply": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".ply"),
-    "surfaces": ExportFormat(write_surfaces, ("mm", "m"), _ANY_AXES, of_frames=True),
-    "obj": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".obj"),
-    "stl": ExportFormat(write_surface, ("mm", "m"), _ANY_AXES, ".stl"),
-    "glb": ExportFormat(lambda run, out, unit, axes: write_glb(run, out), ("m",), ("gltf",), ".glb"),
-    "slicer": ExportFormat(lambda run, out, unit, axes: write_slicer(run, out), ("mm",), ("lps",)),
-    "pointcloud": ExportFormat(lambda run, out, unit, axes: write_points(run, out, unit), ("mm", "m"), ending=".ply"),
-    "gaussians": ExportFormat(lambda run, out, unit, axes: write_gaussians(run, out, unit), ("mm", "m"), ending=".ply"),
-    "mcap": ExportFormat(lambda run, out, unit, axes: write_mcap(run, out), ("m",), ending=".mcap", of_frames=True),
-    "dicom": ExportFormat(write_dicom_stl, ("mm", "m"), ("lps",), ".dcm"),
+    "euroc": ExportFormat(_by("trajectories.write_euroc_file"), ("m",), ending=".csv", is_text=True, of_frames=True),
+    "ply": ExportFormat(_by("surfaces.write_surface", "unit", "axes"), ("mm", "m"), _ANY_AXES, ".ply"),
+    "surfaces": ExportFormat(_by("surfaces.write_surfaces", "unit", "axes"), ("mm", "m"), _ANY_AXES, of_frames=True),
+    "obj": ExportFormat(_by("surfaces.write_surface", "unit", "axes"), ("mm", "m"), _ANY_AXES, ".obj"),
+    "stl": ExportFormat(_by("surfaces.write_surface", "unit", "axes"), ("mm", "m"), _ANY_AXES, ".stl"),
+    "glb": ExportFormat(_by("surfaces.write_glb"), ("m",), ("gltf",), ".glb"),
+    "slicer": ExportFormat(_by("surfaces.write_slicer"), ("mm",), ("lps",)),
+    "pointcloud": ExportFormat(_by("points.write_points", "unit"), ("mm", "m"), ending=".ply"),
+    "gaussians": ExportFormat(_by("points.write_gaussians", "unit"), ("mm", "m"), ending=".ply"),
+    "mcap": ExportFormat(_by("mcap_bag.write_mcap"), ("m",), ending=".mcap", of_frames=True),
+    "dicom": ExportFormat(_by("dicom_stl.write_dicom_stl", "unit", "axes"), ("mm", "m"), ("lps",), ".dcm"),
 }
 _NO_TEXT = {form.ending for form in FORMATS.values() if form.ending and not form.is_text}
 # Of files; other names with a point in them, such as exam.2, may be folders'.
@@ -99,6 +108,9 @@ def export_run(
     kept and gives the scale of what is written (`in_mm`). Raises `SettingsError` for units and axes that the format
     does not have, `InputError` where `out` is there already, cannot be written, or the run lacks what it needs.
     """
+    from scopemap.report.reference_scale import in_mm
+    from scopemap.result.result import Result
+
     form = FORMATS[name]
     for option, given, possible in (("units", unit, form.units), ("axes", axes, form.axes)):
         if given is not None and given not in possible:
@@ -134,6 +146,9 @@ def frames_of_lines(folder: Path, name: str, out: Path) -> str:
     """
     if name not in _UNNUMBERED:
         return ""
+    from scopemap.apps.export.trajectories import lines_in_words
+    from scopemap.result.result import Result
+
     return lines_in_words(Result(folder), out / _UNNUMBERED[name] if out.is_dir() else out)
 
 

@@ -1,4 +1,4 @@
-"""Camera paths as KITTI and EuRoC write them; evo reads both.
+"""Camera paths as TUM, KITTI and EuRoC write them; evo reads both.
 
 Sources: cvlibs.net/datasets/kitti/eval_odometry.php; Burri et
 al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
@@ -11,10 +11,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit, numbers_file, write_kitti
+from scopemap.input.trajectory.trajectory import MM_PER_UNIT, Unit, numbers_file, write_kitti, write_tum
 from scopemap.result.result import Result
 
 _NS_PER_S = 1e9
+
+
+def write_tum_file(run: Result, file: Path, unit: Unit) -> None:
+    """Write a line per tracked frame, with its time, and the scale as a comment."""
+    write_tum(file, run.tracked.trajectory, unit=unit, comment=run.scale)
 
 
 def write_kitti_folder(run: Result, folder: Path, unit: Unit) -> None:
