@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from scopemap.engine.errors import AlignmentError
 from scopemap.engine.geometry.align import Similarity
 from scopemap.engine.geometry.se3 import inverse, se3_exp, so3_exp
+from scopemap_bench.evaluation.protocol_words import PROTOCOL_WORDS
 from scopemap_bench.evaluation.protocols import PROTOCOLS, af_figures
 from tests.support.sample_trajectories import as_trajectory, evo_pair, last_digit, random_pair, vector_a
 
@@ -51,6 +52,10 @@ def evo_statistics(estimated: np.ndarray, reference: np.ndarray, *, scale: bool)
 
 
 # ---- names
+
+
+def test_the_help_names_the_protocols_that_there_are() -> None:
+    assert set(PROTOCOL_WORDS) == set(PROTOCOLS)
 
 
 @pytest.mark.parametrize("name", OF_FEW_FRAMES)

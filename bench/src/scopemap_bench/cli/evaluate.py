@@ -8,6 +8,7 @@ import typer
 
 from scopemap.apps.evaluate.measures import Compared
 from scopemap.engine.errors import CalibrationError, InputError, SettingsError
+from scopemap_bench.evaluation.protocol_words import PROTOCOL_WORDS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,10 +72,7 @@ def protocols(
     compared: Compared,
     protocol: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Also measure by evo, af, endogslam, surgcut3r, free-surgs, simcol, robust-pose-estimator, "
-            "oneslam or climb."
-        ),
+        typer.Option(help=f"Also measure by {', '.join(PROTOCOL_WORDS)}."),
     ] = None,
 ) -> dict[str, Any]:
     """Return a group of figures for each protocol asked for."""

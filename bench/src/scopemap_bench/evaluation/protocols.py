@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from importlib import resources
 
 import numpy as np
 from scipy.special import stdtrit
@@ -23,6 +21,7 @@ from scopemap.evaluation.poses import (
 )
 from scopemap.input.trajectory.trajectory import Trajectory
 from scopemap_bench.climb.figures import LEAST_FRAMES, climb_figures
+from scopemap_bench.evaluation.protocol_words import PROTOCOL_WORDS
 
 _EVO_MODES: tuple[AlignMode, ...] = ("none", "se3", "sim3")
 _EVO_STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
@@ -236,10 +235,9 @@ def _free_surgs(estimated: np.ndarray, reference: np.ndarray) -> dict[str, float
 
 
 def _described(measures: dict[str, Callable[[Trajectory, Trajectory], dict[str, float]]]) -> Iterator[Protocol]:
-    words = tomllib.loads((resources.files("scopemap_bench") / "protocols.toml").read_text(encoding="utf-8"))
     for name, measure in measures.items():
-        description = words[name]["description"].format(least_frames=LEAST_FRAMES)
-        yield Protocol(name, description, words[name]["source"], measure)
+        words = PROTOCOL_WORDS[name]
+        yield Protocol(name, words["description"].format(least_frames=LEAST_FRAMES), words["source"], measure)
 
 
 _OF_POSES = {
