@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,15 @@ if workers := os.environ.get("PYTEST_XDIST_WORKER_COUNT"):
 _DEFAULT = Path(__file__).resolve().parents[2] / "shared" / "data"
 # What a quick test does without.
 NOT_QUICK = ("slow", "real", "networks", "dev", "browser", "cluster")
+# A file of which no test is quick.
+NOTHING_QUICK = re.compile(rf"^pytestmark = \[?\s*pytest\.mark\.({'|'.join(NOT_QUICK)})\b", re.MULTILINE)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files without quick tests where only these are asked for: importing torch and others takes seconds."""
+    if config.option.markexpr != "quick" or collection_path.suffix != ".py":
+        return None
+    return NOTHING_QUICK.search(collection_path.read_text(encoding="utf-8")) is not None or None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
