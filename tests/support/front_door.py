@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import sys
+from functools import cache
 from typing import Any
 from unittest.mock import patch
 
 import pytest
+import typer.main
 
 from scopemap.cli.app import main
+
+# Typer puts all commands and options together at every call, which takes longer than most of the commands tested.
+PUT_TOGETHER_ONCE = cache(typer.main.get_command)
 
 
 def call(*arguments: object) -> int:
     """Return the exit code of `scopemap ARGUMENTS`."""
-    with patch.object(sys, "argv", ["scopemap", *map(str, arguments)]), pytest.raises(SystemExit) as caught:
+    given = patch.object(sys, "argv", ["scopemap", *map(str, arguments)])
+    with given, patch.object(typer.main, "get_command", PUT_TOGETHER_ONCE), pytest.raises(SystemExit) as caught:
         main()
     return caught.value.code if isinstance(caught.value.code, int) else int(caught.value.code is not None)
 
