@@ -191,7 +191,7 @@ def test_several_faults_are_reported_at_once() -> None:
     "content",
     [
         *(b"[odometry\nhuber=1", b"\xff\xfe\x00", b"a = " + b"[" * 100_000, b"a = " + b"{a=" * 2_000),
-        *(b"[" + b"a." * 50_000 + b"b]\nx = 1", b"tracking.keyframe_every = " + b"9" * 5000),
+        *(b"[" + b"a." * 5_000 + b"b]\nx = 1", b"tracking.keyframe_every = " + b"9" * 5000),
     ],
 )
 def test_an_unreadable_file_is_refused(tmp_path: Path, content: bytes) -> None:
