@@ -13,6 +13,8 @@ import numpy as np
 from tests.support.drawn_clips import RATE, SIZE, tissue
 
 WIDTH, HEIGHT = SIZE
+# Of H.264: without loss; the preset takes a tenth of the time of the usual one, and a third to decode.
+LOSSLESS = {"qp": "0", "preset": "ultrafast"}
 
 
 def stereo(number: int, disparity: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +66,7 @@ def encode(
 ) -> Path:
     """A video at 25 frames/s that loses next to nothing; `prepare` sets what the stream says of itself."""
     with av.open(str(file), "w") as container:
-        stream = container.add_stream(codec, rate=RATE, options={"qp": "0"} if options is None else options)
+        stream = container.add_stream(codec, rate=RATE, options=LOSSLESS if options is None else options)
         stream.height, stream.width = pictures[0].shape[:2]
         stream.pix_fmt = pix_fmt
         prepare(stream)
