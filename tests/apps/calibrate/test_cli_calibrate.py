@@ -109,8 +109,11 @@ def test_two_views_in_a_picture_are_read_as_a_run_reads_them(calibrate: Say, fra
         ((*BOARD, "--set", "input.stereo=both"), "input.stereo"),
     ],
 )
-def test_refusals(arguments: tuple[object, ...], words: str, calibrate: Say, frames: Path) -> None:
-    code, out, err = calibrate(frames, *arguments)
+def test_refusals(arguments: tuple[object, ...], words: str, calibrate: Say, tmp_path: Path) -> None:
+    """Before any picture is looked for a board."""
+    (tmp_path / "frames").mkdir()
+    save(tmp_path / "frames" / "0.png", np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    code, out, err = calibrate("frames", *arguments)
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert words in err
     code, _, err = calibrate("none.mp4", *BOARD)
