@@ -1,9 +1,9 @@
-"""Findings about a video's frames: its rate, repeated, blank, blurred frames, odd colours, cuts, motion.
+"""Findings about a video: its rate, repeated, blank, blurred frames, odd colours, cuts, motion, kind of endoscope.
 
-Each check takes a `Clip` and yields findings, with the option that answers each as its advice. What no option answers
-is no finding: the facts have the usual exposure and motion, and the forecast says what they mean for a run. The limits
-of motion and texture separate clips that runs track whole (correlation above 0.84, motion below 2 % of width, sharpness
-above 0.015) from a colonoscopy and a bare tube of which they lost most frames.
+Each check takes a `Clip`, or what else is known of the pictures, and yields findings, with the option that answers each
+as its advice. What no option answers is no finding: the facts have the usual exposure and motion, and the forecast says
+what they mean for a run. The limits of motion and texture separate clips that runs track whole (correlation above 0.84,
+motion below 2 % of width, sharpness above 0.015) from a colonoscopy and a bare tube of which they lost most frames.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from scopemap.apps.inspect.clip import Clip, Segment, VideoFinding, covered
+from scopemap.apps.inspect.field_shape import Field
 from scopemap.input.video_format.stereo_packing import Packing
 
 _BLACK_LEVEL = 16.0
@@ -30,6 +31,10 @@ _CUT = 0.2
 _LIKE = 0.7
 _SOME = 0.05  # shares of the frames
 _MANY = 0.25
+_WITH_EYEPIECE = ("laparoscope", "cystoscope", "sinus", "bronchoscope", "ureteroscope")
+_WITH_CUT_CORNERS = ("colonoscope", "gastroscope")
+_SQUARE = 0.05
+_MOST_IN_BOX = 0.95  # share of the box around the field from which its corners may be those of a round field
 
 
 def check_rate(clip: Clip) -> Iterator[VideoFinding]:
@@ -162,3 +167,38 @@ def forecast(clip: Clip) -> str:
         jumps = f", {cuts} cut{'s' * (cuts != 1)}" if cuts else ""
         return f"{which}fair: {lost} frames are hard to track{jumps}; the surface may break into submaps there"
     return f"{which}good: motion, sharpness and texture suit a reconstruction"
+
+
+def check_scope(field: Field, size: tuple[int, int], *, stereo: bool) -> Iterator[VideoFinding]:
+    """Yield which kinds of endoscope the pictures are typical of, where they tell."""
+    words, kinds = _guessed_scopes(field, size, stereo=stereo)
+    if kinds:
+        named = ", ".join(kinds[:-1]) + " or " * (len(kinds) > 1) + kinds[-1]
+        advice = "" if len(kinds) == 1 else ": name the one that it is"
+        yield VideoFinding("info", "scope", f"{words}: typical of {named}", f"--scope {'|'.join(kinds)}{advice}")
+
+
+def _guessed_scopes(field: Field, size: tuple[int, int], *, stereo: bool) -> tuple[str, tuple[str, ...]]:
+    """Return what of a picture tells the kind of endoscope, in words, and the kinds; "" and none where nothing does.
+
+    A telescope or a bundle of fibres shows a camera behind it a round picture (Budd et al., arXiv 2210.14771); a
+    capsule's is round, too (Prasath et al., "Mucosal Region Detection and 3D Reconstruction in Wireless Capsule
+    Endoscopy Videos"), and square. C3VD's colonoscope has cut corners; that gastroscopes have them is a guess. Stereo
+    endoscopes of all data sets that we read are laparoscopes.
+
+    size : width and height of a picture, px. stereo : whether a picture holds two views.
+    """
+    left, top, right, bottom = field.box
+    across, down = right - left, bottom - top
+    if stereo:
+        return "two views", ("laparoscope",)
+    if field.shape == "circle":
+        return "a round field of view", _WITH_EYEPIECE + ("capsule",) * _is_square(*size)
+    is_square = _is_square(across * size[0], down * size[1])
+    if field.shape == "cut corners" and field.share < _MOST_IN_BOX * across * down and not is_square:
+        return "a field of view with cut corners", _WITH_CUT_CORNERS
+    return "", ()
+
+
+def _is_square(width: float, height: float) -> bool:
+    return abs(width - height) <= _SQUARE * max(width, height)

@@ -16,7 +16,6 @@ from scopemap.apps.inspect.clip import Clip, VideoFinding
 from scopemap.apps.inspect.container import read_container
 from scopemap.apps.inspect.field_shape import Field, FieldWatcher, ShareBox
 from scopemap.apps.inspect.frame_measures import FrameInspector, InspectedFrame
-from scopemap.apps.inspect.scope_guess import check_scope
 from scopemap.engine.config import InputSettings
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import Frame
@@ -135,7 +134,7 @@ def inspect(
         *checks.check_packing(packed, interlaced=interlaced),
         *checks.check_repeats(clip),
         *(finding for watcher in (field, overlays, insets) for finding in watcher.findings()),
-        *([] if sequence.calibrated else check_scope(field.field(), size, stereo=packed is not None)),
+        *([] if sequence.calibrated else checks.check_scope(field.field(), size, stereo=packed is not None)),
         *checks.check_frames(clip),
         *checks.check_dangers(clip),
     ]
