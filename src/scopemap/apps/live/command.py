@@ -82,7 +82,7 @@ def live(
 
     from scopemap.apps.coverage.live_map import KeptDepth, LiveCoverage
     from scopemap.apps.live.live import LiveSession, finished
-    from scopemap.apps.live.shown import ShownSession
+    from scopemap.apps.live.live_status import ShownSession
     from scopemap.input.live_source import LiveSource
     from scopemap.input.opening import sequence_of
     from scopemap.report.frame_pictures import FramePictures
@@ -118,7 +118,7 @@ def live(
                 "stop": session.stop,
             }
             if shown is not None:
-                stack.enter_context(shown.watch(session))
+                stack.enter_context(shown.watch(session.status))
             stack.enter_context(_controls(session, seconds, silent=silent))
             reconstructor = session.run()
             covered.settle()  # it reads the depth that is corrected now
