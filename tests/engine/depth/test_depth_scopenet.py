@@ -22,9 +22,8 @@ from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.cameras.rectification import Rectifier
 from scopemap.engine.config import DepthSettings
 from scopemap.engine.depth.scopenet import estimator as module
-from scopemap.engine.depth.scopenet.colours import one_colour
 from scopemap.engine.depth.scopenet.estimator import WEIGHTS_NAME, ScopeNetDepth
-from scopemap.engine.depth.scopenet.planes import input_planes
+from scopemap.engine.depth.scopenet.planes import input_planes, one_colour
 from scopemap.engine.errors import WeightsError
 from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.srgb import LINEAR

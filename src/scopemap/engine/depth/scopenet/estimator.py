@@ -20,8 +20,7 @@ import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.depth.estimate import DepthEstimate
-from scopemap.engine.depth.scopenet.colours import one_colour
-from scopemap.engine.depth.scopenet.planes import INSTRUMENTS, PLANES, STRIDE, input_planes
+from scopemap.engine.depth.scopenet.planes import INSTRUMENTS, PLANES, STRIDE, input_planes, one_colour
 from scopemap.engine.errors import SettingsError, WeightsError
 from scopemap.engine.frame import Frame
 from scopemap.engine.models import weights

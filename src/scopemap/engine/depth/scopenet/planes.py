@@ -1,4 +1,9 @@
-"""Input planes of the network: colour, brightness, ray directions and valid pixels."""
+"""What the network sees: its input planes, and pictures whose colour tells nothing of distance.
+
+Blood absorbs green and blue, and hardly red: pale and dark tissue differ least in red, and what remains is the lamp's
+fall-off. So a picture in the tissue's one colour, and in grey, by the brightness of red, asks the network once more.
+Where red saturates, the picture's own colours are all there is.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +18,10 @@ INSTRUMENTS = "instruments"  # name of that output
 STRIDE = 32  # of the network: both sides of its input are multiples
 # Below this linear brightness (sRGB level 3 of 255) there is only noise.
 _DARKEST = 1e-3  # guard
+# Linear red from which on it counts less, and from which on it does not count: sRGB levels 188 and 237.
+_SATURATES = 0.5
+_SATURATED = 0.85  # sRGB level 237
+_LINEAR = LINEAR.astype(np.float32)
 _HALF_LINEAR = (0.5 * LINEAR).astype(np.float32)  # brightness is the mean of red and green
 
 
@@ -38,3 +47,22 @@ def input_planes(rgb: np.ndarray, unit_rays: np.ndarray | None, valid: np.ndarra
         planes[4:7] = unit_rays.transpose(2, 0, 1)
     planes[7] = valid
     return planes
+
+
+def one_colour(rgb: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return an sRGB picture (H, W, 3) uint8 in the median colour of its valid pixels (H, W) bool, and that in grey.
+
+    Without valid pixels the first is the picture itself.
+    """
+    linear = _LINEAR[rgb]
+    if valid.any():
+        tint = np.maximum(np.median(linear[valid], axis=0), _DARKEST)
+        red = linear[..., :1]
+        kept = np.clip((red - _SATURATES) / (_SATURATED - _SATURATES), 0, 1)
+        linear = (1 - kept) * red * (tint / tint[0]) + kept * linear
+    grey = np.broadcast_to(linear[..., :2].mean(-1, keepdims=True), linear.shape)
+    return _srgb(linear), _srgb(grey)
+
+
+def _srgb(linear: np.ndarray) -> np.ndarray:
+    return np.rint(np.interp(linear, LINEAR, np.arange(256))).astype(np.uint8)
