@@ -9,7 +9,6 @@ import ast
 import re
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -217,13 +216,6 @@ def _bench_names() -> dict[str, _Module]:
     return {dotted(module).removesuffix(".__init__"): module for module in BENCH_MODULES}
 
 
-def _shortcuts(name: str) -> set[str]:
-    """The modules above it that a module may import when it is asked for them, by the contract of import-linter."""
-    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]
-    named = [edge.split(" -> ") for edge in contract["ignore_imports"]]
-    return {imported for importer, imported in named if importer == name}
-
-
 def _dependencies(name: str, modules: dict[str, _Module]) -> set[str]:
     """The modules that a module imports, also inside functions and by `import_module`.
 
@@ -240,7 +232,7 @@ def _dependencies(name: str, modules: dict[str, _Module]) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             inner = {f"{node.module}.{alias.name}" for alias in node.names} & set(modules)
             found |= inner or {str(node.module)}
-    return (found & set(modules)) - {name} - _shortcuts(name)
+    return (found & set(modules)) - {name}
 
 
 def test_no_import_circles() -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from base64 import b64decode
+from base64 import b64decode, b64encode
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,13 @@ import trimesh
 from scopemap.engine.notices import Notice
 from scopemap.report.facts import report_facts
 from scopemap.report.frame_pictures import FramePictures
-from scopemap.report.notebook import in_one_line
+from scopemap.report.notebook import summary_html
 from scopemap.report.page import page_html, write_comparison, write_report
 from scopemap.report.page_data import page_data
 from scopemap.report.shown_mesh import SeenFrame, simplified, times_seen
 from scopemap.result.result import Result
 from scopemap.result.summary import frames_per_s, time_words
+from scopemap.result.verdict import state_verdict
 from scopemap.result.wording import facts_of_notices
 from tests.support.drawn_run import (
     CAMERA,
@@ -285,17 +287,21 @@ def test_prompt_and_report_tell_one_speed(folder: Path) -> None:
     assert frames_per_s(changed(result, provenance={})) is None
 
 
-def test_a_result_shows_itself_in_a_notebook_and_in_one_line(folder: Path) -> None:
+def test_a_result_shows_itself_in_one_line(page: str, folder: Path, tmp_path: Path) -> None:
     result = drawn_result(name="<b>video</b>.mp4")
-    assert repr(result) == in_one_line(result)
-    assert repr(result) == (
-        "<Result, doubtful: 14 of 24 frames are in the result, others in 1 submap (1 not usable). "
-        "The scale is unknown. The surface covers 94 % of what these frames show, not of the organ.>"
-    )
-    assert "7 of 7 frames are in the result" in repr(result.others[0])
-    html = result._repr_html_()
-    assert "&lt;Result" in html
-    assert "<Result" not in html
+    assert repr(result) == f"<Result, without a verdict: 14 of 24 frames are in it; {result.scale}>"
+    state_verdict(result)
+    assert repr(result).startswith("<Result, doubtful: 14 of 24 frames are in it; scale unknown")
+    assert "7 of 7 frames are in it" in repr(result.others[0])
+    assert repr(Result(tmp_path)) == f"<Result, not finished: {tmp_path}>"
+    assert result._repr_html_() == f"<p>{escape(repr(result))}</p>"
+    picture = b64encode((folder / "summary.png").read_bytes()).decode()
+    assert f"data:image/png;base64,{picture}" in Result(folder)._repr_html_()
+
+
+def test_a_notebook_shows_the_summary_picture_of_a_run(page: str, folder: Path) -> None:
+    html = summary_html(drawn_result(name="<b>video</b>.mp4"))
+    assert "doubtful: 14 of 24 frames are in the result, others in 1 submap (1 not usable). " in html
     content = b64decode(re.findall(r"data:image/jpeg;base64,([^\"]+)", html)[0])
     inline = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR).astype(int)
     written = cv2.imread(str(folder / "summary.png")).astype(int)

@@ -14,7 +14,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from scopemap.engine.errors import reporting
-from scopemap.report.page import PAGE, PICTURE
+from scopemap.report.page import PAGE
+from scopemap.result.result_folder import SUMMARY_PICTURE
 from scopemap.result.wording import LEVEL_WORDS
 
 _COLUMNS = ("input", "folder", "status", "reason", "seconds", "frames", "tracked", "verdict")
@@ -93,5 +94,5 @@ def _card(row: BatchRow) -> str:
     if row.status != "done":
         return f'<li class="{level}"><div>{text}</div></li>'
     folder = quote(row.folder, errors="replace")
-    picture = f'<img src="{folder}/{PICTURE}" alt="" loading="lazy">'
+    picture = f'<img src="{folder}/{SUMMARY_PICTURE}" alt="" loading="lazy">'
     return f'<li class="{level}"><a href="{folder}/{PAGE}">{picture}<div>{text}</div></a></li>'

@@ -24,9 +24,9 @@ from scopemap.report.summary_picture import summary_picture
 from scopemap.result.checksums import SUMS, write_checksums
 from scopemap.result.json_numbers import without_nan
 from scopemap.result.result import Result
+from scopemap.result.result_folder import SUMMARY_PICTURE
 
 PAGE = "report.html"
-PICTURE = "summary.png"
 _SCRIPTS = (
     "matrices", "surface_view", "frame_panels", "curves", "words", "atlas", "places", "measured", "page", "gestures",
 )  # fmt: skip
@@ -46,13 +46,13 @@ def write_report(folder: Path | str) -> list[Path]:
     """
     run = Result(folder).checked()
     facts = report_facts(run)
-    page, picture = Path(folder) / PAGE, Path(folder) / PICTURE
+    page, picture = Path(folder) / PAGE, Path(folder) / SUMMARY_PICTURE
     with reporting(f"cannot write {page}"):
         page.write_text(page_html([page_data(facts)]), encoding="utf-8")
     with reporting(f"cannot write {picture}"):
         summary_picture(facts).save(picture, compress_level=1)
     if (Path(folder) / SUMS).is_file():
-        write_checksums(Path(folder), only=(PAGE, PICTURE, PICTURES))
+        write_checksums(Path(folder), only=(PAGE, SUMMARY_PICTURE, PICTURES))
     return [page, picture]
 
 

@@ -9,8 +9,10 @@ out/  trajectory.tum  mesh.ply  mesh.glb  camera.yaml  source_camera.yaml  frame
 from __future__ import annotations
 
 import csv
+import html
 import json
 import warnings
+from base64 import b64encode
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,10 +28,11 @@ from scopemap.engine.notices import Level
 from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.trajectory.trajectory import Trajectory, write_tum
 from scopemap.result.depth_maps import DepthReader
-from scopemap.result.frame_table import FrameTable
+from scopemap.result.frame_table import NOT_USED, FrameTable
+from scopemap.result.result_folder import SUMMARY_PICTURE
 from scopemap.result.surface_segments import SurfaceSegment, read_segments, save_segments, surface_file
 from scopemap.result.trajectory_folders import read_frames, submap_folders
-from scopemap.result.wording import scale_words
+from scopemap.result.wording import LEVEL_WORDS, scale_words
 
 _SCALE_NOT_STATED = "scale unknown (the run does not state it): compare shapes, not sizes"
 _MOST_PX = 1 << 15
@@ -326,14 +329,22 @@ class Result:
             raise InputError(f"cannot write the result to {folder}: {error.strerror or error}") from None
 
     def __repr__(self) -> str:
-        from scopemap.report.notebook import in_one_line
-
-        return in_one_line(self)
+        """Return the stated verdict and the main facts in one line."""
+        if self.path is not None and not self.is_finished:
+            return f"<Result, not finished: {self.path}>"
+        word = "without a verdict" if self.verdict is None else LEVEL_WORDS[self.verdict.level]
+        submap = self.frames.submap
+        counted = f"{np.sum(submap == 0)} of {np.sum(submap != NOT_USED)} frames are in it"
+        return f"<Result, {word}: {counted}; {self.scale}>"
 
     def _repr_html_(self) -> str:
-        from scopemap.report.notebook import as_html
-
-        return as_html(self)
+        """Return what a notebook shows: the line, and the summary picture where its folder has one."""
+        line = f"<p>{html.escape(repr(self))}</p>"
+        file = None if self.path is None else self.path / SUMMARY_PICTURE
+        if file is None or not file.is_file():
+            return line
+        picture = b64encode(file.read_bytes()).decode()
+        return f'{line}<img alt="summary" src="data:image/png;base64,{picture}" style="max-width: 100%">'
 
 
 def opened(result: Result | Path | str) -> Result:

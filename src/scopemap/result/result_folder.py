@@ -34,11 +34,14 @@ VIEW = "view"
 NOT_OF_THE_RESULT = (LOCK, STORED, CHECKPOINT, CHECKPOINT_NEW, VIEW)
 """Files and folders there that a run needs to go on, and that go with the folder."""
 
+SUMMARY_PICTURE = "summary.png"
+"""File of a result with a report: the verdict, some frames and the surface in one picture."""
+
 _REPLACED = "replaced"
 _MOVING = "moving"
 _OWN_FILES = (
     "trajectory.tum", "mesh.ply", "mesh.glb", "camera.yaml", "source_camera.yaml", "frames.csv", "config.toml",
-    "provenance.json", "report.html", "summary.png", "SHA256SUMS", "measurements.json", "mesh_over_time.glb",
+    "provenance.json", "report.html", SUMMARY_PICTURE, "SHA256SUMS", "measurements.json", "mesh_over_time.glb",
 )  # fmt: skip
 _OWN_FOLDERS = ("depth", "depth_sigma", "depth_preview", "frames", "pictures", "maps", "against_video", "surfaces")
 # Files by which a run's folder is recognised.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import astuple, dataclass, field, replace
 from functools import partial
@@ -86,7 +87,8 @@ def reconstruct(
         without a result, to be resumed after them.
     tracker : replaces the one of `config.tracking`; its keyframes are adjusted, too, unless `config.mapping.method` is
         "none".
-    progress : called before the first frame and after the last one; None: a notebook shows how far the run is.
+    progress : called before the first frame and after the last one; None: a notebook shows how far the run is, and the
+        summary picture of its result.
     """
     config = Config.chosen(config)
     if isinstance(sequence, Path | str):
@@ -94,15 +96,20 @@ def reconstruct(
 
         sequence = open_sequence(sequence, settings=config.input)
     folder = None if out is None else Path(out)
+    show: Callable[[Result], None] | None = None
     with ExitStack() as stack:
         if progress is None:
-            from scopemap.report.notebook_progress import in_notebook, notebook_progress
+            from scopemap.report.notebook import in_notebook, notebook_progress, show_summary
 
             if in_notebook():
                 observe, progress = stack.enter_context(notebook_progress(sequence.used_count))
                 observers += (observe,)
+                show = show_summary
         progress = progress or (lambda doing, done, total: None)
-        return _reconstruct(sequence, config, folder, overwrite, observers, progress, tracker)
+        result = _reconstruct(sequence, config, folder, overwrite, observers, progress, tracker)
+    if show is not None:
+        show(result)
+    return result
 
 
 def _reconstruct(

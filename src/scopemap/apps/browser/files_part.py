@@ -12,9 +12,10 @@ from typing import Any
 from scopemap.apps.browser.shown_result import ShownResult
 from scopemap.apps.browser.window import BrowserWindow, escaped
 from scopemap.apps.export.formats import FORMATS, export_run
-from scopemap.report.page import PAGE, PICTURE, page_to_send
+from scopemap.report.page import PAGE, page_to_send
 from scopemap.report.reference_scale import holds_for, reference_scale
 from scopemap.result.result import Result
+from scopemap.result.result_folder import SUMMARY_PICTURE
 
 EXPORTS = "exports"
 """Folder of a result with what the window wrote; `verify` knows it."""
@@ -27,7 +28,7 @@ _SURFACES = {
 }
 _MOST_SENT = 100_000_000
 _PLACE = "/result/"
-_BESIDE = (PICTURE, "mesh.ply", "mesh.glb", "trajectory.tum", "frames.csv", "provenance.json")
+_BESIDE = (SUMMARY_PICTURE, "mesh.ply", "mesh.glb", "trajectory.tum", "frames.csv", "provenance.json")
 """What the report links to."""
 
 
