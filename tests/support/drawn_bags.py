@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ START_NS = 1_700_000_000_000_000_000
 STEP_NS = 40_000_000
 K = (60.0, 0.0, 31.0, 0.0, 61.0, 24.0, 0.0, 0.0, 1.0)
 P = (55.0, 0.0, 30.0, 0.0, 0.0, 56.0, 23.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+TYPES_OF = cache(get_typestore)
 IMAGE, INFO = "/endoscope/left/image_raw", "/endoscope/left/camera_info"
 
 
@@ -41,7 +43,7 @@ class Bag:
 
     @property
     def store(self) -> Any:
-        return get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST)
+        return TYPES_OF(Stores.ROS1_NOETIC if self.ros1 else Stores.LATEST)
 
     def add(self, topic: str, bag_ns: int, kind: str, **fields: Any) -> None:
         self.messages.append((topic, bag_ns, f"sensor_msgs/msg/{kind}", fields))
