@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from scopemap.engine.frame import TruthQuality
+from scopemap.engine.frame import Frame, TruthQuality
 from scopemap.input.mask_files import MaskFiles
 from scopemap.input.opening import open_sequence, readers
 from scopemap.input.sequence import Sequence
@@ -29,21 +29,25 @@ def sequence(written: tuple[str, Path]) -> Sequence:
     return open_sequence(written[1])
 
 
+@pytest.fixture(scope="module")
+def frames(sequence: Sequence) -> list[Frame]:
+    return list(sequence.frames())
+
+
 def test_every_reader_has_a_copy() -> None:
     assert {name.split(":")[0] for name in NAMES} >= set(readers())
 
 
-def test_it_is_recognised_and_can_be_named(written: tuple[str, Path]) -> None:
+def test_it_is_recognised_and_can_be_named(written: tuple[str, Path], frames: list[Frame]) -> None:
     name, path = written
     kind = name.split(":")[0]
     found = open_sequence(path)
     assert found.source.name == kind
     named = open_sequence(found.path, dataset=kind)
-    assert [frame.index for frame in named.frames()] == [frame.index for frame in found.frames()]
+    assert [frame.index for frame in named.frames()] == [frame.index for frame in frames]
 
 
-def test_frames_are_whole_and_in_order(sequence: Sequence) -> None:
-    frames = list(sequence.frames())
+def test_frames_are_whole_and_in_order(sequence: Sequence, frames: list[Frame]) -> None:
     assert len(frames) >= 2
     assert sequence.count in (None, len(frames))
     assert all(a.index < b.index and a.time_s < b.time_s for a, b in pairwise(frames))
@@ -57,8 +61,8 @@ def test_frames_are_whole_and_in_order(sequence: Sequence) -> None:
         assert frame.T_world_camera is None
 
 
-def test_it_can_be_read_again_and_in_part(written: tuple[str, Path], sequence: Sequence) -> None:
-    frames, again = list(sequence.frames()), list(sequence.frames())
+def test_it_can_be_read_again_and_in_part(written: tuple[str, Path], sequence: Sequence, frames: list[Frame]) -> None:
+    again = list(sequence.frames())
     some = list(open_sequence(written[1], frames=slice(1, None, 1)).frames()) if len(frames) > 2 else frames[1:]
     assert [f.index for f in some] == [f.index for f in frames[1:]]
     for one, other in zip(frames, again, strict=True):
@@ -68,11 +72,11 @@ def test_it_can_be_read_again_and_in_part(written: tuple[str, Path], sequence: S
         np.testing.assert_array_equal(one.rgb, other.rgb)
 
 
-def test_stamps_are_those_of_the_frames(sequence: Sequence) -> None:
+def test_stamps_are_those_of_the_frames(sequence: Sequence, frames: list[Frame]) -> None:
     stamps = sequence.source.stamps(slice(None))
     if stamps is not None:
-        assert [index for index, _ in stamps] == [frame.index for frame in sequence.frames()]
-        np.testing.assert_allclose([time for _, time in stamps], [frame.time_s for frame in sequence.frames()])
+        assert [index for index, _ in stamps] == [frame.index for frame in frames]
+        np.testing.assert_allclose([time for _, time in stamps], [frame.time_s for frame in frames])
 
 
 def test_truth_is_in_the_common_form(sequence: Sequence) -> None:
@@ -98,8 +102,8 @@ def test_truth_is_in_the_common_form(sequence: Sequence) -> None:
             assert (truth.depth_mm[known] > 0).all()
 
 
-def test_the_reference_is_the_poses(sequence: Sequence) -> None:
-    poses = {frame.index: sequence.source.pose(frame.index) for frame in sequence.frames()}
+def test_the_reference_is_the_poses(sequence: Sequence, frames: list[Frame]) -> None:
+    poses = {frame.index: sequence.source.pose(frame.index) for frame in frames}
     known = {index: pose for index, pose in poses.items() if pose is not None}
     reference = reference_trajectory(sequence)
     if not known:

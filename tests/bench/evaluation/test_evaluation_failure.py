@@ -24,7 +24,7 @@ from tests.support.plane_scene import CAMERA, EVERYWHERE
 from tests.support.sample_trajectories import as_trajectory, write_c3vd, write_run
 from tests.support.tiny_phantom import write_tiny
 
-FRAMES, AT = 24, 12
+FRAMES, AT = 16, 8
 TRUTH = [
     plane_scene.pose(at_mm=(8 * np.sin(0.15 * n), 0.8 * n, 0.3 * n), turn_rad=(0.004 * n, 0.0, 0.0))
     for n in range(FRAMES)

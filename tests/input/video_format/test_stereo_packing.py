@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import cv2
 import numpy as np
@@ -43,6 +44,7 @@ def test_views_in_circles_are_found() -> None:
     assert found.layout == "left-right"
 
 
+@cache
 def _blurred(seed: int, scale_px: float, deviation: float) -> np.ndarray:
     noise = np.random.default_rng(seed).normal(0, 1, (2 * HEIGHT, 2 * WIDTH)).astype(np.float32)
     blurred = cv2.GaussianBlur(noise, (0, 0), scale_px)
@@ -69,7 +71,7 @@ def test_reflections_of_two_lamps_are_not_stereo(scale_px: float, deviation: flo
         levels = _blurred(number, scale_px, deviation)
         for side in (-1, 1):
             away = np.hypot(u - 2 * WIDTH * (0.45 + 0.02 * number + side * gap / 2), v - HEIGHT * (0.7 + 0.1 * number))
-            levels += peak * np.exp(-(away**2) / 300)
+            levels = levels + peak * np.exp(-(away**2) / 300)
         pictures.append(_grey(levels))
     assert packing(pictures) is None
     assert not any(packing([one]) for one in pictures)
