@@ -40,8 +40,7 @@ def _tested(kind: str, now: str = "pinhole", factor: float = 1.0) -> LensTest:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["equidistant fisheye", "orthographic fisheye"])
-@pytest.mark.parametrize("factor", [1.0, 1.3])
+@pytest.mark.parametrize(("kind", "factor"), [("equidistant fisheye", 1.0), ("orthographic fisheye", 1.3)])
 def test_a_fisheye_that_is_taken_for_a_pinhole_is_told(kind: str, factor: float) -> None:
     found = _tested(kind, factor=factor)
     assert found.kind == kind
@@ -51,8 +50,9 @@ def test_a_fisheye_that_is_taken_for_a_pinhole_is_told(kind: str, factor: float)
 
 @pytest.mark.slow
 def test_a_pinhole_stays_one() -> None:
-    assert _tested("pinhole").kind == ""
-    assert not _tested("pinhole").contradicts
+    found = _tested("pinhole")
+    assert found.kind == ""
+    assert not found.contradicts
 
 
 def test_another_focal_length_of_the_present_fisheye_is_told() -> None:

@@ -81,7 +81,7 @@ def test_a_frame_leaves_little_in_memory(tmp_path: Path) -> None:
         pictures.put(number, small, small[..., 0] == 0)
 
     # Measures of sharpness, 24 bytes, in an array that grows by a quarter.
-    assert _bytes_each(put, 3000, 1000) < 100
+    assert _bytes_each(put, 1500, 500) < 100
 
 
 def test_frames_kept_to_check_the_surface_of_a_map_leave_little_in_memory(tmp_path: Path) -> None:
