@@ -7,6 +7,7 @@ import io
 import json
 import tarfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,7 @@ def rays(camera: OpenCvCamera | PinholeCamera = CAMERA) -> np.ndarray:
     return camera.unproject(np.stack([u, v], -1).astype(float))
 
 
+@cache
 def scene_points(number: int, both: bool = True) -> bytes:
     """X, Y, Z per pixel as tifffile writes them; holes of each kind in the first columns; the right view is far off."""
     left = (rays() * true_depth_mm(true_pose(number))[..., None]).astype(np.float32)
