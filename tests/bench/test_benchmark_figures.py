@@ -19,17 +19,9 @@ from scopemap_bench.pictures import (
     draw_frames_until_loss,
 )
 from scopemap_bench.scene_pictures import draw_depth_change, draw_reconstruction
+from tests.support.picture_colours import is_colour, read
 
 NAN = float("nan")
-
-
-def read(file: Path) -> np.ndarray:
-    return cv2.imread(str(file))[..., ::-1]
-
-
-def is_colour(picture: np.ndarray, colour: str, within: int = 12) -> np.ndarray:
-    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
-    return np.asarray(np.abs(picture.astype(int) - rgb).max(-1) < within)
 
 
 def bar_lengths(picture: np.ndarray, colour: str = BAR_COLOUR) -> list[int]:

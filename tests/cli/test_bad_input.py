@@ -21,10 +21,9 @@ import trimesh
 from scopemap.engine.errors import ScopemapError
 from scopemap.input.camera_files.reading import read_calibration
 from scopemap.input.opening import open_sequence
-from scopemap.result.reference import reference_trajectory
 from scopemap.result.trajectories import read_trajectory
 from scopemap_bench.datasets.survey import survey
-from tests.support.drawn_datasets import WRITERS
+from tests.support.drawn_datasets import WRITERS, read_all
 from tests.support.drawn_inputs import picture, save, write_video
 from tests.support.front_door import call, refused
 from tests.support.tiny_phantom import FRAMES, write_tiny
@@ -39,14 +38,6 @@ NOBODY = 65534
 @pytest.fixture(scope="module")
 def phantom(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny(tmp_path_factory.mktemp("phantom") / "sound")
-
-
-def _read_all(path: Path) -> None:
-    sequence = open_sequence(path)
-    reference_trajectory(sequence)
-    survey(sequence)
-    for _ in sequence:
-        pass
 
 
 # ---- files that are not what their names say
@@ -98,7 +89,7 @@ def _as_nobody(act: Callable[[], str]) -> str:
 def _outcome(path: Path) -> str:
     """The sentence by which reading ends, "" where all can be read."""
     try:
-        _read_all(path)
+        read_all(path)
     except ScopemapError as error:
         return str(error)
     return ""
@@ -108,7 +99,7 @@ def _outcome(path: Path) -> str:
 @pytest.mark.parametrize("name", sorted(WRITERS))
 def test_no_permission_is_a_sentence(name: str, open_folder: Path) -> None:
     entry = WRITERS[name](open_folder / "input")
-    _read_all(entry)  # what is imported late is imported now
+    read_all(entry)  # what is imported late is imported now
     folders = [entry if entry.is_dir() else entry.parent, *(f for f in entry.rglob("*") if f.is_dir())]
     files = {(file.parent, file.suffix): file for file in entry.rglob("*") if file.is_file()}
     files |= {} if entry.is_dir() else {(entry.parent, ""): entry}

@@ -21,21 +21,10 @@ import pytest
 
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.input.opening import open_sequence
-from scopemap.result.reference import reference_trajectory
 from scopemap.result.trajectories import read_trajectory
-from scopemap_bench.datasets.survey import survey
-from tests.support.drawn_datasets import WRITERS
+from tests.support.drawn_datasets import WRITERS, read_all
 from tests.support.drawn_image_sets import write_real
 from tests.support.drawn_trajectories import write_trajectories
-
-
-def read_all(path: Path) -> None:
-    sequence = open_sequence(path)
-    reference_trajectory(sequence)
-    survey(sequence)
-    for _ in sequence:
-        pass
-
 
 # ---- archives whose members lead outside
 

@@ -24,17 +24,9 @@ from scopemap.report.mesh_figures import (
     view_from_behind,
 )
 from scopemap.report.sheet import Plot, Sheet
+from tests.support.picture_colours import is_colour, read
 
 NAN = float("nan")
-
-
-def read(file: Path) -> np.ndarray:
-    return cv2.imread(str(file))[..., ::-1]
-
-
-def is_colour(picture: np.ndarray, colour: str) -> np.ndarray:
-    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
-    return np.asarray(np.abs(picture.astype(int) - rgb).max(-1) < 12)
 
 
 def count_colour(picture: np.ndarray, colour: str) -> int:

@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 
 from scopemap.input.camera_files.writing import write_calibration
+from scopemap.input.opening import open_sequence
+from scopemap.result.reference import reference_trajectory
+from scopemap_bench.datasets.survey import survey
 from tests.support.drawn_bags import write_bag1, write_mcap, write_ros2
 from tests.support.drawn_calibrations import CAMERAS, write_forms
 from tests.support.drawn_climb import write_clip
@@ -76,6 +79,15 @@ WRITERS: dict[str, Writer] = {
     "dicom:video": write_dicom_video,
     "dicom:frames": write_frames,
 }
+
+
+def read_all(path: Path) -> None:
+    """Read all that a data set holds, by every way that there is."""
+    sequence = open_sequence(path)
+    reference_trajectory(sequence)
+    survey(sequence)
+    for _ in sequence:
+        pass
 
 
 def write_cameras(folder: Path) -> Path:

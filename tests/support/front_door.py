@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from functools import cache
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -22,6 +23,12 @@ def call(*arguments: object) -> int:
     with given, patch.object(typer.main, "get_command", PUT_TOGETHER_ONCE), pytest.raises(SystemExit) as caught:
         main()
     return caught.value.code if isinstance(caught.value.code, int) else int(caught.value.code is not None)
+
+
+def exported(run: Path, to: str, out: Path, *more: object) -> Path:
+    """Return `out`, to which `scopemap export` has written."""
+    assert call("export", run, "--to", to, "--out", out, "--quiet", *more) == 0
+    return out
 
 
 def refused(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:

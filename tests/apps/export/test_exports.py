@@ -20,7 +20,7 @@ from scopemap.engine.errors import InputError
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.result.trajectories import read_trajectory
 from tests.support.drawn_run import CAMERA, IN_FIRST_MAP, IN_RESULT, draw_run, draw_run_of_frames, pose_of, tube
-from tests.support.front_door import call, refused
+from tests.support.front_door import call, exported, refused
 
 POSES = np.stack([pose_of(index) for index in range(IN_RESULT)])
 UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
@@ -31,11 +31,6 @@ BOX_MM = tube().bounds
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of 24 frames, of which 14 are in the result and 7 in maps/1, and its input."""
     return draw_run_of_frames(tmp_path_factory.mktemp("exports"))
-
-
-def exported(run: Path, to: str, out: Path, *more: object) -> Path:
-    assert call("export", run, "--to", to, "--out", out, "--quiet", *more) == 0
-    return out
 
 
 def seen(index: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from scopemap.engine.fusion.mesh_files import save_mesh
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.result.result import Result
 from tests.support.drawn_run import CAMERA, IN_RESULT, draw_run, draw_run_of_frames, pose_of, tube
-from tests.support.front_door import call, refused
+from tests.support.front_door import exported, refused
 
 UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
 
@@ -32,11 +32,6 @@ UNKNOWN = "scale unknown (scopenet's own scale): compare shapes, not sizes"
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return draw_run_of_frames(tmp_path_factory.mktemp("exports"))
-
-
-def exported(run: Path, to: str, out: Path, *more: object) -> Path:
-    assert call("export", run, "--to", to, "--out", out, "--quiet", *more) == 0
-    return out
 
 
 def columns_of(file: Path) -> np.ndarray:
