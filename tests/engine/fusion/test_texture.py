@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from scopemap.apps.export.surfaces import write_surface
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.mesh_files import read_textured, save_mesh
+from scopemap.engine.fusion.open_glb import texture_picture
 from scopemap.engine.fusion.texture import textured_mesh
 from scopemap.engine.fusion.texture_levels import chart_vertices, level_gains
 from scopemap.engine.fusion.texture_views import choose_views, pieces_of, spread
@@ -110,6 +112,23 @@ def test_views_of_different_exposure_are_levelled() -> None:
     shown = _textured(mesh, _frames(gains), gains)
     assert np.median(_errors(shown)) < 4
     assert np.percentile(_errors(shown), 99) < 20
+
+
+def test_a_chart_is_painted_in_its_colours() -> None:
+    mesh, colour = _plane(4, FAR_MM), np.array([150, 100, 90], np.uint8)
+    mesh.visual.vertex_colors = np.broadcast_to(colour, (len(mesh.vertices), 3))
+    frame = replace(_frames()[0], rgb=np.full((CAMERA.height, CAMERA.width, 3), colour), T_world_camera=_pose(0.0))
+
+    def pictures(numbers: Sequence[int], camera: PinholeCamera) -> Iterator[tuple[int, np.ndarray]]:
+        yield from ((number, np.full((camera.height, camera.width, 3), colour)) for number in numbers)
+
+    _, label = choose_views(mesh, [frame])
+    shown = textured_mesh(mesh, label, [frame], [frame], pictures, FINE.width)
+    texture = texture_picture(shown)
+    height, width = texture.shape[:2]
+    column, row = (np.asarray(shown.visual.uv) * [width, -height] + [0, height]).astype(int).T
+    painted = texture[np.minimum(row, height - 1), np.minimum(column, width - 1)].astype(int)
+    np.testing.assert_allclose(painted, np.broadcast_to(colour, painted.shape), atol=1)
 
 
 def test_hidden_triangles_get_no_colour_from_what_is_in_front() -> None:
@@ -211,6 +230,18 @@ def test_gains_undo_an_exposure(factor: float) -> None:
     shown = surface * np.where(places.chart == 1, factor, 1.0)[:, None]
     gains = level_gains(places, shown, surface)
     np.testing.assert_allclose(gains * shown, surface, rtol=0.01)
+
+
+def test_a_small_patch_of_another_view_takes_the_view_around_it() -> None:
+    mesh, window = _plane(14, FAR_MM), np.zeros((CAMERA.height, CAMERA.width), bool)
+    window[49:71, 69:91] = True  # 2 px along its border are left out: 32 triangles are shown
+    whole = Frame(0, 0.0, _picture(CAMERA, 0.0, 1.0), CAMERA, np.ones_like(window), T_world_camera=_pose(0.0))
+    sharp_patch = replace(whole, index=1, valid=window)
+    blurred = replace(whole, quality=0.5)
+    assert choose_views(mesh, [sharp_patch])[0] == [1]
+    numbers, label = choose_views(mesh, [blurred, sharp_patch])
+    assert numbers == [0]
+    assert (label == 0).all()
 
 
 def test_pieces_are_connected() -> None:

@@ -107,8 +107,8 @@ def _rasterise(corners, colours, faces, inverse_depth, rgb):  # type: ignore[no-
         area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
         if wa < 0 or wb < 0 or wc < 0 or area == 0:
             continue
-        first_row, last_row = max(0, np.ceil(min(va, vb, vc))), min(height - 1, np.floor(max(va, vb, vc)))
-        first_col, last_col = max(0, np.ceil(min(ua, ub, uc))), min(width - 1, np.floor(max(ua, ub, uc)))
+        first_row, last_row = int(max(0, np.ceil(min(va, vb, vc)))), int(min(height - 1, np.floor(max(va, vb, vc))))
+        first_col, last_col = int(max(0, np.ceil(min(ua, ub, uc)))), int(min(width - 1, np.floor(max(ua, ub, uc))))
         for row in range(first_row, last_row + 1):
             for col in range(first_col, last_col + 1):
                 at_a = ((ub - col) * (vc - row) - (vb - row) * (uc - col)) / area
