@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.fusion.tsdf import BLOCK, KEY_OFFSET, Grid, TsdfCamera, touched_blocks, unpack
 from scopemap.engine.geometry.se3 import se3, so3_exp
 from tests.support.drawn_surfaces import AHEAD, LENIENT, VIEW, all_around, frame_of, lenient, plane_frame, sphere_frame
 
@@ -55,6 +56,34 @@ def test_slanted_plane_is_exact_and_ends_with_the_view(tilt_x: float, tilt_y: fl
     assert (pixels.max(axis=0) < np.array([VIEW.width, VIEW.height]) + slack_px).all()
     assert not mesh.is_watertight
     assert (mesh.face_normals @ normal < 0).all()
+
+
+@pytest.mark.parametrize("quarters", range(4))
+@pytest.mark.parametrize("which", [np.s_[:, :], np.s_[::2, ::2], np.s_[::2, 1::2], np.s_[1::2, ::2], np.s_[1::2, 1::2]])
+def test_no_block_of_a_measured_pixel_is_missed(quarters: int, which: tuple[slice, slice]) -> None:
+    """A wall across the camera, which looks along z and is turned about it; all pixels count, or one of four."""
+    R, grid = np.rint(so3_exp(np.array([0.0, 0.0, quarters * np.pi / 2]))), Grid(1.0, 3.0, 0.05)
+    depth_mm = np.full((VIEW.height, VIEW.width), np.nan, np.float32)
+    depth_mm[which] = 40.0
+    points = (VIEW.rays * depth_mm[..., None])[which].reshape(-1, 3)
+    for shift_mm in np.arange(0.0, BLOCK, 0.25):
+        t = np.array([shift_mm, shift_mm, 0.0])
+        camera = TsdfCamera(R, t, VIEW.fx, VIEW.fy, VIEW.cx, VIEW.cy)
+        found = np.unique(unpack(touched_blocks(1 / depth_mm, camera, grid)), axis=0)
+        blocks = np.unique(np.floor((points - t) @ R / BLOCK).astype(int), axis=0)
+        assert {*map(tuple, blocks)} <= {*map(tuple, found)}
+
+
+def test_a_pose_may_be_as_far_away_as_keys_of_blocks_reach() -> None:
+    voxel_mm, truncation_mm, max_depth_mm = 1.0, 5.0, 150.0
+    farthest_mm = (KEY_OFFSET - 1) * BLOCK * voxel_mm - 4 * max_depth_mm - truncation_mm
+    frame = plane_frame(AHEAD, 50.0)
+    for side in (-1.0, 1.0):
+        volume = TsdfVolume(LENIENT)
+        volume.integrate(replace(frame, T_world_camera=se3(np.eye(3), np.array([side * farthest_mm, 0.0, 0.0]))))
+        np.testing.assert_allclose(volume.extract_mesh().vertices[:, 2], 50.0, atol=0.01)
+    with pytest.raises(ValueError, match="mm from the origin"):
+        volume.integrate(replace(frame, T_world_camera=se3(np.eye(3), np.array([0.0, farthest_mm + 1.0, 0.0]))))
 
 
 def test_no_wall_grows_behind_a_silhouette() -> None:

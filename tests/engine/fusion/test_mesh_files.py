@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from scopemap.engine.fusion.mesh_files import save_mesh
+from scopemap.engine.fusion.mesh_files import save_mesh, save_meshes_in_time
+from scopemap.engine.fusion.open_glb import OpenGlb
 
 
 @pytest.fixture
@@ -62,6 +63,38 @@ def test_glb_is_metres_y_up_with_linear_colours_of_16_bits(tmp_path: Path, ball:
     assert linear[128, 0] == pytest.approx(0.2158, abs=1e-4)
     back = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     assert (np.round(255 * back[:, 0]) == np.arange(len(back)) % 256).all()
+
+
+def _values(glb: OpenGlb, accessor: int) -> np.ndarray:
+    about = glb.tree["accessors"][accessor]
+    view = glb.tree["bufferViews"][about["bufferView"]]
+    binary = glb.content[-glb.tree["buffers"][0]["byteLength"] :]
+    return np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(about["count"], -1)
+
+
+def test_surfaces_that_follow_each_other_show_from_the_start_of_the_first(
+    tmp_path: Path, ball: trimesh.Trimesh
+) -> None:
+    file = tmp_path / "mesh_over_time.glb"
+    empty = trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), int))
+    save_meshes_in_time([empty, ball, ball], [0.0, 3.0, 5.0], file)
+    glb = OpenGlb(file.read_bytes())
+    (animation,) = glb.tree["animations"]
+    for number, sampler in enumerate(animation["samplers"]):
+        np.testing.assert_allclose(_values(glb, sampler["input"]).ravel(), [0.0, 2.0])
+        np.testing.assert_array_equal(_values(glb, sampler["output"]), np.eye(2)[number][:, None].repeat(3, 1))
+
+
+def test_values_that_are_added_after_a_picture_begin_at_a_multiple_of_4_bytes(
+    tmp_path: Path, ball: trimesh.Trimesh
+) -> None:
+    file = tmp_path / "mesh.glb"
+    save_mesh(ball, glb_file=file)
+    glb = OpenGlb(file.read_bytes())
+    glb.add_texture(b"jpg")  # glTF 2.0, section 3.6.2.4
+    added = glb.accessor(np.array([1.0, 2.5]), "SCALAR")
+    assert glb.tree["bufferViews"][-1]["byteOffset"] % 4 == 0
+    np.testing.assert_array_equal(_values(glb, added).ravel(), [1.0, 2.5])
 
 
 def test_empty_mesh_gives_an_empty_ply_and_no_glb(tmp_path: Path) -> None:

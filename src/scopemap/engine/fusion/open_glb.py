@@ -51,7 +51,6 @@ class OpenGlb:
     def __init__(self, glb: bytes) -> None:
         (length,) = struct.unpack_from("<I", glb, 12)
         self.tree, self._binary = json.loads(glb[20 : 20 + length]), bytearray(glb[28 + length :])
-        self._binary.extend(b"\0" * (-len(self._binary) % 4))
 
     @property
     def mesh_nodes(self) -> list[int]:
