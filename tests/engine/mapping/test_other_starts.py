@@ -133,6 +133,7 @@ def test_where_another_start_wins_in_the_middle_of_many_keyframes_all_are_solved
     right, true = _scene(12)
     problem = _tracked_by(right, _inside_out(right))
     log_depth, test = _tested(problem)
+    assert test.outcome == "decided"
     assert test.replaced
     assert _correlation(problem, log_depth, true) > 0.95
 

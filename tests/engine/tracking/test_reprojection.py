@@ -1,17 +1,18 @@
-"""Poses from 2D-3D correspondences: exact motions come back, outliers and wrong depth count little."""
+"""Poses from 2D-3D correspondences: exact motions come back, outliers and wrong depth count little; what moves."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.flow.corners import Correspondences2D3D
 from scopemap.engine.geometry.se3 import inverse, rotation_angle_rad, se3_exp
-from scopemap.engine.tracking.corner_pose import pose_from_correspondences
+from scopemap.engine.tracking.corner_pose import nonrigidity, pose_from_correspondences
 
 CAMERA = PinholeCamera(150.0, 151.0, 79.5, 63.5, 160, 128)
 TRUE = se3_exp(np.array([0.02, -0.03, 0.05, 2.0, -1.0, 1.5]))
@@ -65,3 +66,13 @@ def test_too_few_points_and_points_behind_give_no_pose() -> None:
     few = Correspondences2D3D(seen.points_mm[:49], seen.pixels[:49], 0.2, 0)
     assert pose_from_correspondences(few, CAMERA, np.eye(4), 0.2) is None
     assert pose_from_correspondences(replace(seen, points_mm=-seen.points_mm), CAMERA, np.eye(4), 0.2) is None
+
+
+@pytest.mark.parametrize("moved_px", [0.0, 0.2, 3.0])
+def test_what_all_corners_move_beside_the_rigid_motion_is_told_in_deviations_of_a_match(moved_px: float) -> None:
+    seen = _observed(TRUE)
+    moved = replace(seen, pixels=seen.pixels + np.array([moved_px, 0.0]))
+    found = nonrigidity(moved, CAMERA, TRUE, 0.0)
+    # Matches have a standard deviation of 0.5 px, and these do not scatter.
+    np.testing.assert_allclose(found[np.isfinite(found)], moved_px / 0.5, atol=1e-5)
+    assert np.isfinite(found).sum() > 30
