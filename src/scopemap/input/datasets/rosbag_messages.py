@@ -102,7 +102,7 @@ def calibration_of(info: Any, size: tuple[int, int], rectified: bool, topic: str
     if info.width and info.height:
         pairs += [("image_width", int(info.width)), ("image_height", int(info.height))]
     if rectified:
-        pairs += [("camera_matrix", P.reshape(3, 4)[:, :3].ravel().tolist())]
+        pairs += [("camera_matrix", P.tolist())]
     else:
         terms = np.trim_zeros(D, "b").tolist()
         terms += [0.0] * (next((count for count in _OPENCV_TERMS if len(terms) <= count), len(terms)) - len(terms))
