@@ -169,6 +169,8 @@ def test_motion_and_network_decide_together() -> None:
     nan = float("nan")
     assert KindEvidence((9.0, 9.0), nan, 2).sign == 1
     assert KindEvidence((-9.0, -9.0), -0.4, 2).sign == -1
+    # Windows that hardly tell do not outvote those that do.
+    assert KindEvidence((9.0, 9.0, -0.1, -0.1), nan, 4).sign == 1
     assert KindEvidence((), -0.95, 2).sign == -1
     assert KindEvidence((0.5, -0.2), 0.97, 2).sign == 1
     for motion, network in (((), nan), ((), 0.8), ((9.0, 9.0), -0.95), ((-4.0,), 0.95), ((9.0, -5.0, 5.0), nan)):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scopemap.engine.errors import InputError
+from scopemap.input.decoding import read_decoded
 from scopemap.input.images import ImageFolder
 from scopemap.input.opening import open_sequence
 from tests.support.drawn_inputs import number_in, picture, save
@@ -174,6 +175,31 @@ def test_levels_of_fewer_bits_than_16_fill_the_range(bits: int, ending: str, tmp
     said = [str(note) for note in source.notes if "bits" in str(note)]
     expected = [f"levels: 16-bit pictures hold {bits} bits, which are scaled to the whole range"]
     assert said == (expected if bits < 16 else [])
+
+
+def test_transparency_has_no_say_in_the_bits_of_a_picture(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number in range(5):
+        levels = picture(number, SIZE).astype(np.uint16) << 4
+        opaque = np.dstack([levels[..., ::-1], np.full(levels.shape[:2], 65535, np.uint16)])
+        assert cv2.imwrite(str(folder / f"{number:03d}.png"), opaque)
+    assert any("16-bit pictures hold 12 bits" in str(note) for note in ImageFolder(folder).notes)
+
+
+def test_of_many_pictures_few_are_read_for_their_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, read = tmp_path / "images", list[Path]()
+    folder.mkdir()
+    for number in range(64):
+        assert cv2.imwrite(str(folder / f"{number:03d}.png"), np.full((8, 8, 3), 1000, np.uint16))
+
+    def counted(file: Path, *flags: int) -> np.ndarray | None:
+        read.append(file)
+        return read_decoded(file, *flags)
+
+    monkeypatch.setattr("scopemap.input.images.read_decoded", counted)
+    ImageFolder(folder)
+    assert len(set(read)) == 16
 
 
 def test_masks_that_differ_from_their_pictures_by_the_ending_alone_are_not_mixed_in(tmp_path: Path) -> None:

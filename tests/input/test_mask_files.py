@@ -170,7 +170,9 @@ def test_masks_without_a_frame_and_masks_that_may_be_late_are_told(tmp_path: Pat
     assert set(unused) == {"masks-unused"}
     assert (unused["masks-unused"].values["masks"], unused["masks-unused"].values["first"]) == (2, "70.png")
     late = write_masks(tmp_path / "late", {f"{k}.png": left_half() for k in range(1, 5)})
-    assert set(_codes(MaskFiles(late, RECTIFIER, numbers=range(7)), range(7))) == {"masks-late"}
+    told = _codes(MaskFiles(late, RECTIFIER, numbers=range(7)), range(7))
+    assert set(told) == {"masks-late"}
+    assert (told["masks-late"].values["frame"], told["masks-late"].values["mask"]) == (0, 1)
     assert _codes(MaskFiles(late, RECTIFIER, numbers=range(7)), range(1, 7)) == {}
 
 
@@ -184,6 +186,14 @@ def test_masks_that_hide_nothing_or_everything_are_told(name: str, level: int, c
     values = {name.format(k): np.full((480, 640), level, np.uint8) for k in range(3)}
     masks = MaskFiles(write_masks(tmp_path / "masks", values), RECTIFIER, numbers=range(3))
     assert set(_codes(masks, range(3))) == ({code} if code else set())
+
+
+@pytest.mark.parametrize(("rows", "large"), [(360, False), (361, True)])
+def test_masks_are_large_that_hide_more_than_three_quarters(rows: int, large: bool, tmp_path: Path) -> None:
+    mask = np.zeros((480, 640), np.uint8)
+    mask[:rows] = 255
+    masks = MaskFiles(write_masks(tmp_path / "masks", {"0.png": mask}), RECTIFIER, numbers=range(1))
+    assert set(_codes(masks, range(1))) == ({"masks-large"} if large else set())
 
 
 def test_masks_numbered_from_one_beside_a_video_numbered_from_zero(tmp_path: Path) -> None:

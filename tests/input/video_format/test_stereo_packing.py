@@ -44,6 +44,14 @@ def test_views_in_circles_are_found() -> None:
     assert found.layout == "left-right"
 
 
+@pytest.mark.parametrize("black", [0, 16])
+def test_black_around_small_circles_does_not_count(black: int) -> None:
+    """Black is level 16 in pictures that were not converted from the range of video."""
+    change = inside(lambda mask: cv2.circle(mask, (160, 120), 70, 1, -1))
+    left = np.maximum(change(0, tissue(0)), np.uint8(black))
+    assert packing([np.hstack([left, np.roll(left, -10, axis=1)])]) is not None
+
+
 @cache
 def _blurred(seed: int, scale_px: float, deviation: float) -> np.ndarray:
     noise = np.random.default_rng(seed).normal(0, 1, (2 * HEIGHT, 2 * WIDTH)).astype(np.float32)
