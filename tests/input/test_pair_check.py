@@ -52,6 +52,13 @@ def _warped(picture: np.ndarray, camera: PinholeCamera | OpenCvCamera, R: np.nda
     return cv2.remap(picture, *maps, cv2.INTER_LINEAR)
 
 
+def test_a_pattern_that_repeats_shows_nothing() -> None:
+    tile = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, (64, 64)), (0, 0), 3)
+    levels = np.clip(128 + 400 * np.tile(tile, (5, 6)), 0, 255).astype(np.uint8)[..., None].repeat(3, 2)
+    left, right = (levels[: LEFT.height, begin : begin + LEFT.width] for begin in (0, 24))
+    assert check_pair(PAIR, [(left, right)]).endswith("its views have 0 points in common")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PAIRS)
 def test_views_that_fit_are_believed(name: str) -> None:
