@@ -66,7 +66,7 @@ def test_no_block_of_a_measured_pixel_is_missed(quarters: int, which: tuple[slic
     depth_mm = np.full((VIEW.height, VIEW.width), np.nan, np.float32)
     depth_mm[which] = 40.0
     points = (VIEW.rays * depth_mm[..., None])[which].reshape(-1, 3)
-    for shift_mm in np.arange(0.0, BLOCK, 0.25):
+    for shift_mm in np.arange(0.0, BLOCK, 0.5):
         t = np.array([shift_mm, shift_mm, 0.0])
         camera = TsdfCamera(R, t, VIEW.fx, VIEW.fy, VIEW.cx, VIEW.cy)
         found = np.unique(unpack(touched_blocks(1 / depth_mm, camera, grid)), axis=0)
