@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +12,7 @@ from scopemap.engine.geometry.median import median
 
 
 # A cached kernel would be the one of an earlier median.
-@partial(kernel, cache=False)
+@kernel(cache=False)
 def _medians(rows):  # type: ignore[no-untyped-def]
     found = np.empty(len(rows))
     for n in range(len(rows)):

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import trimesh
 from PIL import Image
-from rectpack import SORT_LSIDE, PackingBin, PackingMode, GuillotineBssfSas, newPacker
+from rectpack import SORT_LSIDE, GuillotineBssfSas, PackingBin, PackingMode, newPacker
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.frame import Frame
