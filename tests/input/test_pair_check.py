@@ -16,7 +16,7 @@ from scopemap.engine.config import Config, InputSettings
 from scopemap.engine.errors import CalibrationError
 from scopemap.engine.geometry.se3 import inverse, se3_exp
 from scopemap.input.opening import open_sequence
-from scopemap.input.pair_check import Views, check_pair
+from scopemap.input.pair_check import ImagePair, check_pair
 from scopemap.runner.reconstruct import reconstruct
 from tests.support.drawn_inputs import save
 from tests.support.drawn_pairs import BENT, LEFT, LENS, T_BENT, beside, view, write_opencv, write_scared
@@ -31,11 +31,11 @@ PAIRS = {"ideal": PAIR, "bent": BENT_PAIR, "shifted": SHIFTED_PAIR}
 PLANES = [(np.array([0.25, -0.3, 1.0]), 55.0), (np.array([0.0, 0.1, 1.0]), 75.0)]
 
 
-def _seen(pair: StereoPair) -> list[Views]:
+def _seen(pair: StereoPair) -> list[ImagePair]:
     return [(view(pair.left, np.eye(4), plane), view(pair.right, pair.T_right_left, plane)) for plane in PLANES]
 
 
-def _rectified(pair: StereoPair) -> list[Views]:
+def _rectified(pair: StereoPair) -> list[ImagePair]:
     """What data sets publish as rectified: both cameras turned to be parallel, with one principal point."""
     R_left, R_right, P_left, P_right = pair.rectification((LEFT.width, LEFT.height))
     return [
