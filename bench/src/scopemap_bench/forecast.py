@@ -15,18 +15,18 @@ from pathlib import Path
 
 from scopemap.apps.demo.demo import CLIP, prepare_out
 from scopemap.engine.config import Config
+from scopemap.engine.flow.flows import FLOWS
+from scopemap.runner.depth_networks import NETWORKS
 from scopemap_bench.entry import Entry, worker_command
 from scopemap_bench.plan import MethodPlan, ProtocolPlan, SequencePlan
 from scopemap_bench.result import RunResult
 
-# Seconds per frame of 400x320 px on two CPU cores of one machine: half the CPU time of random networks of full size,
-# flow both ways. Only their ratios count.
-_FLOW_S = {"dis": 0.02, "raft-small": 0.7, "raft-large": 2.6}
+# Seconds per frame of 400x320 px on two CPU cores of one machine, as half the CPU time; those of depth and flow are in
+# `NETWORKS` and `FLOWS`. Only their ratios count.
+_CORES = 2
 _PERCEPTUAL_S = {"lpips": 0.05, "structure": 0.01}
 _TRACKING_S = 0.2  # with reading, masks, fusion and the back end
 _SCORING_S = 0.1
-# These see pictures of a size of their own.
-_DEPTH_S = {"scopenet": 0.05, "depth-anything": 1.1, "depth-pro": 100.0}
 _SURFACE_S = 10.0  # a surface against the true one
 _RENDERING_S = 1.0  # of a phantom
 _PIXELS = 400 * 320
@@ -50,16 +50,28 @@ class Pace:
         scored_s = frames * share * _SCORING_S + _SURFACE_S * surface
         if config is None:
             return self.once_s + self.ratio * scored_s
-        anchor_s = _DEPTH_S["depth-pro"] if config.depth.anchor == "depth-pro" else 0.0
+        anchor_s = _depth_s("depth-pro") if config.depth.anchor == "depth-pro" else 0.0
         return self.once_s + self.ratio * (scored_s + anchor_s + frames * _frame_s(config, share))
 
 
 def _frame_s(config: Config, share: float) -> float:
     networks, mapis = config.networks, config.mapis
-    by_pixels = _TRACKING_S + _FLOW_S.get(networks.keyframe_flow, 0.0)
+    by_pixels = _TRACKING_S + _flow_s(networks.keyframe_flow)
     if (mapis.blend, mapis.frame_scale) != ("none", "none"):
-        by_pixels += _FLOW_S.get(networks.flow, 0.0) + _PERCEPTUAL_S[networks.perceptual]
-    return share * by_pixels + _DEPTH_S.get(config.depth.backend, 0.0)
+        by_pixels += _flow_s(networks.flow) + _PERCEPTUAL_S[networks.perceptual]
+    return share * by_pixels + _depth_s(config.depth.backend)
+
+
+def _flow_s(name: str) -> float:
+    """Return the time of a flow both ways."""
+    by_pixels, by_square = FLOWS[name].seconds if name in FLOWS else (0.0, 0.0)
+    mpx = _PIXELS / 1e6
+    return 2 * (by_pixels * mpx + by_square * mpx**2) / _CORES
+
+
+def _depth_s(backend: str) -> float:
+    """Return the time of a network, which sees pictures of a size of its own; files and two views: 0."""
+    return NETWORKS[backend].seconds / _CORES if backend in NETWORKS else 0.0
 
 
 def measured_pace() -> Pace:

@@ -26,8 +26,9 @@ class DepthNetwork:
     """An estimator of depth from one picture, a row of `NETWORKS`.
 
     create : returns it; imports it. words : about it, in the help of `--depth`. has_weights : whether it needs files of
-    weights, which `engine/models/checkpoints.toml` has by its name, and the packages of the extra `networks`. seconds,
-    gigabytes : of one core for a picture of any size, and of memory; those of the others count as the run's.
+    weights, which `engine/models/checkpoints.toml` has by its name, and all packages of the extra `networks`. seconds,
+    gigabytes : of one core for a picture of any size, and of memory. A run is told of those of networks with weights;
+    `scopemap bench --dry-run` counts them all.
     """
 
     create: Callable[[DepthRequest], DepthEstimator]
@@ -79,7 +80,7 @@ def _depth_pro(request: DepthRequest) -> DepthEstimator:
 
 
 NETWORKS = {
-    "scopenet": DepthNetwork(_scopenet, "default"),
+    "scopenet": DepthNetwork(_scopenet, "default", seconds=0.1),
     "shading": DepthNetwork(_shading),
     "depth-anything": DepthNetwork(_depth_anything, has_weights=True, seconds=2.2, gigabytes=0.4),
     # Estimated by the size of its weights.

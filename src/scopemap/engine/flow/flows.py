@@ -18,7 +18,7 @@ class FlowModel:
 
     create : returns the estimator, on a device; imports it. words : about it, in the help of `--flow`. needs : returns
     the packages of a network, and its weights, of which any will do; None: no network. seconds : of one core for one
-    flow of a network, for each million pixels and each square of that.
+    flow, for each million pixels and each square of that.
     """
 
     create: Callable[[str], FlowEstimator]
@@ -66,7 +66,7 @@ def _raft(size: Literal["small", "large"], seconds: tuple[float, float]) -> Flow
 
 
 FLOWS = {
-    "dis": FlowModel(_dis, "default"),
+    "dis": FlowModel(_dis, "default", seconds=(0.16, 0.0)),
     "raft-small": _raft("small", (7.5, 2.0)),
     "raft-large": _raft("large", (26.0, 10.5)),
     "none": FlowModel(_none),
