@@ -61,25 +61,27 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_GROUPS = {
-    "Reconstruct": ("app", "run", "demo", "live"),
-    "Look": ("view", "report", "export", "verify"),
-    "Measure": ("measure", "coverage", "locate", "compare-exams"),
-    "Compare and evaluate": ("evaluate", "compare", "bench", "climb"),
-    "Prepare": ("inspect", "calibrate", "datasets", "phantom", "models"),
-    "Many videos": ("batch",),
-}
-"""Commands in the groups of --help, those of scopemap-bench among them; others stand in a group of their own."""
 _MEASURES = [one for _, added in plugins("scopemap.measures") for one in added]
-_OWN = (
-    window_app, run, batch, live, view, report, demo, inspect, with_measures(evaluate, _MEASURES), export, measure,
-    coverage, locate, compare_exams, verify, calibrate, models.app,
-)  # fmt: skip
+_GROUPS: dict[str, tuple[Any, ...]] = {
+    "Reconstruct": (window_app, run, demo, live),
+    "Look": (view, report, export, verify),
+    "Measure": (measure, coverage, locate, compare_exams),
+    "Compare and evaluate": (with_measures(evaluate, _MEASURES), "compare", "bench", "climb"),
+    "Prepare": (inspect, calibrate, "datasets", "phantom", models.app),
+    "Many videos": (batch,),
+}
+"""Commands in the groups of --help, those of scopemap-bench by their names; others stand in a group of their own."""
+
+
+def _name_of(command: Any) -> str:
+    """Return the name of a command of a group."""
+    return command if isinstance(command, str) else getattr(command, "__name__", "models").replace("_", "-")
 
 
 def commands() -> tuple[dict[str, Any], list[str]]:
     """Return the commands, scopemap's own and those of other packages; and names of theirs that scopemap has itself."""
-    own = {getattr(command, "__name__", "models").replace("_", "-"): command for command in _OWN}
+    grouped = [command for group in _GROUPS.values() for command in group]
+    own = {_name_of(command): command for command in grouped if not isinstance(command, str)}
     added = dict(plugins("scopemap.commands"))
     return own | {name: command for name, command in added.items() if name not in own}, sorted(
         own.keys() & added.keys()
@@ -87,7 +89,7 @@ def commands() -> tuple[dict[str, Any], list[str]]:
 
 
 _COMMANDS, _LEFT_OUT = commands()
-_GROUP_OF = {name: group for group, names in _GROUPS.items() for name in names}
+_GROUP_OF = {_name_of(command): group for group, of_group in _GROUPS.items() for command in of_group}
 for name in sorted(_COMMANDS, key=lambda name: [*_GROUP_OF, name].index(name)):
     command, group = _COMMANDS[name], _GROUP_OF.get(name)
     if isinstance(command, typer.Typer):
