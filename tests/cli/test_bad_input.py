@@ -56,9 +56,6 @@ def test_content_decides_not_names(tmp_path: Path) -> None:
     assert "2.png cannot be read and was left out" in sequence.warnings[0]
 
 
-# ---- poses
-
-
 # ---- folders that may not be read, and that lead in circles
 
 
