@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -61,14 +62,19 @@ def content(camera: CameraModel, scale: float, depth_unit_mm: float) -> Content:
 
 def seen_depth_mm(T_world_camera: np.ndarray, camera: CameraModel) -> np.ndarray:
     """Depth (h, w) of the wall along the camera's axis; 0 where the lens sees nothing."""
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = camera.unproject(np.stack([u, v], -1).astype(float)) @ T_world_camera[:3, :3].T
+    rays = _rays(camera) @ T_world_camera[:3, :3].T
     depth_mm = np.full(rays.shape[:2], DISTANCE_MM)
     for _ in range(20):
         x, y, _ = np.moveaxis(T_world_camera[:3, 3] + depth_mm[..., None] * rays, -1, 0)
         wall_mm = DISTANCE_MM + 0.15 * x - 0.1 * y + DEEP_MM * np.sin(x / 9) * np.cos(y / 8)
         depth_mm = 0.5 * depth_mm + 0.5 * (wall_mm - T_world_camera[2, 3]) / rays[..., 2]
     return np.where(np.isfinite(depth_mm) & (depth_mm > 0) & (depth_mm < 2 * DISTANCE_MM), depth_mm, 0)
+
+
+@cache
+def _rays(camera: CameraModel) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return camera.unproject(np.stack([u, v], -1).astype(float))
 
 
 def quaternion(T: np.ndarray) -> np.ndarray:
