@@ -188,7 +188,10 @@ class Linear(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """Normal equations of unknowns alone: numbers (m,), second derivative (m, m), first derivative (m,)."""
+    """Normal equations of C terms, each of m different unknowns alone.
+
+    columns : (C, m) numbers of the unknowns. A, b : second (C, m, m) and first (C, m) derivatives.
+    """
 
     columns: np.ndarray
     A: np.ndarray
@@ -216,21 +219,25 @@ class ReducedModel:
 
     first : first observation of each point, and their number (P + 1,). parts : of the points. linear : returns the
     derivatives of the observations of a part, those of several found again where a step is tried, since all would fill
-    memory. priors : of the unknowns. off, held : (P,) error of each point's ln depth against the estimate, and its
-    weight. scale : (P,) unknown of its host's ln scale, which moves the estimate. free : (F,) numbers of the unknowns
-    that may change. unknowns : their number.
+    memory. priors : returns those of the unknowns. off, held : (P,) error of each point's ln depth against the
+    estimate, and its weight. scale : (P,) unknown of its host's ln scale, which moves the estimate. free : (F,) numbers
+    of the unknowns that may change. unknowns : their number.
     """
 
     first: np.ndarray
     parts: Sequence[slice]
     cost: float
     linear: Callable[[slice], Linear]
-    priors: Sequence[Prior]
+    priors: Callable[[], Sequence[Prior]]
     off: np.ndarray
     held: np.ndarray
     scale: np.ndarray
     free: np.ndarray
     unknowns: int
+
+    @cached_property
+    def _priors(self) -> Sequence[Prior]:
+        return self.priors()
 
     @cached_property
     def _of_first(self) -> Linear:
@@ -251,11 +258,12 @@ class ReducedModel:
             scale, off, held = place[self.scale[some]], self.off[some], self.held[some]
             linear = self._linear(some)
             _add_points(own, start, scale, off, held, linear._replace(columns=place[linear.columns]))
-        for prior in self.priors:
-            kept = np.flatnonzero(place[prior.columns] >= 0)
-            own_place = place[prior.columns[kept]]
-            normal.matrix[np.ix_(own_place, own_place)] += prior.A[np.ix_(kept, kept)]
-            normal.gradient[own_place] += prior.b[kept]
+        for prior in self._priors:
+            row, column = np.broadcast_arrays(place[prior.columns][:, :, None], place[prior.columns][:, None])
+            kept = (row >= 0) & (column >= 0)
+            np.add.at(normal.matrix, (row[kept], column[kept]), prior.A[kept])
+            own = place[prior.columns]
+            np.add.at(normal.gradient, own[own >= 0], prior.b[own >= 0])
         normal.matrix[np.diag_indices(free)] *= 1 + _RIDGE
         return normal
 
@@ -305,7 +313,13 @@ class ReducedModel:
         for some, linear, change in self._changes(step):
             change = change + linear.by_depth * points[self._points(some)][:, None]
             total += float(linear.weight @ (change**2).sum(1))
-        return total + sum(float(step[prior.columns] @ prior.A @ step[prior.columns]) for prior in self.priors)
+        return total + sum(sum(_squares(step[prior.columns], prior.A)) for prior in self._priors)
+
+
+def _squares(steps: np.ndarray, A: np.ndarray) -> list[float]:
+    """Return s^T A s of each of some steps (C, m) with their matrices (C, m, m)."""
+    found: list[float] = (steps[:, None] @ A @ steps[..., None]).ravel().tolist()
+    return found
 
 
 @kernel

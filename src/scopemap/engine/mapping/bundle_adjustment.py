@@ -146,22 +146,22 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
         return BundleSolution(problem.tracked, np.full(len(start.log_depth), np.inf), 0)
 
     # Where only the kernel's scale changes, the errors do not.
-    found_at: tuple[np.ndarray, Errors] | None = None
+    found_at: tuple[np.ndarray, _Deviations] | None = None
 
-    def seen_at(state: BundleState) -> Errors:
+    def deviations_at(state: BundleState) -> _Deviations:
         nonlocal found_at
         if found_at is None or found_at[0] is not state.log_depth:
-            found_at = state.log_depth, reprojection_errors(problem, state)
+            found_at = state.log_depth, _deviations(problem, state)
         return found_at[1]
 
     def rescaled(state: BundleState) -> BundleState:
-        seen = seen_at(state)
+        seen = deviations_at(state).seen
         lengths = np.linalg.norm(seen.error[seen.ahead], axis=1)
         return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
 
     options = least_squares.Options(np.inf, max_iterations, min_step=0.0, min_decrease=min_decrease)
     search = least_squares.Problem(
-        lambda state: linearised(problem, state, seen_at(state)), partial(_retract, problem), rescaled
+        lambda state: _linearised(problem, state, deviations_at(state)), partial(_retract, problem), rescaled
     )
     found = minimise(search, rescaled(start), options)
     state = found.state._replace(T_camera_world=orthonormalised(found.state.T_camera_world))
@@ -183,25 +183,26 @@ def weights(state: BundleState, seen: Errors | Reprojection) -> np.ndarray:
     return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, CAUCHY)[1], 0) / state.sigma_px**2
 
 
-def linearised(problem: BundleProblem, state: BundleState, seen: Errors | None = None) -> ReducedModel:
-    """Return the model of the cost around a state: unknowns of the keyframes, ln f if unknown, then the points.
+def linearised(problem: BundleProblem, state: BundleState) -> ReducedModel:
+    """Return the model of the cost around a state: unknowns of the keyframes, ln f if unknown, then the points."""
+    return _linearised(problem, state, _deviations(problem, state))
 
-    seen : the errors of the observations, where they are known.
-    """
-    count = len(state.T_camera_world)
-    seen, edges = seen or reprojection_errors(problem, state), _odometry_edges(problem, state)
-    held = [6 + _PER_KEYFRAME * np.arange(count)] if problem.priors.scale == 0 else []
-    held += [np.arange(6), np.arange(_PER_KEYFRAME * problem.held)]
-    unknowns = _PER_KEYFRAME * count + (problem.log_focal_sigma is not None)
+
+def _linearised(problem: BundleProblem, state: BundleState, at: _Deviations) -> ReducedModel:
+    unknowns = _PER_KEYFRAME * len(state.T_camera_world)
+    is_free = np.ones(unknowns + (problem.log_focal_sigma is not None), bool)
+    is_free[: max(6, _PER_KEYFRAME * problem.held)] = False
+    if problem.priors.scale == 0:
+        is_free[6:unknowns:_PER_KEYFRAME] = False
     return ReducedModel(
         problem.first_seen,
         problem.parts,
-        _cost(problem, state, seen, edges),
+        _cost(problem, state, at),
         partial(_derivatives, problem, state),
-        _camera_priors(problem, state, edges),
+        partial(_camera_priors, problem, state, at.edges),
         *_held_depths(problem, state),
-        free=np.setdiff1d(np.arange(unknowns), np.concatenate(held)),
-        unknowns=unknowns,
+        free=np.flatnonzero(is_free),
+        unknowns=len(is_free),
     )
 
 
@@ -224,9 +225,9 @@ def _derivatives(problem: BundleProblem, state: BundleState, points: slice) -> L
     return Linear(columns, by, by_depth, seen.error, weights(state, seen) / problem.correlated)
 
 
-def _cost(problem: BundleProblem, state: BundleState, seen: Errors, edges: _OdometryEdges) -> float:
+def _cost(problem: BundleProblem, state: BundleState, at: _Deviations) -> float:
     """Return what is minimised, at a state."""
-    points, priors = problem.points, problem.priors
+    points, priors, (seen, edges) = problem.points, problem.priors, at
     square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
     depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
     cost = cauchy(square, CAUCHY)[0].sum() / problem.correlated + cauchy(depth**2, CAUCHY)[0].sum()
@@ -249,6 +250,17 @@ class _OdometryEdges(NamedTuple):
     information: np.ndarray
 
 
+class _Deviations(NamedTuple):
+    """How far a state is from the observations, and from the tracked motion."""
+
+    seen: Errors
+    edges: _OdometryEdges
+
+
+def _deviations(problem: BundleProblem, state: BundleState) -> _Deviations:
+    return _Deviations(reprojection_errors(problem, state), _odometry_edges(problem, state))
+
+
 def _odometry_edges(problem: BundleProblem, state: BundleState) -> _OdometryEdges:
     """Deviations from the tracked motion between neighbours."""
     priors, tracked, T = problem.priors, problem.T_camera_world, state.T_camera_world
@@ -259,20 +271,20 @@ def _odometry_edges(problem: BundleProblem, state: BundleState) -> _OdometryEdge
 
 
 def _camera_priors(problem: BundleProblem, state: BundleState, edges: _OdometryEdges) -> list[Prior]:
-    """Return the normal equations of the priors of keyframes, and of ln f."""
+    """Return the normal equations of the priors of pairs of keyframes, of all scales, and of ln f."""
     T, unit, (i, j) = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), edges.pairs.T
     own = _PER_KEYFRAME * np.repeat(edges.pairs, 6, axis=1) + np.tile(np.arange(6), 2)
     by_i = -_adjoint(T[j] @ inverse(T[i]))
     J = np.concatenate([by_i, np.broadcast_to(np.eye(6), by_i.shape)], -1) * np.tile(unit, 2)
     weighted = J.swapaxes(1, 2) * edges.information
-    priors = list(map(Prior, own, weighted @ J, (weighted @ edges.error[..., None])[..., 0]))
+    priors = [Prior(own, weighted @ J, (weighted @ edges.error[..., None])[..., 0])]
     if problem.priors.scale > 0:
         information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + _PER_KEYFRAME * np.arange(len(T))
-        priors.append(Prior(own, np.diag(information), information * state.log_scale))
+        priors.append(Prior(own[None], np.diag(information)[None], (information * state.log_scale)[None]))
     if problem.log_focal_sigma is not None:
         information, own = np.array([problem.log_focal_sigma**-2.0]), np.array([_PER_KEYFRAME * len(T)])
         change = np.array([state.log_focal - problem.tracked.log_focal])
-        priors.append(Prior(own, np.diag(information), information * change))
+        priors.append(Prior(own[None], np.diag(information)[None], (information * change)[None]))
     return priors
 
 
