@@ -47,15 +47,14 @@ def simplified(mesh: trimesh.Trimesh, most_faces: int) -> trimesh.Trimesh:
     A twentieth of the time of quadric edge collapses, and colours are means, not those of single vertices (Rossignac
     and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993). Attributes are means, too.
     """
+    if len(mesh.faces) <= most_faces:
+        return mesh
     # `mesh.area` would keep all triangles: 30 MB for a submap.
     area = trimesh.triangles.area(np.asarray(mesh.vertices)[mesh.faces])
     cell = np.sqrt(_CELLS_PER_FACE * area.sum() / most_faces)
-    while len(mesh.faces) > most_faces:
-        fewer = _clustered(mesh, cell)
-        if len(fewer.faces) <= most_faces:
-            return fewer
+    while len((fewer := _clustered(mesh, cell)).faces) > most_faces:
         cell *= np.sqrt(max(len(fewer.faces) / most_faces, 1.04))
-    return mesh
+    return fewer
 
 
 def textured_surface(run: Result, segment: int, shown: trimesh.Trimesh) -> trimesh.Trimesh | None:
@@ -63,7 +62,9 @@ def textured_surface(run: Result, segment: int, shown: trimesh.Trimesh) -> trime
 
     The triangles are those of `shown`, in their order; vertices at seams are there more than once.
     """
-    textured = run.textured if segment == run.main_segment else None
+    # Of a mesh that was simplified the texture, whose file takes long to read, is of no use.
+    is_whole = segment == run.main_segment and len(shown.faces) == len(run.mesh.faces)
+    textured = run.textured if is_whole else None
     return textured if textured is not None and len(textured.faces) == len(shown.faces) else None
 
 
