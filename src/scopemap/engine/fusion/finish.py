@@ -84,28 +84,25 @@ def without_small_holes(mesh: trimesh.Trimesh, largest_perimeter_mm: float) -> t
     vertex attributes, such as `confidence`. Vertices and faces keep their numbers, new ones follow. Islands and open
     ends stay as they are.
     """
-    vertices, loops = np.asarray(mesh.vertices), []
+    vertices, loops = np.asarray(mesh.vertices), _LoopVertices([])
     if len(mesh.faces):
         starts, ends = border_edges(mesh).T
         lengths = np.linalg.norm(vertices[starts] - vertices[ends], axis=1)
-        found = [np.array(loop) for loop in _loops(starts, ends, lengths, largest_perimeter_mm)]
-        loops = [loop for loop in found if _is_hole(vertices[loop], mesh.vertex_normals[loop])]
-    if not loops:
+        if found := _loops(starts, ends, lengths, largest_perimeter_mm):
+            are_holes = _are_holes(vertices, np.asarray(mesh.vertex_normals), _LoopVertices(found))
+            loops = _LoopVertices([loop for loop, is_hole in zip(found, are_holes.tolist(), strict=True) if is_hole])
+    if not len(loops.counts):
         return mesh
-    fans = [
-        np.stack([np.roll(loop, -1), loop, np.full(len(loop), len(vertices) + k)], axis=1)
-        for k, loop in enumerate(loops)
-    ]
+    fans = np.stack([loops.vertices[loops.after], loops.vertices, len(vertices) + loops.loop], axis=1)
     colours = vertex_colours(mesh)
-    middles = np.stack([vertices[loop].mean(axis=0) for loop in loops])
-    shades = np.round([colours[loop].mean(axis=0) for loop in loops]).astype(colours.dtype)
+    shades = np.round(loops.means(colours)).astype(colours.dtype)
     attributes: dict[str, Any] = {
-        name: np.concatenate([values, np.zeros((len(loops), *np.shape(values)[1:]), np.asarray(values).dtype)])
+        name: np.concatenate([values, np.zeros((len(loops.counts), *np.shape(values)[1:]), np.asarray(values).dtype)])
         for name, values in mesh.vertex_attributes.items()
     }
     return trimesh.Trimesh(
-        np.concatenate([vertices, middles]),
-        np.concatenate([mesh.faces, *fans]),
+        np.concatenate([vertices, loops.means(vertices)]),
+        np.concatenate([mesh.faces, fans]),
         vertex_colors=np.concatenate([colours, shades]),
         vertex_attributes=attributes,
         process=False,
@@ -140,12 +137,39 @@ def _loops(starts: np.ndarray, ends: np.ndarray, lengths: np.ndarray, longest: f
     return loops
 
 
-def _is_hole(points: np.ndarray, normals: np.ndarray) -> bool:
-    """Whether a loop of border points (N, 3), in the direction of their faces, goes around a hole in the surface."""
-    arms = points - points.mean(axis=0)
-    area = np.cross(arms, np.roll(arms, -1, axis=0)).sum(axis=0)
-    around = normals.sum(axis=0)
-    return bool(area @ around < _HOLE_COSINE * np.linalg.norm(area) * np.linalg.norm(around))
+class _LoopVertices:
+    """Loops of vertices one after the other.
+
+    vertices : (N,) their numbers. loop : (N,) the number of the loop of each. after : (N,) where the one that follows
+    each in its loop is. counts : (L,) how many each loop has.
+    """
+
+    def __init__(self, loops: list[list[int]]) -> None:
+        self.vertices = np.array([vertex for loop in loops for vertex in loop], int)
+        self.counts = np.array([len(loop) for loop in loops], int)
+        self.loop = np.repeat(np.arange(len(loops)), self.counts)
+        ends = np.cumsum(self.counts)
+        self.after = np.arange(1, len(self.vertices) + 1)
+        self.after[ends - 1] = ends - self.counts
+
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Return the sums (L, n) of values (N, n)."""
+        # One value after the other: `np.add.reduceat` adds in another order.
+        return np.stack([np.bincount(self.loop, column, len(self.counts)) for column in values.T], axis=1)
+
+    def means(self, values: np.ndarray) -> np.ndarray:
+        """Return the means (L, n) of values (V, n) of all vertices of the mesh."""
+        return self.sums(values[self.vertices]) / self.counts[:, None]
+
+
+def _are_holes(vertices: np.ndarray, normals: np.ndarray, loops: _LoopVertices) -> np.ndarray:
+    """Return whether loops of border vertices, directed as their faces, go around a hole in the surface, (L,) bool."""
+    arms = vertices[loops.vertices] - loops.means(vertices)[loops.loop]
+    areas, around = loops.sums(np.cross(arms, arms[loops.after])), loops.sums(normals[loops.vertices])
+    found: np.ndarray = (areas * around).sum(axis=1) < _HOLE_COSINE * (
+        np.linalg.norm(areas, axis=1) * np.linalg.norm(around, axis=1)
+    )
+    return found
 
 
 def with_even_border(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -169,9 +193,11 @@ def with_even_border(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def border_edges(mesh: trimesh.Trimesh) -> np.ndarray:
     """Return the edges (E, 2) that only one face has, directed as in their face, sorted by their vertices."""
-    border = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
-    edges: np.ndarray = mesh.edges[border[np.lexsort(mesh.edges_sorted[border].T[::-1])]]
-    return edges
+    edges = np.asarray(mesh.faces)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    keys = np.minimum(edges[:, 0], edges[:, 1]) * len(mesh.vertices) + np.maximum(edges[:, 0], edges[:, 1])
+    order = np.argsort(keys)
+    differs = np.diff(keys[order], prepend=-1, append=-1) != 0
+    return edges[order[differs[1:] & differs[:-1]]]
 
 
 def _grown(chosen: np.ndarray, faces: np.ndarray, rings: int) -> np.ndarray:

@@ -88,8 +88,10 @@ def textured_mesh(
     gains = level_gains(places, shown, colours)
     width, height = layout.extent
     texture = np.zeros((height, width, 3), np.uint8)
+    by_chart = np.argsort(chart, kind="stable")
+    ends = np.searchsorted(chart[by_chart], np.arange(len(crops) + 1))
     for number, crop in enumerate(crops):
-        corners = places.of_corner[chart == number]
+        corners = places.of_corner[by_chart[ends[number] : ends[number + 1]]]
         at = layout.pixels[corners] - layout.first[number]
         (x, y), (across, down) = layout.place[number], layout.size[number]
         texture[y : y + down, x : x + across] = _painted(crop, at, gains[corners])

@@ -57,8 +57,9 @@ def level_gains(places: ChartVertices, shown: np.ndarray, surface: np.ndarray) -
     has, wanted = (np.log(np.maximum(levels, _LEAST_LEVEL)) for levels in (shown, surface))
     has = np.where(free[:, None], has, wanted)  # what is in no chart is shown as it is
     corners = places.of_corner
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    edges = np.unique(edges[free[edges[:, 0]]], axis=0)
+    pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    keys = np.unique(pairs[free[pairs[:, 0]]] @ [len(free), 1])
+    edges = np.stack(np.divmod(keys, len(free)), axis=1)
     seams = _seams(places)
     one, other = np.concatenate([edges, seams]).T
     weight = np.concatenate([np.ones(len(edges)), np.full(len(seams), _SEAM)])

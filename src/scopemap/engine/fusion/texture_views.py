@@ -9,6 +9,7 @@ color!", ECCV 2014) weighs such a quality against seams. Here the few views and 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -48,9 +49,11 @@ def choose_views(mesh: trimesh.Trimesh, frames: Iterable[Frame]) -> tuple[list[i
     """
     numbers, qualities = list[int](), list[np.ndarray]()
     corners, areas_mm2 = np.asarray(mesh.vertices)[mesh.faces], np.asarray(mesh.area_faces)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    triangles = _Triangles(areas_mm2, corners.mean(axis=1), normals, np.linalg.norm(normals, axis=1))
     for frame in frames:
         numbers.append(frame.index)
-        qualities.append(_quality(mesh, corners, areas_mm2, frame))
+        qualities.append(_quality(mesh, triangles, frame))
     label = np.full(len(mesh.faces), -1, np.int32)
     if not numbers or not len(mesh.faces):
         return [], label
@@ -65,7 +68,16 @@ def choose_views(mesh: trimesh.Trimesh, frames: Iterable[Frame]) -> tuple[list[i
     return [numbers[chosen[one]] for one in used], place[label]
 
 
-def _quality(mesh: trimesh.Trimesh, corners: np.ndarray, areas_mm2: np.ndarray, frame: Frame) -> np.ndarray:
+class _Triangles(NamedTuple):
+    """Areas (F,) and middles (F, 3) of triangles, mm; normals (F, 3) of any length, and their lengths (F,)."""
+
+    areas_mm2: np.ndarray
+    middles: np.ndarray
+    normals: np.ndarray
+    lengths: np.ndarray
+
+
+def _quality(mesh: trimesh.Trimesh, triangles: _Triangles, frame: Frame) -> np.ndarray:
     """Return what a frame is worth as texture of each triangle, (F,) float32: px per mm, times the frame's quality."""
     assert frame.T_world_camera is not None
     rendering = render_mesh(mesh, frame.camera, frame.T_world_camera)
@@ -83,11 +95,10 @@ def _quality(mesh: trimesh.Trimesh, corners: np.ndarray, areas_mm2: np.ndarray, 
     a, b, c = (pixels[faces[:, corner]] for corner in range(3))
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     with np.errstate(invalid="ignore", divide="ignore"):
-        per_mm = np.sqrt(np.abs(ux * vy - uy * vx) / 2 / areas_mm2)
-    to_camera = frame.T_world_camera[:3, 3] - corners.mean(axis=1)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=1) * np.linalg.norm(to_camera, axis=1)
-    cosine = np.abs(np.einsum("ij,ij->i", normals, to_camera)) / np.maximum(length, 1e-12)
+        per_mm = np.sqrt(np.abs(ux * vy - uy * vx) / 2 / triangles.areas_mm2)
+    to_camera = frame.T_world_camera[:3, 3] - triangles.middles
+    length = triangles.lengths * np.linalg.norm(to_camera, axis=1)
+    cosine = np.abs(np.einsum("ij,ij->i", triangles.normals, to_camera)) / np.maximum(length, 1e-12)
     shown = seen[faces].all(axis=1) & (cosine > _LEAST_COSINE) & np.isfinite(per_mm)
     return np.where(shown, per_mm * max(frame.quality, 0.05), 0).astype(np.float32)
 
