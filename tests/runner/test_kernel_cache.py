@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
-from numba import njit
+from numba import config, njit
 
+from scopemap.engine.geometry.kernels import cache_folder, use_cache
 from scopemap.result.summary import compiling_words
 from scopemap.runner.run import compiling_s
 
@@ -52,6 +53,25 @@ def test_kernels_are_cached_in_a_private_folder_where_the_usual_ones_are_read_on
 def test_without_any_folder_nothing_is_cached_and_all_works() -> None:
     code = "from pathlib import Path\nPath.mkdir = lambda *_, **__: (_ for _ in ()).throw(OSError(30, 'read-only'))\n"
     assert _import(code) == ""
+
+
+def test_kernels_of_another_text_are_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    kernel, other = tmp_path / "geometry" / "warp.py", tmp_path / "frame.py"
+    kernel.parent.mkdir()
+    kernel.write_text("@kernel\ndef warp(): ...\n", encoding="utf-8")
+    before = cache_folder(tmp_path)
+    other.write_text("x = 1\n", encoding="utf-8")
+    assert cache_folder(tmp_path) == before
+    kernel.write_text("@kernel\ndef warp(a): ...\n", encoding="utf-8")
+    after = cache_folder(tmp_path)
+    assert (after.parent, after != before) == (before.parent, True)
+    for folder in (before, after):
+        folder.mkdir(parents=True)
+    use_cache(after)
+    assert [folder.name for folder in before.parent.iterdir()] == [after.name]
+    assert after == Path(config.CACHE_DIR)
 
 
 def test_the_summary_names_what_compiling_took(monkeypatch: pytest.MonkeyPatch) -> None:

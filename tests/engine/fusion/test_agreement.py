@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from scopemap.engine.fusion.agreement import surface_views, vertex_sigmas
+from scopemap.engine.fusion.agreement import rendered_frames, vertex_sigmas
 from tests.support.drawn_surfaces import AHEAD, VIEW, plane_frame
 
 
@@ -25,5 +25,5 @@ def test_a_frame_sees_vertices_up_to_the_border_of_its_last_pixels() -> None:
     beyond = 50.0 * VIEW.unproject(np.array([[-20.0, -20.0], [180.0, -20.0], [-20.0, 140.0], [180.0, 140.0]]))
     vertices = np.concatenate([beyond, 50.0 * VIEW.unproject(np.array(pixels))])
     wall = trimesh.Trimesh(vertices, [[0, 1, 2], [2, 1, 3]], process=False)
-    sigmas = vertex_sigmas(len(vertices), surface_views(wall, [frame]))
+    sigmas = vertex_sigmas(len(vertices), rendered_frames(wall, [frame]))
     np.testing.assert_array_equal(np.isfinite(sigmas), [False] * 4 + [True, False] * 4)
