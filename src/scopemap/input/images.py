@@ -94,7 +94,6 @@ class ImageFolder(Source):
     """
 
     name = "images"
-    seeks = True
     depth_code: DepthCode = ((16, 1.0, 65535),)
 
     def __init__(self, path: Path, files: list[Path] | None = None) -> None:
@@ -125,6 +124,10 @@ class ImageFolder(Source):
     def picture_files(self) -> dict[int, Path]:
         """Return the files of the frames by number."""
         return self.file_of
+
+    def entry(self, number: int) -> int:
+        """Return the position itself: each picture is a file."""
+        return number
 
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames; unreadable files, with a warning, and those of another size are left out."""

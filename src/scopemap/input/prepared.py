@@ -32,9 +32,9 @@ _FEWEST_SAMPLES = 2
 _SAMPLES_BYTES = 100_000_000
 # Attributes and methods of a source that are the same for one view of it.
 _KEPT = (
-    "name", "width", "height", "pixel_aspect", "seeks", "count", "numbers", "stamped", "rate_hz", "notes", "warnings",
+    "name", "width", "height", "pixel_aspect", "count", "numbers", "stamped", "rate_hz", "notes", "warnings",
     "frame_limit_s", "left_out", "resized", "quality", "depth_scale_mm", "depth_sensor", "masks", "stamps", "media",
-    "pose", "truth", "picture_files",
+    "entry", "pose", "truth", "picture_files",
 )  # fmt: skip
 _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 

@@ -75,7 +75,6 @@ class Source:
     name : the data set's name. path : the file or folder.
     width, height : size of the images, px. pixel_aspect : width of a pixel over its height.
     count : number of frames. numbers : the frames' numbers. Both are None where only reading on tells.
-    seeks : whether selected frames are read without those before them.
     stamped : whether its time stamps are its own; False: frame numbers over an assumed rate.
     times_s : time stamps, s, by frame number; a frame without one has its number / `rate_hz`.
     calibration : content of the calibration file beside the frames, of whatever size; None where there is none.
@@ -98,7 +97,6 @@ class Source:
     width: int
     height: int
     pixel_aspect = 1.0
-    seeks = False
     count: int | None = None
     numbers: Sequence[int] | None = None
     stamped = False
@@ -133,6 +131,10 @@ class Source:
     def frames(self, selection: slice) -> Iterator[SourceFrame]:
         """Yield the selected frames, decoded one at a time; `selection` counts positions, its step is positive."""
         return iter(())
+
+    def entry(self, number: int) -> int:
+        """Return the position of the picture from which on the input is read for the one at a position; 0: from all."""
+        return 0
 
     def begin_at(self, selection: slice) -> None:
         """Take what may change within the input, such as the pictures' size, as it is at the first selected frame."""

@@ -132,7 +132,6 @@ class VideoFile(Source):
             self._promised = len(stream.index_entries)
             self.count = sum(not entry.is_discard for entry in stream.index_entries)
             self._frame_index = frame_index(container, stream)
-            self.seeks = self._frame_index is not None
         elif not self.count:
             self.count = None if duration_s is None else round(duration_s * self.rate_hz)
 
@@ -148,6 +147,10 @@ class VideoFile(Source):
             shown = self._of_one_size(SourceFrame(index, time_s, self._shown(frame, reformatter)))
             if shown is not None:
                 yield shown
+
+    def entry(self, number: int) -> int:
+        """Return the position of the last key picture up to a position."""
+        return 0 if self._frame_index is None else self._frame_index.key_before(number)
 
     def begin_at(self, selection: slice) -> None:
         """Take size and pixel aspect of the first selected picture: they may change within a video."""

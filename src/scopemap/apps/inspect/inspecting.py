@@ -25,6 +25,7 @@ from scopemap.input.sequence import Sequence
 from scopemap.input.source import SourceFrame
 from scopemap.input.video_format.stereo_packing import Packing, packing
 from scopemap.result.wording import in_words
+from scopemap.runner.run import in_thread
 
 _PARTS = 12  # by hand: 300 frames, in about 4 s, show what concerns a whole video
 _FRAMES_OF_PART = 25  # by hand: a second of most videos, for what lasts
@@ -176,7 +177,8 @@ def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:
     positions = {index: position for position, (index, _) in enumerate(known)}
     inspector = FrameInspector()
     is_video = sequence.source.media() is not None
-    for part, number, item in _read(sequence):
+    # Decoding and measuring take about the same time.
+    for part, number, item in in_thread(_read(sequence), "read"):
         rgb, valid = sequence.rectifier.image(item.rgb), sequence.rectifier.valid
         frame = Frame(item.index, item.time_s, rgb, sequence.camera, valid, name=item.name)
         place = item.index if is_video else positions.get(item.index, number)
@@ -187,7 +189,7 @@ def _read(sequence: Sequence) -> Iterator[tuple[int, int, SourceFrame]]:
     """Yield the frames of the parts, each with the number of its part and about its position in the input."""
     source, selection = sequence.source, sequence.selection
     parts, (start, _, step) = _parts(sequence), selection.indices(source.count or sys.maxsize)
-    if source.seeks or len(parts) == 1:
+    if len(parts) == 1 or source.entry(start + step * parts[-1].start):
         for part, numbers in enumerate(parts):
             first = selection.start if len(parts) == 1 else start + step * numbers.start
             # The last one is read to the end of the input, for its reader to say where that breaks off.
@@ -202,12 +204,22 @@ def _read(sequence: Sequence) -> Iterator[tuple[int, int, SourceFrame]]:
 
 
 def _parts(sequence: Sequence) -> list[range]:
-    """Return which of the selected frames are read: short parts, evenly spread; all where they are few or uncounted."""
+    """Return which of the selected frames are read: short parts, evenly spread; all where they are few or uncounted.
+
+    Parts between the first and the last begin at a key picture, where there is one after the part before: nothing else
+    has to be decoded for them.
+    """
     count = sequence.count
     if count is None or count <= _PARTS * _FRAMES_OF_PART:
         return [range(count or 0)]
-    firsts = np.linspace(0, count - _FRAMES_OF_PART, _PARTS).round().astype(int).tolist()
-    return [range(first, first + _FRAMES_OF_PART) for first in firsts]
+    start, _, step = sequence.selection.indices(sequence.source.count or sys.maxsize)
+    parts, end = list[range](), 0
+    for first in np.linspace(0, count - _FRAMES_OF_PART, _PARTS).round().astype(int).tolist():
+        entry = -((start - sequence.source.entry(start + step * first)) // step)
+        begin = entry if end <= entry and len(parts) + 1 < _PARTS else first
+        end = begin + _FRAMES_OF_PART
+        parts.append(range(begin, end))
+    return parts
 
 
 def _of_source(warnings: list[str]) -> list[VideoFinding]:

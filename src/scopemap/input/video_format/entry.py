@@ -30,6 +30,10 @@ class FrameIndex:
     dts: np.ndarray
     keys: np.ndarray
 
+    def key_before(self, number: int) -> int:
+        """Return the position of the last key picture up to a position."""
+        return int(self.keys[self.keys <= number].max(initial=0))
+
 
 @dataclass(frozen=True)
 class Entry:
