@@ -9,14 +9,16 @@ from __future__ import annotations
 import csv
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from scopemap.engine.errors import reporting
 from scopemap.engine.frame import Rows
-from scopemap.engine.odometry import Step
-from scopemap.result.result import Result
+
+if TYPE_CHECKING:
+    from scopemap.engine.odometry import Step
 
 FOLDER = "frames"
 _MOST = 64
@@ -89,6 +91,9 @@ class FramePictures:
         folder = run / FOLDER
         with reporting(f"cannot write to {folder}"):
             folder.mkdir(parents=True, exist_ok=True)
+            # Here: `scopemap inspect` shrinks pictures without all that results need, and starts sooner.
+            from scopemap.result.result import Result
+
             place = Result(run)
             for index in place.pictured:
                 place.picture_file(index).unlink()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, defaultdict, deque
+from collections import Counter, defaultdict
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from numba.core.event import TimingListener, register
 
@@ -21,6 +20,7 @@ from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.engine.pipeline import Adjusted, Pipeline
 from scopemap.engine.tracking.track import Track
+from scopemap.input.ahead import in_thread
 from scopemap.input.sequence import Sequence
 from scopemap.result.frame_table import FrameTable, GrowingFrameTable
 from scopemap.result.result import Result
@@ -31,9 +31,6 @@ from scopemap.runner.memory import MemoryPlan, trim_memory
 from scopemap.runner.observers import FrameWriter, Observer, Progress, RunStopped
 from scopemap.runner.provenance import Limits, facts_of_segment, motion_notices, notices_of_end, provenance_of
 from scopemap.runner.submap_frames import check_tracked, frames_of_submap, put_backwards, tracked_frames
-
-_Item = TypeVar("_Item")
-_END = object()
 
 
 class CheckpointWriter(Protocol):
@@ -327,25 +324,6 @@ def _compiling() -> TimingListener:
     listener = TimingListener()
     register("numba:compile", listener)
     return listener
-
-
-def in_thread(items: Iterable[_Item], thread: str, count: int = 2) -> Generator[_Item, None, None]:
-    """Yield items in order, computed in a thread of their own, at most `count` ahead of their use.
-
-    thread : its name. An error of an item is raised where the item would come. Closed early, the thread ends after the
-    item that it computes.
-    """
-    source = iter(items)
-    worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix=thread)
-    try:
-        coming = deque(worker.submit(next, source, _END) for _ in range(count))
-        while (item := coming.popleft().result()) is not _END:
-            coming.append(worker.submit(next, source, _END))
-            yield item  # type: ignore[misc]
-    finally:
-        worker.shutdown(cancel_futures=True)
-        if hasattr(source, "close"):
-            source.close()
 
 
 def overlapped(
