@@ -1,16 +1,18 @@
-"""The sequence of rectified frames that everything above works on."""
+"""The sequence of rectified frames that everything above works on, and reading them ahead of their use."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from collections.abc import Sequence as Numbers
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
-from typing import Literal
+from typing import Literal, TypeVar
 
 from scopemap.engine.cameras.camera import CameraModel, PinholeCamera
 from scopemap.engine.cameras.lenses import FisheyeCamera
@@ -22,6 +24,8 @@ from scopemap.input.frame_choice import FrameChoice, selection_text
 from scopemap.input.source import SkippedFrame, Source, SourceFrame, assumed_camera
 
 CameraOrigin = Literal["calibrated", "stated", "estimated", "assumed"]
+_Item = TypeVar("_Item")
+_END = object()
 _MOST_ASPECT = 0.05  # by hand: share by which fx and fy differ, of pixels that are nearly square
 
 
@@ -247,3 +251,22 @@ def _in_time(
         asked.put(False)
         if not hangs:
             reader.join()
+
+
+def in_thread(items: Iterable[_Item], thread: str, count: int = 2) -> Generator[_Item, None, None]:
+    """Yield items in order, computed in a thread of their own, at most `count` ahead of their use.
+
+    thread : its name. An error of an item is raised where the item would come. Closed early, the thread ends after the
+    item that it computes.
+    """
+    source = iter(items)
+    worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix=thread)
+    try:
+        coming = deque(worker.submit(next, source, _END) for _ in range(count))
+        while (item := coming.popleft().result()) is not _END:
+            coming.append(worker.submit(next, source, _END))
+            yield item  # type: ignore[misc]
+    finally:
+        worker.shutdown(cancel_futures=True)
+        if hasattr(source, "close"):
+            source.close()

@@ -20,8 +20,7 @@ from scopemap.engine.notices import Notice
 from scopemap.engine.odometry import Step
 from scopemap.engine.pipeline import Adjusted, Pipeline
 from scopemap.engine.tracking.track import Track
-from scopemap.input.ahead import in_thread
-from scopemap.input.sequence import Sequence
+from scopemap.input.sequence import Sequence, in_thread
 from scopemap.result.frame_table import FrameTable, GrowingFrameTable
 from scopemap.result.result import Result
 from scopemap.result.surface_segments import main_segment

@@ -19,10 +19,9 @@ from scopemap.apps.inspect.frame_measures import FrameInspector, InspectedFrame
 from scopemap.engine.config import InputSettings
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import Frame
-from scopemap.input.ahead import in_thread
 from scopemap.input.opening import open_sequence, open_source
 from scopemap.input.prepared import OF_UNKNOWN_VIEWS, sample_pairs, shows_two_fields
-from scopemap.input.sequence import Sequence
+from scopemap.input.sequence import Sequence, in_thread
 from scopemap.input.source import SourceFrame
 from scopemap.input.video_format.stereo_packing import Packing, packing
 from scopemap.result.wording import in_words

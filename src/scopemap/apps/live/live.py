@@ -31,6 +31,8 @@ LIMITS = Limits(frames=50_000, maps=8, blocks=80_000, stored=9_000)
 """Of a session: about 60 MB of rows, 1 GB of surfaces, and on disk 4 GB of frames: ten minutes at 15 frames/s."""
 _REMEMBERED = 300  # latencies
 _AHEAD = 1
+_MOST_AT_ONCE = 2  # frames between source and step, one for each of two cores: more wait for each other, and come late
+_WITHOUT_STEP_S = 1.0  # guard: after which a frame that never became a step holds up no other
 
 LiveObserver = Callable[[Step, Reconstructor], None]
 """Called with each step, in the thread that fuses."""
@@ -129,15 +131,21 @@ class LiveSession:
         self._latencies_ms: deque[float] = deque(maxlen=_REMEMBERED)
         self._times_s: deque[float] = deque(maxlen=_REMEMBERED)
         self._step: Step | None = None
+        self._places = threading.Semaphore(_MOST_AT_ONCE)
         self._tracked = self._lost = 0
         self._scale_known = self._full = False
 
     def _until_reset(self) -> Iterator[Frame]:
-        while not self._wants_reset and (frame := next(self._frames, None)) is not None:
+        """Yield the newest frame whenever few are on their way; the source leaves out those that come meanwhile."""
+        while not self._wants_reset:
+            self._places.acquire(timeout=_WITHOUT_STEP_S)
+            if (frame := next(self._frames, None)) is None:
+                return
             yield frame
 
     def _take(self, step: Step, reconstructor: Reconstructor) -> None:
         now_s = self._source.now_s()
+        self._places.release()
         with self._lock:
             self._step, is_lost = step, step.track.status == "lost"
             self._tracked, self._lost = self._tracked + (not is_lost), self._lost + is_lost
