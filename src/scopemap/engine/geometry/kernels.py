@@ -26,6 +26,7 @@ IS_CACHED = os.environ.get("NUMBA_CACHE_DIR") != ""
 would refuse to start."""
 
 _ENGINE = Path(__file__).parents[1]
+_OF_KERNELS = (b"kernel", b"NamedTuple")  # words of files with kernels, and with types that kernels take
 
 
 def cache_folder(engine: Path = _ENGINE) -> Path:
@@ -33,10 +34,10 @@ def cache_folder(engine: Path = _ENGINE) -> Path:
     digest = hashlib.sha256()
     for file in sorted(engine.rglob("*.py")):
         text = file.read_bytes()
-        if b"kernel" in text:
+        if any(word in text for word in _OF_KERNELS):
             digest.update(text)
     beside = engine / "geometry" / "__pycache__"
-    users = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "numba"
+    users = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")) / "numba"
     may_write = os.access(beside if beside.exists() else beside.parent, os.W_OK)
     named = os.environ.get("NUMBA_CACHE_DIR")
     return Path(named or (beside if may_write else users)) / f"kernels-{digest.hexdigest()[:16]}"
