@@ -34,7 +34,9 @@ _LARGEST_STEP = 2000  # of frames that are numbered
 _MOST_UNEVEN = 100.0  # longest over usual step of a clock that only pauses
 _MOST_UNEVEN_DECIMAL = 10.0  # of decimal numbers, which may be two counters: scan_0.14, scan_1.01
 _MOST_PICTURES = 8  # kinds of pictures beside one frame
-_NS, _US, _MS = 1e-9, 1e-6, 1e-3
+_NS = 1e-9
+_US = 1e-6
+_MS = 1e-3
 _UNIX_S = (6e8, 5e9)  # 1989 to 2128
 
 

@@ -17,7 +17,8 @@ from scopemap.input.decoding import read_decoded
 from scopemap.report.depth_figures import colour_depth
 from scopemap.runner.reread_frames import sharp_picture
 
-_WIDTH, _HEIGHT = 1440, 240
+_WIDTH = 1440
+_HEIGHT = 240
 _LETTERS = 0.6
 _CAPTION_PX = 24
 _MARK_PX = 12

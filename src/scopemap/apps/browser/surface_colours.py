@@ -19,7 +19,8 @@ _LOOKED_AT = 25
 _SAME_SURFACE = 0.1
 """Relative difference of depth up to which a frame sees a vertex, as for `times_seen`."""
 _WORST_PERCENTILE = 95
-_PICTURE, _PALE = "picture", "picture, pale where unsure"
+_PICTURE = "picture"
+_PALE = "picture, pale where unsure"
 _UNKNOWN = (150, 150, 150)
 
 

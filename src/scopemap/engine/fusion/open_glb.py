@@ -11,7 +11,8 @@ import numpy as np
 import trimesh
 
 # trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
-WRITTEN_COLOURS, WRITTEN_UV = "_COLOR_0", "_TEXCOORD_0"
+WRITTEN_COLOURS = "_COLOR_0"
+WRITTEN_UV = "_TEXCOORD_0"
 _FLOAT = 5126  # glTF 2.0, sections 3.6.2.2 and 4.4.3
 _JSON = 0x4E4F534A  # glTF 2.0, section 4.4.3: "JSON"
 _BIN = 0x004E4942  # glTF 2.0, section 4.4.3: "BIN"
