@@ -27,11 +27,12 @@ def _modules_loaded_after(code: str) -> int:
 CEILINGS = {
     "settings that can be set": (lambda: len(setting_names()), 80),
     "settings but the advanced ones": (lambda: len(setting_names()) - _advanced_settings(), 46),
-    # Readers of formats, networks and pages are loaded when an input, a setting or a command needs them. 152: the log
-    # from which a killed run is resumed, in place of a serialiser of all that the stages hold; depth under highlights.
+    # Readers of formats, networks and pages are loaded when an input, a setting or a command needs them. 153: the log
+    # from which a killed run is resumed, in place of a serialiser of all that the stages hold; depth under highlights;
+    # the blocks of a TSDF apart from its kernels.
     "modules loaded by scopemap.reconstruct": (
         lambda: _modules_loaded_after("import scopemap; scopemap.reconstruct"),
-        152,
+        153,
     ),
 }
 

@@ -1,4 +1,4 @@
-"""Compiled kernels where neither the installation nor the user's cache can be written: containers, clusters."""
+"""Compiled kernels: ahead of a run, and where neither installation nor cache can be written: containers, clusters."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import pytest
 from numba import config, njit
 
-from scopemap.engine.geometry.kernels import cache_folder, use_cache
+import scopemap
+from scopemap.engine.geometry.kernels import KERNELS, Float32_2d, cache_folder, compile_kernel, kernel, use_cache
 from scopemap.result.summary import compiling_words
 from scopemap.runner.run import compiling_s
 
@@ -83,3 +86,58 @@ def test_the_summary_names_what_compiling_took(monkeypatch: pytest.MonkeyPatch) 
     assert compiling_words(11.04) == " (without 11.0 s of compiling kernels, once)"
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     assert "in every run: set NUMBA_CACHE_DIR" in compiling_words(11.0)
+
+
+class Pair(NamedTuple):
+    """What a kernel takes."""
+
+    image: Float32_2d
+    factor: float
+
+
+@kernel
+def _total(pair: Pair, count: int) -> float:
+    return pair.image[0, 0] * pair.factor + count
+
+
+KERNELS.remove(_total)
+
+
+def test_kernels_are_compiled_for_the_types_of_their_parameters() -> None:
+    compile_kernel(_total)
+    assert _total(Pair(np.full((1, 1), 2, np.float32), 3.0), 4) == 10.0
+    assert len(_total.signatures) == 1
+    # Every second column: another type, for which it is compiled, too.
+    assert _total(Pair(np.full((2, 4), 2, np.float32)[:, ::2], 3.0), 4) == 10.0
+    assert len(_total.signatures) == 2
+
+
+_RUNS = """
+import sys
+from pathlib import Path
+from scopemap.engine.config import Config
+from scopemap.input.opening import open_sequence
+from scopemap.engine.geometry.kernels import compiled_mark
+from scopemap.runner.kernels import compile_kernels
+from scopemap.runner.reconstruct import reconstruct
+from scopemap.runner.run import compiling_s
+compiling_s()
+compile_kernels()
+assert compiled_mark().exists()
+for source in sys.argv[1:]:
+    video, frames = source.rsplit("@", 1)
+    reconstruct(open_sequence(Path(video), frames=slice(*map(int, frames.split(":")))), Config.load("default"))
+    print(compiling_s())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_runs_compile_nothing_after_all_kernels_were(real_data: Path, tmp_path: Path) -> None:
+    videos, demo = real_data / "endoscopy" / "video", Path(scopemap.__file__).parent / "apps" / "demo" / "clip"
+    clips = demo / "colon.mp4", videos / "laparoscopy_rvim.mp4", videos / "colonoscopy_nflba_03.mp4"
+    command = [sys.executable, "-c", _RUNS, *(f"{clip}@30:90" for clip in clips)]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.split() == ["0.0"] * len(clips)

@@ -16,7 +16,8 @@ from scopemap.engine.config import Config, FusionSettings
 from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion
-from scopemap.engine.fusion.tsdf import VoxelBlocks, pack
+from scopemap.engine.fusion.tsdf import pack
+from scopemap.engine.fusion.voxel_blocks import VoxelBlocks
 from scopemap.engine.mapping.mapper import MOST_OBSERVATIONS
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.network_cost import network_cost

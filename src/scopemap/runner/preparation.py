@@ -1,4 +1,4 @@
-"""What comes before the first frame of a run: estimators, an unknown focal length, the kind of depth files."""
+"""What comes before the first frame of a run: kernels, estimators, an unknown focal length, kind of depth files."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from scopemap.engine.config import Config
 from scopemap.engine.depth.estimate import DepthEstimator
 from scopemap.engine.estimators import Estimators
 from scopemap.engine.frame import is_constant
+from scopemap.engine.geometry.kernels import IS_CACHED, compiled_mark
 from scopemap.engine.notices import Notice
 from scopemap.input.sequence import Sequence
 from scopemap.runner.depth_backends import files_folder
@@ -23,6 +24,12 @@ def prepare(
     sequence: Sequence, config: Config, timed: Timed, progress: Progress, own: CustomEstimators | None = None
 ) -> tuple[Sequence, Config, Estimators, list[Notice]]:
     """Return a sequence with a focal length, resolved settings, the estimators, and notices of what was estimated."""
+    if IS_CACHED and not compiled_mark().exists():
+        # Once for each machine.
+        from scopemap.runner.kernels import compile_kernels
+
+        progress("compiling kernels, once", 0, 0)
+        timed("compile kernels", compile_kernels)
     progress("preparing", 0, 0)
     estimators = timed("prepare", create_estimators, config, sequence, own)
     if not (sequence.calibrated or sequence.is_estimated):

@@ -297,8 +297,8 @@ class Clock:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Seconds of the parts so far, and of all; those of compiling kernels are in other parts, too."""
-        compiled_s = compiling_s() - self._compiled_before_s
+        """Seconds of the parts so far, and of all; those of kernels not compiled ahead are in other parts, too."""
+        compiled_s = compiling_s() - self._compiled_before_s + self._seconds.get("compile kernels", 0.0)
         compiled = {"compile kernels": compiled_s} if compiled_s else {}
         return self._seconds | compiled | {"total": time.perf_counter() - self._started}
 

@@ -18,8 +18,9 @@ import cv2
 import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.fusion.tsdf import BLOCK, MeasuredSurface, TsdfCamera, VoxelBlocks, measure_surface
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.fusion.tsdf import BLOCK, MeasuredSurface, TsdfCamera, measure_surface
+from scopemap.engine.fusion.voxel_blocks import VoxelBlocks
+from scopemap.engine.geometry.kernels import Float32_2d, UInt8_3d, kernel
 
 _COSINE_POWER = 0.1  # fitted with the next two on three real clips and two phantoms (docs/method.md, Fusion)
 _DISTANCE_POWER = 0.8  # fitted: -0.71 to -0.95 in each; sRGB and an inverse square give 0.9
@@ -136,7 +137,7 @@ def _mean(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _painted(rgb, inverse_depth, light):  # type: ignore[no-untyped-def]
+def _painted(rgb: UInt8_3d, inverse_depth: Float32_2d, light: Float32_2d) -> np.ndarray:
     """Return rgb / light and the weight of each pixel's colour, (H, W, 4) float32; 0 where light is NaN."""
     height, width = light.shape
     result = np.zeros((height, width, 4), np.float32)

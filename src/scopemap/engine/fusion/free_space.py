@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from scopemap.engine.frame import Frame
-from scopemap.engine.geometry.kernels import inner_kernel, kernel
+from scopemap.engine.geometry.kernels import Float32_2d, Float32_3d, Float64_2d, inner_kernel, kernel
 from scopemap.engine.geometry.median import median
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.notices import Notice
@@ -53,10 +53,10 @@ class _CoarseFrame(NamedTuple):
     """
 
     number: int
-    nearest_mm: np.ndarray
-    farthest_mm: np.ndarray
-    colour: np.ndarray
-    P: np.ndarray
+    nearest_mm: Float32_2d
+    farthest_mm: Float32_2d
+    colour: Float32_3d
+    P: Float64_2d
 
 
 def reference_frames(indices: Sequence[int]) -> list[int]:
@@ -193,7 +193,7 @@ def _place(points_mm: np.ndarray, n: int, P: np.ndarray, nearest_mm: np.ndarray)
 
 
 @kernel
-def _count(points_mm: np.ndarray, colour: np.ndarray, other: _CoarseFrame, counts: np.ndarray) -> None:
+def _count(points_mm: Float64_2d, colour: Float32_2d, other: _CoarseFrame, counts: Float64_2d) -> None:
     """Add to `counts` (N, 4) whether another confirms or contradicts points (N, 3), contradicts, clearly contradicts.
 
     The last is the difference to their colour (N, 2) there. What both differ by in the median is a difference of

@@ -10,8 +10,17 @@ import trimesh
 
 from scopemap.engine.config.mapping import FusionSettings
 from scopemap.engine.fusion.albedo import displayed
-from scopemap.engine.fusion.tsdf import BLOCK, VoxelBlocks, Voxels, unpack
-from scopemap.engine.geometry.kernels import inner_kernel, kernel
+from scopemap.engine.fusion.tsdf import BLOCK, Voxels, unpack
+from scopemap.engine.fusion.voxel_blocks import VoxelBlocks
+from scopemap.engine.geometry.kernels import (
+    Float32_3d,
+    Float64_1d,
+    Float64_2d,
+    Int64_1d,
+    Int64_2d,
+    inner_kernel,
+    kernel,
+)
 
 _CHUNK_BLOCKS = 8  # by hand, for memory: the result does not depend on it
 _CHUNK = _CHUNK_BLOCKS * BLOCK
@@ -157,7 +166,7 @@ def _all_contours() -> np.ndarray:
 
 @kernel
 def _march(
-    field: np.ndarray, used: np.ndarray, contours: np.ndarray, vertices: np.ndarray, faces: np.ndarray
+    field: Float32_3d, used: Int64_1d, contours: Int64_2d, vertices: Float64_2d, faces: Int64_2d
 ) -> tuple[int, int]:
     """Fill in vertices and faces of the used cells, flat numbers in increasing order; return how many there are."""
     rows, columns = field.shape[1] - 1, field.shape[2] - 1
@@ -208,7 +217,7 @@ def _march(
 
 
 @kernel
-def _contours(corners: np.ndarray) -> np.ndarray:
+def _contours(corners: Float64_1d) -> np.ndarray:
     """Return the edge (12,) that follows each around the surface in a cell with these corners (8,); -1: not crossed."""
     following: np.ndarray = np.full(len(_EDGES), -1)
     for face in _FACES:

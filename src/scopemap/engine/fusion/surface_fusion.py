@@ -24,12 +24,12 @@ from scopemap.engine.fusion.tsdf import (
     KEY_OFFSET,
     Grid,
     TsdfCamera,
-    VoxelBlocks,
     integrate_blocks,
     measure_surface,
     touched_blocks,
     unpack,
 )
+from scopemap.engine.fusion.voxel_blocks import VoxelBlocks
 from scopemap.engine.geometry.se3 import inverse
 from scopemap.engine.geometry.uncertainty import depth_trust
 from scopemap.engine.notices import Notice

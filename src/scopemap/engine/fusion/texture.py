@@ -21,7 +21,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.texture_alignment import shifts_px
 from scopemap.engine.fusion.texture_levels import ChartVertices, chart_vertices, level_gains
 from scopemap.engine.fusion.texture_views import pieces_of
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.geometry.kernels import Float32_3d, Float64_3d, UInt8_2d, UInt8_3d, kernel
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.se3 import inverse, transform
 
@@ -224,7 +224,7 @@ def _painted(crop: np.ndarray, corners: np.ndarray, gains: np.ndarray) -> np.nda
 
 
 @kernel
-def _paint(crop, corners, gains, painted, covered):  # type: ignore[no-untyped-def]
+def _paint(crop: UInt8_3d, corners: Float64_3d, gains: Float32_3d, painted: Float32_3d, covered: UInt8_2d) -> None:
     """Multiply the pixels inside of triangles (F, 3, 2) by their gains, linear inside each. Changes the last two."""
     height, width = covered.shape
     for face in range(len(corners)):

@@ -13,7 +13,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.engine.geometry.kernels import inner_kernel, kernel
+from scopemap.engine.geometry.kernels import (
+    Float32_2d,
+    Float32_3d,
+    Float32_4d,
+    Float32_5d,
+    Float64_1d,
+    Float64_2d,
+    Int64_1d,
+    Int64_2d,
+    inner_kernel,
+    kernel,
+)
 
 BLOCK = 8  # voxels along an edge of a block: 8, as Niessner et al. 2013 hash them
 # 21 bits of a key for each block coordinate.
@@ -25,22 +36,21 @@ _FEW_KEYS = 1 << 14  # by hand, for time: more need a second attempt
 _F32 = np.float32
 _SLOPE_STEP_PX = 3  # by hand: pixels to either side from which a slope is measured
 _COLOUR_BAND_VOXELS = 2.0  # by hand: colours are integrated so near to the surface
-_FIRST_CAPACITY = 256  # by hand: blocks; doubles when it is full
 
 
 class Voxels(NamedTuple):
     """N blocks: `tsdf` mm and `weight` (N, 8, 8, 8) float32; `colour` (N, 8, 8, 8, 4), weighted sums r g b 1."""
 
-    tsdf: np.ndarray
-    weight: np.ndarray
-    colour: np.ndarray
+    tsdf: Float32_4d
+    weight: Float32_4d
+    colour: Float32_5d
 
 
 class TsdfCamera(NamedTuple):
     """A pinhole camera in the world: rotation (3, 3) and translation (3,) mm from world to camera, focal lengths px."""
 
-    R: np.ndarray
-    t: np.ndarray
+    R: Float64_2d
+    t: Float64_1d
     fx: float
     fy: float
     cx: float
@@ -50,9 +60,9 @@ class TsdfCamera(NamedTuple):
 class MeasuredSurface(NamedTuple):
     """What a frame measures, (H, W) float32: inverse depth 1/mm or NaN; tangent plane's distance, mm; weight 0..1."""
 
-    inverse_depth: np.ndarray
-    plane_mm: np.ndarray
-    weight: np.ndarray
+    inverse_depth: Float32_2d
+    plane_mm: Float32_2d
+    weight: Float32_2d
 
 
 class Grid(NamedTuple):
@@ -80,7 +90,7 @@ def _slope(before: np.float32, here: np.float32, after: np.float32, most: np.flo
 
 @kernel
 def measure_surface(
-    inverse_depth: np.ndarray, camera: TsdfCamera, largest_step: float, min_incidence: float, max_depth_mm: float
+    inverse_depth: Float32_2d, camera: TsdfCamera, largest_step: float, min_incidence: float, max_depth_mm: float
 ) -> MeasuredSurface:
     """Return tangent plane and weight of every pixel of `inverse_depth` (H, W) float32, 1/mm, NaN = unknown.
 
@@ -164,7 +174,7 @@ def touched_blocks(inverse_depth: np.ndarray, camera: TsdfCamera, grid: Grid) ->
 
 
 @kernel
-def _touched_blocks(keys: np.ndarray, inverse_depth: np.ndarray, rays: np.ndarray, footprint: float, grid: Grid) -> int:
+def _touched_blocks(keys: Int64_1d, inverse_depth: Float32_2d, rays: Float64_2d, footprint: float, grid: Grid) -> int:
     """Put the keys of the touched blocks into `keys`, as many as it holds; return how many there are.
 
     rays : (3, 4), directions and origin of the rays of 2 by 2 pixels, in voxels. footprint : of these per mm of depth.
@@ -318,77 +328,14 @@ def integrate_blocks(
 @kernel
 def _integrate_blocks(
     voxels: Voxels,
-    slots: np.ndarray,
-    corners: np.ndarray,
+    slots: Int64_1d,
+    corners: Int64_2d,
     surface: MeasuredSurface,
-    picture: np.ndarray,
-    projection: np.ndarray,
+    picture: Float32_3d,
+    projection: Float64_2d,
     grid: Grid,
 ) -> None:
     whole = _whole_cells(surface.inverse_depth, grid.largest_step)
     for n in range(len(slots)):
         block = Voxels(voxels.tsdf[slots[n]], voxels.weight[slots[n]], voxels.colour[slots[n]])
         _integrate_block(block, corners[n], surface, whole, picture, projection, grid)
-
-
-class VoxelBlocks:
-    """Blocks of 8^3 voxels by the key of their coordinate; slot 0 of `voxels` is always an empty block."""
-
-    def __init__(self) -> None:
-        self.voxels = _zeros(_FIRST_CAPACITY)
-        # A dict finds the few thousand blocks of a frame in under a millisecond; a compiled hash table gains nothing.
-        self._slots = dict[int, int]()
-
-    def __len__(self) -> int:
-        return len(self._slots)
-
-    def keys(self) -> np.ndarray:
-        """Return the (N,) int64 keys of all blocks, in the order in which they were made."""
-        return np.fromiter(self._slots, np.int64, len(self._slots))
-
-    def slots(self, keys: np.ndarray) -> np.ndarray:
-        """Return the (N,) int64 slots of `keys` (N,) int64; blocks that are not there yet are made, empty."""
-        index = self._slots
-        slots = np.array([index.setdefault(key, len(index) + 1) for key in keys.tolist()], dtype=np.int64)
-        capacity = len(self.voxels.weight)
-        if len(index) >= capacity:
-            larger = max(capacity * 5 // 4, len(index) + 1)
-            for array in self.voxels:
-                # In place, so that a large volume is not in memory twice; the new blocks are zero.
-                array.resize((larger, *array.shape[1:]), refcheck=False)
-        return slots
-
-    def halve(self) -> None:
-        """Keep every second voxel along each axis: the field as voxels of twice the size hold it."""
-        coordinates = unpack(self.keys())
-        # In the order in which they were made, as ever.
-        keys = np.asarray(pack.py_func(*(coordinates >> 1).T))
-        old, (self.voxels, self._slots) = self.voxels, (_zeros(_FIRST_CAPACITY), {})
-        slots = self.slots(keys)
-        for octant in np.ndindex(2, 2, 2):
-            some = np.flatnonzero((coordinates & 1 == octant).all(1))
-            there = tuple(slice(BLOCK // 2 * half, BLOCK // 2 * (half + 1)) for half in octant)
-            for array, finer in zip(self.voxels, old, strict=True):
-                array[slots[some], there[0], there[1], there[2]] = finer[some + 1, ::2, ::2, ::2]
-
-    def find(self, coordinates: np.ndarray) -> np.ndarray:
-        """Return the (N,) int64 slots of the blocks at (N, 3) int64 block coordinates; 0 where there is no block."""
-        keys = np.asarray(pack.py_func(*coordinates.T))
-        return np.array([self._slots.get(key, 0) for key in keys.tolist()], dtype=np.int64)
-
-    def dense(self, corner: np.ndarray, blocks: int) -> Voxels:
-        """Return `blocks`^3 blocks from coordinate `corner` (3,) on, dense (8 blocks, ...), weight 0 where none is."""
-        slots = self.find(corner + np.argwhere(np.ones((blocks,) * 3)))
-        return Voxels(*(_assemble(array[slots], blocks) for array in self.voxels))
-
-
-def _zeros(blocks: int) -> Voxels:
-    shape = (blocks, BLOCK, BLOCK, BLOCK)
-    return Voxels(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros((*shape, 4), np.float32))
-
-
-def _assemble(array: np.ndarray, blocks: int) -> np.ndarray:
-    """Turn (blocks^3, 8, 8, 8, ...) into (8 blocks, 8 blocks, 8 blocks, ...)."""
-    side, rest = blocks * BLOCK, array.shape[4:]
-    cube = np.moveaxis(array.reshape(blocks, blocks, blocks, BLOCK, BLOCK, BLOCK, *rest), (3, 4, 5), (1, 3, 5))
-    return cube.reshape(side, side, side, *rest)

@@ -17,7 +17,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from scopemap.engine.fusion.mesh import marching_cubes
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.geometry.kernels import Bool_3d, Float32_3d, kernel
 from scopemap.engine.geometry.rendering import vertex_colours
 
 _MOST_CELLS = 160  # by hand: along the longest side of the mesh
@@ -113,7 +113,7 @@ def _set_distances(
 
 
 @kernel(parallel=True)  # type: ignore[untyped-decorator]
-def _relax(field: np.ndarray, fixed: np.ndarray, sweeps: int) -> None:
+def _relax(field: Float32_3d, fixed: Bool_3d, sweeps: int) -> None:
     """Solve the Laplace equation where the field (l, m, n) is not fixed: successive over-relaxation, red and black."""
     for half in range(2 * sweeps):
         for i in prange(1, field.shape[0] - 1):

@@ -16,10 +16,14 @@ import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_origin, get_type_hints
 
 import numba
+import numpy as np
+from llvmlite.binding import get_host_cpu_name
 from numba import njit
+from numba.core import types
+from numba.core.dispatcher import Dispatcher
 
 IS_CACHED = os.environ.get("NUMBA_CACHE_DIR") != ""
 """Whether there is a folder for compiled kernels; `scopemap/__init__.py` looks for one. Without any numba
@@ -56,8 +60,62 @@ def use_cache(folder: Path) -> None:
 if IS_CACHED:
     use_cache(cache_folder())
 
-kernel: Callable[..., Any] = partial(njit, cache=IS_CACHED, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
-"""Decorator of a kernel: division by 0 gives an infinity or NaN, as in numpy."""
+Float32_2d = Annotated[np.ndarray, numba.float32[:, ::1]]
+Float32_3d = Annotated[np.ndarray, numba.float32[:, :, ::1]]
+Float32_4d = Annotated[np.ndarray, numba.float32[:, :, :, ::1]]
+Float32_5d = Annotated[np.ndarray, numba.float32[:, :, :, :, ::1]]
+Float64_1d = Annotated[np.ndarray, numba.float64[::1]]
+Float64_2d = Annotated[np.ndarray, numba.float64[:, ::1]]
+Float64_3d = Annotated[np.ndarray, numba.float64[:, :, ::1]]
+Int64_1d = Annotated[np.ndarray, numba.int64[::1]]
+Int64_2d = Annotated[np.ndarray, numba.int64[:, ::1]]
+UInt8_2d = Annotated[np.ndarray, numba.uint8[:, ::1]]
+UInt8_3d = Annotated[np.ndarray, numba.uint8[:, :, ::1]]
+Bool_1d = Annotated[np.ndarray, numba.boolean[::1]]
+Bool_2d = Annotated[np.ndarray, numba.boolean[:, ::1]]
+Bool_3d = Annotated[np.ndarray, numba.boolean[:, :, ::1]]
 
-inner_kernel: Callable[..., Any] = partial(kernel, no_cpython_wrapper=True)
+KERNELS: list[Dispatcher] = []
+"""Those of the modules that are imported."""
+
+_OPTIONS: dict[str, Any] = {"cache": IS_CACHED, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+
+def kernel(function: Callable[..., Any] | None = None, *, parallel: bool = False) -> Any:
+    """Decorator of a kernel: division by 0 gives an infinity or NaN, as in numpy.
+
+    Its parameters are of the array types above, numbers, or `NamedTuple`s of these: `compile_kernel` compiles it for
+    them. Called with others it is compiled for those, too.
+    """
+    if function is None:
+        return partial(kernel, parallel=parallel)
+    KERNELS.append(compiled := njit(**_OPTIONS, parallel=parallel)(function))
+    return compiled
+
+
+inner_kernel: Callable[..., Any] = partial(njit, **_OPTIONS, no_cpython_wrapper=True)
 """Decorator of a kernel that only kernels may call; Python would crash. Its `py_func` is plain Python."""
+
+
+def compiled_mark() -> Path:
+    """Return the file that is there where all kernels of the cache were compiled, by this numba for this processor."""
+    folder = Path(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
+    return folder / f"compiled-{numba.__version__}-{get_host_cpu_name()}"
+
+
+def compile_kernel(kernel: Dispatcher) -> None:
+    """Compile a kernel for the types of its parameters, or read it from the cache."""
+    kernel.compile(tuple(_numba_type(hint) for hint in _hints(kernel.py_func)))
+
+
+def _hints(of: Any) -> list[Any]:
+    """Return the types of a function's parameters, or of a tuple's fields."""
+    return [hint for name, hint in get_type_hints(of, include_extras=True).items() if name != "return"]
+
+
+def _numba_type(hint: Any) -> Any:
+    if get_origin(hint) is Annotated:
+        return hint.__metadata__[0]
+    if hasattr(hint, "_fields"):
+        return types.BaseTuple.from_types([_numba_type(field) for field in _hints(hint)], hint)
+    return {float: numba.float64, int: numba.int64, bool: numba.boolean}[hint]

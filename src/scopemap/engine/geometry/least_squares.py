@@ -17,7 +17,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.geometry.kernels import Float64_1d, Float64_2d, Float64_3d, Int64_1d, Int64_2d, kernel
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation over the median absolute value of a normal variable."""
@@ -180,11 +180,11 @@ class Linear(NamedTuple):
     columns : unknowns (n, U) that an observation touches beside its point. by : (n, 2, U) px.
     """
 
-    columns: np.ndarray
-    by: np.ndarray
-    by_depth: np.ndarray  # (n, 2)
-    error: np.ndarray  # (n, 2) px
-    weight: np.ndarray  # (n,)
+    columns: Int64_2d
+    by: Float64_3d
+    by_depth: Float64_2d  # (n, 2)
+    error: Float64_2d  # (n, 2) px
+    weight: Float64_1d  # (n,)
 
 
 class Prior(NamedTuple):
@@ -206,11 +206,11 @@ class _Normal(NamedTuple):
     derivatives (P,) by the points.
     """
 
-    matrix: np.ndarray
-    gradient: np.ndarray
-    by_points: np.ndarray
-    h: np.ndarray
-    g: np.ndarray
+    matrix: Float64_2d
+    gradient: Float64_1d
+    by_points: Float64_1d
+    h: Float64_1d
+    g: Float64_1d
 
 
 @dataclass(frozen=True)
@@ -324,7 +324,7 @@ def _squares(steps: np.ndarray, A: np.ndarray) -> list[float]:
 
 @kernel
 def _add_points(
-    normal: _Normal, start: np.ndarray, scale: np.ndarray, off: np.ndarray, held: np.ndarray, linear: Linear
+    normal: _Normal, start: Int64_1d, scale: Int64_1d, off: Float64_1d, held: Float64_1d, linear: Linear
 ) -> None:
     """Add the observations of points, and what holds them, without the points.
 

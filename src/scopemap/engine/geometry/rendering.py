@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.geometry.kernels import Float32_2d, Float32_3d, Float64_2d, Int64_2d, kernel
 from scopemap.engine.geometry.se3 import inverse, transform
 
 _NEAR_MM = 1e-3  # guard: division by z
@@ -96,7 +96,9 @@ def render_points(
 
 
 @kernel
-def _rasterise(corners, colours, faces, inverse_depth, rgb):  # type: ignore[no-untyped-def]
+def _rasterise(
+    corners: Float64_2d, colours: Float32_2d, faces: Int64_2d, inverse_depth: Float32_2d, rgb: Float32_3d
+) -> None:
     """Draw faces (F, 3) of corners (V, 3): u, v, 1 / z, negative behind the camera. Changes both images."""
     height, width = inverse_depth.shape
     for face in range(len(faces)):

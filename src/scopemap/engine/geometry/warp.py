@@ -9,7 +9,7 @@ import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.errors import check_shape
-from scopemap.engine.geometry.kernels import inner_kernel, kernel
+from scopemap.engine.geometry.kernels import Float32_3d, inner_kernel, kernel
 
 
 def pull(image_previous: np.ndarray, to_previous: np.ndarray) -> np.ndarray:
@@ -47,7 +47,7 @@ def _mean_of_known(neighbours, a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sampled(image, to_previous):  # type: ignore[no-untyped-def]
+def _sampled(image: Float32_3d, to_previous: Float32_3d) -> np.ndarray:
     """Sample floats (H, W, C) as `pull` says; (H, W, C) float32."""
     h, w, channels = image.shape
     out = np.empty((h, w, channels), np.float32)

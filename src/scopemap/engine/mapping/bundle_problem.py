@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.geometry.kernels import Bool_1d, Float64_2d, Float64_3d, Int64_1d, kernel
 from scopemap.engine.geometry.se3 import inverse
 
 _LEAST_Z = 1e-3  # guard: points nearer to the camera's plane, over their distance, are behind it
@@ -236,14 +236,14 @@ class Reprojection(NamedTuple):
     observing camera, pair : (n,) which of them applies.
     """
 
-    error: np.ndarray
-    ahead: np.ndarray
-    seen: np.ndarray
-    pixel: np.ndarray
-    in_host: np.ndarray
-    point: np.ndarray
-    between: np.ndarray
-    pair: np.ndarray
+    error: Float64_2d
+    ahead: Bool_1d
+    seen: Float64_2d
+    pixel: Float64_2d
+    in_host: Float64_2d
+    point: Int64_1d
+    between: Float64_3d
+    pair: Int64_1d
 
 
 def reprojection_errors(problem: BundleProblem, state: BundleState) -> Errors:
@@ -282,7 +282,9 @@ def jacobians(
 
 
 @kernel
-def _projected(between, pair, in_host, point, observed, focal):  # type: ignore[no-untyped-def]
+def _projected(
+    between: Float64_3d, pair: Int64_1d, in_host: Float64_2d, point: Int64_1d, observed: Float64_2d, focal: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return error, ahead, seen and pixel of a `Reprojection`; observed : (n, 2)."""
     count = len(point)
     error, pixel, seen = np.zeros((count, 2)), np.empty((count, 2)), np.empty((count, 3))
@@ -305,7 +307,9 @@ def _projected(between, pair, in_host, point, observed, focal):  # type: ignore[
 
 
 @kernel
-def _derivatives(at, corners, focal, unit_mm, is_free):  # type: ignore[no-untyped-def]
+def _derivatives(
+    at: Reprojection, corners: Float64_2d, focal: float, unit_mm: float, is_free: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return what `jacobians` does; corners : (p, 2) of the points, px from the centre. is_free : f is unknown."""
     count, row, turned, X = len(at.point), np.zeros(3), np.zeros(3), np.zeros(3)
     by_camera, by_host = np.empty((count, 2, 6)), np.empty((count, 2, 6))

@@ -20,7 +20,7 @@ import numpy as np
 from scipy import sparse
 
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.geometry.kernels import Float32_2d, Float32_3d, kernel
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.mapping.bundle_problem import Points
 
@@ -170,7 +170,7 @@ def depth_log_ratios(
 
 
 @kernel
-def _inverted(values: np.ndarray, log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
+def _inverted(values: Float32_3d, log_depth: Float32_2d, nearest: float, farthest: float) -> np.ndarray:
     """Return a field's values (6, 7, 4) at what the ln depth (H, W) was before their addition, (H, W) float32."""
     height, width = log_depth.shape
     found = np.empty((height, width), np.float32)
@@ -203,7 +203,7 @@ def _inverted(values: np.ndarray, log_depth: np.ndarray, nearest: float, farthes
 
 
 @kernel
-def _interpolated(values: np.ndarray, log_depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
+def _interpolated(values: Float32_3d, log_depth: Float32_2d, nearest: float, farthest: float) -> np.ndarray:
     """Return a field's values (6, 7, 4) at each pixel's ln depth (H, W), (H, W) float32; NaN where that is NaN."""
     height, width = log_depth.shape
     found = np.empty((height, width), np.float32)

@@ -9,7 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.engine.geometry.kernels import inner_kernel, kernel
+from scopemap.engine.geometry.kernels import (
+    Bool_1d,
+    Bool_2d,
+    Float32_2d,
+    Float32_3d,
+    Float64_2d,
+    Float64_3d,
+    Int64_1d,
+    inner_kernel,
+    kernel,
+)
 from scopemap.engine.geometry.median import median
 
 VIEW_SIGMA = 0.03  # by hand
@@ -35,11 +45,11 @@ class Intrinsics(NamedTuple):
 class Projection(NamedTuple):
     """Pixels of a frame seen by another: position there, px; its change per unit of ln depth, px; whether usable."""
 
-    x: np.ndarray
-    y: np.ndarray
-    slope_x: np.ndarray
-    slope_y: np.ndarray
-    usable: np.ndarray
+    x: Float32_2d
+    y: Float32_2d
+    slope_x: Float32_2d
+    slope_y: Float32_2d
+    usable: Float32_2d
 
 
 @inner_kernel
@@ -51,7 +61,7 @@ def _seen_from(T: np.ndarray, depth: float, ray_x: float, ray_y: float) -> tuple
 
 
 @kernel
-def project(depth_mm: np.ndarray, known: np.ndarray, T: np.ndarray, camera: Intrinsics) -> Projection:
+def project(depth_mm: Float32_2d, known: Bool_2d, T: Float64_2d, camera: Intrinsics) -> Projection:
     """Project a frame's pixels into another; usable: known depth, seen at least 1 px inside, at `known` pixels."""
     height, width = depth_mm.shape
     planes = np.zeros((5, height, width), np.float32)
@@ -82,7 +92,7 @@ def _bilinear(image: np.ndarray, i: int, j: int, s: float, t: float) -> float:
 
 
 @kernel
-def epipolar_error(flow: np.ndarray, seen: Projection) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def epipolar_error(flow: Float32_3d, seen: Projection) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split the flow (H, W, 2), px, to a neighbour warped by `seen`.
 
     Returns ln factor of depth, squared change of position per unit of it (0 = unknown), squared offset across, px.
@@ -114,7 +124,7 @@ def epipolar_error(flow: np.ndarray, seen: Projection) -> tuple[np.ndarray, np.n
 
 
 @kernel
-def combine(log_factor: np.ndarray, information: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def combine(log_factor: Float32_3d, information: Float32_3d) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Combine (N, H, W) estimates by Cauchy's M-estimator.
 
     Returns ln factor, information, the variance of one estimate, and 1 where that is known.
@@ -152,12 +162,12 @@ def combine(log_factor: np.ndarray, information: np.ndarray) -> tuple[np.ndarray
 
 @kernel
 def add_comparison(
-    total: np.ndarray,
-    depth_mm: np.ndarray,
-    T: np.ndarray,
+    total: Float32_3d,
+    depth_mm: Float32_2d,
+    T: Float64_2d,
     camera: Intrinsics,
-    at_mm: np.ndarray,
-    at_sigma: np.ndarray,
+    at_mm: Float32_2d,
+    at_sigma: Float32_2d,
     weight: float,
 ) -> None:
     """Compare a frame's depth with the one that another frame has there, at every n-th pixel of a row and a column.
@@ -190,7 +200,7 @@ def add_comparison(
 
 
 @kernel
-def parallax_px(points: np.ndarray, far: np.ndarray, T: np.ndarray, camera: Intrinsics, size: np.ndarray) -> np.ndarray:
+def parallax_px(points: Float32_2d, far: Bool_1d, T: Float64_3d, camera: Intrinsics, size: Int64_1d) -> np.ndarray:
     """Return the median parallax, px per unit of ln depth, of points (n, 3) in each other camera, and of the far ones.
 
     far : (n,) bool. T : (m, 4, 4) to these cameras. size : width and height, px. (m, 2); 0 where a camera sees less

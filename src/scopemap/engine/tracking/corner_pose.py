@@ -18,7 +18,7 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.flow.corners import Correspondences2D3D
 from scopemap.engine.frame import REGIONS
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.geometry.kernels import Float64_1d, Float64_2d, kernel
 from scopemap.engine.geometry.least_squares import (
     RAYLEIGH_TO_SIGMA,
     DenseModel,
@@ -139,7 +139,15 @@ def _projected(
 
 
 @kernel
-def _normal_equations(T, points_mm, pixels, along, intrinsics, scale, unit_mm):  # type: ignore[no-untyped-def]
+def _normal_equations(
+    T: Float64_2d,
+    points_mm: Float64_2d,
+    pixels: Float64_2d,
+    along: Float64_2d,
+    intrinsics: Float64_1d,
+    scale: float,
+    unit_mm: float,
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Summed hessian (6, 6), gradient (6,) and cost of Cauchy-weighted errors; infinite cost behind the camera."""
     fx, fy, cx, cy = intrinsics
     variance, width = _SIGMA_PX**2, scale**2

@@ -10,7 +10,7 @@ import numpy as np
 from scopemap.engine.cameras.camera import PinholeCamera
 from scopemap.engine.config import TrackingSettings
 from scopemap.engine.frame import Frame
-from scopemap.engine.geometry.kernels import kernel
+from scopemap.engine.geometry.kernels import Float32_2d, kernel
 from scopemap.engine.geometry.local_contrast import local_contrast, local_mean
 from scopemap.engine.tracking.residuals import PyramidLevel
 
@@ -95,7 +95,7 @@ def _halve_image(grey: np.ndarray, weight: np.ndarray, size: tuple[int, int]) ->
 
 
 @kernel
-def _halve_depth(depth_mm):  # type: ignore[no-untyped-def]
+def _halve_depth(depth_mm: Float32_2d) -> np.ndarray:
     """Mean of the known depths of four pixels on the nearest of their surfaces (within 5 %)."""
     h, w = depth_mm.shape[0] // 2, depth_mm.shape[1] // 2
     out = np.empty((h, w), np.float32)

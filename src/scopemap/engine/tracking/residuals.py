@@ -27,7 +27,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.engine.geometry.kernels import inner_kernel, kernel
+from scopemap.engine.geometry.kernels import (
+    Bool_1d,
+    Float32_2d,
+    Float32_3d,
+    Float64_1d,
+    Float64_2d,
+    inner_kernel,
+    kernel,
+)
 
 PARAMETERS = 8  # of an alignment: rotation, translation, gain and bias
 _MAX_SURFACE_SPREAD = 0.1  # by hand: of four neighbouring depths on one surface, relative
@@ -45,11 +53,11 @@ class PyramidLevel(NamedTuple):
     intrinsics : (4,) float64 fx, fy, cx, cy in px of this level.
     """
 
-    channels: np.ndarray
-    weight: np.ndarray
-    depth_mm: np.ndarray
-    slope: np.ndarray
-    intrinsics: np.ndarray
+    channels: Float32_3d
+    weight: Float32_2d
+    depth_mm: Float32_2d
+    slope: Float32_3d
+    intrinsics: Float64_1d
 
 
 class Loss(NamedTuple):
@@ -61,10 +69,10 @@ class Loss(NamedTuple):
     depth_sigma, depth_share : sigma and weight of the geometric residual; share 0: none.
     """
 
-    sigma: np.ndarray
+    sigma: Float64_1d
     threshold: float
-    share: np.ndarray
-    lit: np.ndarray
+    share: Float64_1d
+    lit: Bool_1d
     gamma: float
     depth_sigma: float = 1.0
     depth_share: float = 0.0
@@ -160,7 +168,9 @@ def _plane_distance(depth, moved, place, G):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def depth_residuals(reference, current, T_current_reference, unit_mm):  # type: ignore[no-untyped-def]
+def depth_residuals(
+    reference: PyramidLevel, current: PyramidLevel, T_current_reference: Float64_2d, unit_mm: float
+) -> np.ndarray:
     """Return the geometric residual (H, W) float32 on the reference's grid, NaN where there is none."""
     # Outside the loop: numba counts references of arrays that are read from a tuple.
     depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
@@ -177,7 +187,9 @@ def depth_residuals(reference, current, T_current_reference, unit_mm):  # type: 
 
 
 @kernel
-def residual_images(reference, current, T_current_reference, affine, loss):  # type: ignore[no-untyped-def]
+def residual_images(
+    reference: PyramidLevel, current: PyramidLevel, T_current_reference: Float64_2d, affine: Float64_1d, loss: Loss
+) -> np.ndarray:
     """Return residuals (C, H, W) float32 on the reference's grid, NaN where a pixel is not used."""
     depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
     shown, slope, lit, gamma = reference.channels, reference.slope, loss.lit, loss.gamma
@@ -202,7 +214,9 @@ def residual_images(reference, current, T_current_reference, affine, loss):  # t
 
 
 @kernel
-def compared_pixels(reference, current, T_current_reference):  # type: ignore[no-untyped-def]
+def compared_pixels(
+    reference: PyramidLevel, current: PyramidLevel, T_current_reference: Float64_2d
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Return the last channel's expected values, residuals (N,) float32, and the number of usable pixels."""
     depth_mm, weights, K, T = reference.depth_mm, reference.weight, reference.intrinsics, T_current_reference
     image, usable, G = current.channels[-1:], current.weight, current.intrinsics
@@ -255,7 +269,9 @@ def _add(hessian, gradient, J, r, information, count):  # type: ignore[no-untype
 
 
 @kernel
-def _accumulate(reference, current, T, affine, loss, unit_mm):  # type: ignore[no-untyped-def]
+def _accumulate(
+    reference: PyramidLevel, current: PyramidLevel, T: Float64_2d, affine: Float64_1d, loss: Loss, unit_mm: float
+) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Sums over all pixels: upper triangle of the hessian (8, 8), gradient (8,), cost, weight."""
     depth_mm, weights, K = reference.depth_mm, reference.weight, reference.intrinsics
     shown, slope, lit, gamma = reference.channels, reference.slope, loss.lit, loss.gamma

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scopemap.engine.geometry.kernels import inner_kernel, kernel
+from scopemap.engine.geometry.kernels import Float64_1d, Float64_2d, Float64_3d, inner_kernel, kernel
 from scopemap.engine.geometry.least_squares import RAYLEIGH_TO_SIGMA
 from scopemap.engine.geometry.median import median
 
@@ -40,9 +40,9 @@ class Start(NamedTuple):
     A lens sees x where a straight one sees x (1 + b |x|^2 / w^2), w half the image width.
     """
 
-    T: np.ndarray
-    log_depth: np.ndarray
-    lens: np.ndarray
+    T: Float64_3d
+    log_depth: Float64_1d
+    lens: Float64_1d
 
 
 class Scene(NamedTuple):
@@ -53,13 +53,13 @@ class Scene(NamedTuple):
     the lens is known, and straight.
     """
 
-    start: np.ndarray
-    seen: np.ndarray
-    expected: np.ndarray
-    sigma: np.ndarray
+    start: Float64_2d
+    seen: Float64_3d
+    expected: Float64_1d
+    sigma: Float64_1d
     half_width_px: float
-    lens: np.ndarray
-    lens_sigma: np.ndarray
+    lens: Float64_1d
+    lens_sigma: Float64_1d
 
 
 class WindowSolution(NamedTuple):
