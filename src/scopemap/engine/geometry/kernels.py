@@ -67,6 +67,7 @@ Float32_5d = Annotated[np.ndarray, numba.float32[:, :, :, :, ::1]]
 Float64_1d = Annotated[np.ndarray, numba.float64[::1]]
 Float64_2d = Annotated[np.ndarray, numba.float64[:, ::1]]
 Float64_3d = Annotated[np.ndarray, numba.float64[:, :, ::1]]
+Int32_2d = Annotated[np.ndarray, numba.int32[:, ::1]]
 Int64_1d = Annotated[np.ndarray, numba.int64[::1]]
 Int64_2d = Annotated[np.ndarray, numba.int64[:, ::1]]
 UInt8_2d = Annotated[np.ndarray, numba.uint8[:, ::1]]
@@ -78,22 +79,22 @@ Bool_3d = Annotated[np.ndarray, numba.boolean[:, :, ::1]]
 KERNELS: list[Dispatcher] = []
 """Those of the modules that are imported."""
 
-_OPTIONS: dict[str, Any] = {"cache": IS_CACHED, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
-def kernel(function: Callable[..., Any] | None = None, *, parallel: bool = False) -> Any:
+def kernel(function: Callable[..., Any] | None = None, *, parallel: bool = False, cache: bool = IS_CACHED) -> Any:
     """Decorator of a kernel: division by 0 gives an infinity or NaN, as in numpy.
 
     Its parameters are of the array types above, numbers, or `NamedTuple`s of these: `compile_kernel` compiles it for
     them. Called with others it is compiled for those, too.
     """
     if function is None:
-        return partial(kernel, parallel=parallel)
-    KERNELS.append(compiled := njit(**_OPTIONS, parallel=parallel)(function))
+        return partial(kernel, parallel=parallel, cache=cache)
+    KERNELS.append(compiled := njit(**_OPTIONS, parallel=parallel, cache=cache)(function))
     return compiled
 
 
-inner_kernel: Callable[..., Any] = partial(njit, **_OPTIONS, no_cpython_wrapper=True)
+inner_kernel: Callable[..., Any] = partial(njit, **_OPTIONS, cache=IS_CACHED, no_cpython_wrapper=True)
 """Decorator of a kernel that only kernels may call; Python would crash. Its `py_func` is plain Python."""
 
 

@@ -17,7 +17,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from scopemap.engine.geometry.kernels import Float64_1d, Float64_2d, Float64_3d, Int64_1d, Int64_2d, kernel
+from scopemap.engine.geometry.kernels import Float64_1d, Float64_2d, Float64_3d, Int32_2d, Int64_1d, kernel
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation over the median absolute value of a normal variable."""
@@ -36,6 +36,12 @@ def robust_sigma(residuals: np.ndarray, least: float = 0.0) -> float:
 def robust_sigma_2d(lengths: np.ndarray, least: float = 0.0) -> float:
     """Return the standard deviation, per axis, of vectors in the plane from their lengths; `least` of none."""
     return max(float(RAYLEIGH_TO_SIGMA * np.median(lengths)), least) if lengths.size else least
+
+
+def dots(vectors: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the scalar products (N,) of vectors (N, 2); numpy takes five times as long to sum over two columns."""
+    products: np.ndarray = vectors[:, 0] * others[:, 0] + vectors[:, 1] * others[:, 1]
+    return products
 
 
 def cauchy(square: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +160,9 @@ def minimise(problem: Problem[_State], start: _State, options: Options) -> Solut
         if options.gauss_newton:
             state, model, newton = candidate, ahead, None
             continue
-        predicted = -float(model.gradient @ step + 0.5 * model.curvature(step))
+        slope = float(model.gradient @ step)
+        # The whole step to the minimum has H step = -g.
+        predicted = -0.5 * slope if step is newton else -(slope + 0.5 * model.curvature(step))
         ratio = (model.cost - ahead.cost) / max(predicted, 1e-300)
         if ratio < 0.25:
             radius = 0.25 * length
@@ -177,10 +185,11 @@ _RIDGE = 1e-9  # guard: of the diagonal
 class Linear(NamedTuple):
     """Derivatives and weights of n observations.
 
-    columns : unknowns (n, U) that an observation touches beside its point. by : (n, 2, U) px.
+    columns : free unknowns (n, U) that an observation touches beside its point; -1: one that is held. by : (n, 2, U),
+    px.
     """
 
-    columns: Int64_2d
+    columns: Int32_2d
     by: Float64_3d
     by_depth: Float64_2d  # (n, 2)
     error: Float64_2d  # (n, 2) px
@@ -255,9 +264,7 @@ class ReducedModel:
         for some in self.parts:
             own = _Normal(*normal[:3], normal.h[some], normal.g[some])
             start = first[some.start : some.stop + 1] - first[some.start]
-            scale, off, held = place[self.scale[some]], self.off[some], self.held[some]
-            linear = self._linear(some)
-            _add_points(own, start, scale, off, held, linear._replace(columns=place[linear.columns]))
+            _add_points(own, start, self.scale[some], self.off[some], self.held[some], self._linear(some))
         for prior in self._priors:
             row, column = np.broadcast_arrays(place[prior.columns][:, :, None], place[prior.columns][:, None])
             kept = (row >= 0) & (column >= 0)
@@ -286,11 +293,11 @@ class ReducedModel:
         """Return the number of the point of each observation of a part."""
         return np.repeat(np.arange(some.start, some.stop), np.diff(self.first[some.start : some.stop + 1]))
 
-    def _changes(self, step: np.ndarray) -> Iterator[tuple[slice, Linear, np.ndarray]]:
-        """Yield each part with what a step without its points changes, px."""
+    def _changes(self, free: np.ndarray) -> Iterator[tuple[slice, Linear, np.ndarray]]:
+        """Yield each part with what a step of the free unknowns, with 0 after them, changes, px."""
         for some in self.parts:
             linear = self._linear(some)
-            yield some, linear, np.einsum("nau,nu->na", linear.by, step[linear.columns])
+            yield some, linear, np.einsum("nau,nu->na", linear.by, free[linear.columns])
 
     def gauss_newton_step(self) -> np.ndarray:
         """Return the step to the minimum."""
@@ -298,21 +305,20 @@ class ReducedModel:
         # LAPACK reads by columns: the lower half is the upper one there.
         factor = cho_factor(normal.matrix.T, check_finite=False)
         solved = cho_solve(factor, normal.by_points - normal.gradient, check_finite=False)
-        step = self._step(solved, np.zeros(len(normal.g)))
-        shift = normal.g - self.held * step[self.scale]
-        for some, linear, change in self._changes(step):
-            slope = linear.weight * (linear.by_depth * change).sum(1)
+        free = np.append(solved, 0.0)
+        shift = normal.g - self.held * free[self.scale]
+        for some, linear, change in self._changes(free):
+            slope = linear.weight * dots(linear.by_depth, change)
             shift[some] += np.bincount(self._points(some) - some.start, slope, some.stop - some.start)
-        step[self.unknowns :] = -shift / normal.h
-        return step
+        return self._step(solved, -shift / normal.h)
 
     def curvature(self, step: np.ndarray) -> float:
         """Return step^T H step."""
-        points = step[self.unknowns :]
-        total = float(self.held @ (points - step[self.scale]) ** 2)
-        for some, linear, change in self._changes(step):
+        points, free = step[self.unknowns :], np.append(step[self.free], 0.0)
+        total = float(self.held @ (points - free[self.scale]) ** 2)
+        for some, linear, change in self._changes(free):
             change = change + linear.by_depth * points[self._points(some)][:, None]
-            total += float(linear.weight @ (change**2).sum(1))
+            total += float(linear.weight @ dots(change, change))
         return total + sum(sum(_squares(step[prior.columns], prior.A)) for prior in self._priors)
 
 
@@ -328,26 +334,20 @@ def _add_points(
 ) -> None:
     """Add the observations of points, and what holds them, without the points.
 
-    start : first observation of each point and their number (P + 1,). scale : (P,) unknown of its host's ln scale. All
-    unknowns are numbered among those that are free; -1: they are not.
+    start : first observation of each point and their number (P + 1,). scale : (P,) free unknown of its host's ln
+    scale, or -1.
     """
     size, most = len(normal.gradient), linear.columns.shape[1]
-    # A point touches few unknowns: its sums are made among these, and added to the matrix once.
-    columns, place, b, E = np.empty(size, np.int64), np.full(size, -1), np.zeros(size), np.zeros(size)
-    touched, one, other = np.empty(most, np.int64), np.empty(most), np.empty(most)
+    # A point touches few unknowns: what eliminates it is summed among these.
+    columns, b, E = np.empty(size, np.int64), np.zeros(size), np.zeros(size)
+    is_touched, touched, one, other = np.zeros(size, np.bool_), np.empty(most, np.int64), np.empty(most), np.empty(most)
+    matrix = normal.matrix
     for p in range(len(scale)):
-        count = 0
+        count, h, g = 0, held[p], held[p] * off[p]
         if scale[p] >= 0:
-            columns[0], place[scale[p]], count = scale[p], 0, 1
-        for k in range(start[p], start[p + 1]):
-            for i in range(most):
-                column = linear.columns[k, i]
-                if column >= 0 and place[column] < 0:
-                    columns[count], place[column] = column, count
-                    count += 1
-        A, h, g = np.zeros((count, count)), held[p], held[p] * off[p]
-        if scale[p] >= 0:
-            A[0, 0], b[0], E[0] = held[p], -held[p] * off[p], -held[p]
+            columns[0], is_touched[scale[p]], count = scale[p], True, 1
+            matrix[scale[p], scale[p]] += held[p]
+            b[scale[p]], E[scale[p]] = -held[p] * off[p], -held[p]
         for k in range(start[p], start[p + 1]):
             weight, used = linear.weight[k], 0
             depth_x, depth_y = linear.by_depth[k, 0], linear.by_depth[k, 1]
@@ -358,24 +358,32 @@ def _add_points(
                 x, y, column = linear.by[k, 0, i], linear.by[k, 1, i], linear.columns[k, i]
                 if column < 0 or (x == 0 and y == 0):
                     continue
-                at = place[column]
-                b[at] += weight * (x * error_x + y * error_y)
-                E[at] += weight * (x * depth_x + y * depth_y)
-                A[at, at] += weight * (x * x + y * y)
+                if not is_touched[column]:
+                    # In order, so that the matrix is walked row by row.
+                    place, is_touched[column] = count, True
+                    while place > 0 and columns[place - 1] > column:
+                        columns[place] = columns[place - 1]
+                        place -= 1
+                    columns[place] = column
+                    count += 1
+                b[column] += weight * (x * error_x + y * error_y)
+                E[column] += weight * (x * depth_x + y * depth_y)
+                matrix[column, column] += weight * (x * x + y * y)
                 for j in range(used):
                     before, value = touched[j], one[j] * x + other[j] * y
-                    if before == at:
-                        A[at, at] += 2 * value
+                    if before == column:
+                        matrix[column, column] += 2 * value
                     else:
-                        A[max(at, before), min(at, before)] += value
-                touched[used], one[used], other[used] = at, weight * x, weight * y
+                        matrix[max(column, before), min(column, before)] += value
+                touched[used], one[used], other[used] = column, weight * x, weight * y
                 used += 1
         normal.h[p], normal.g[p] = h, g
         for i in range(count):
-            normal.gradient[columns[i]] += b[i]
-            normal.by_points[columns[i]] += E[i] / h * g
+            row = columns[i]
+            by_depth = E[row] / h
+            normal.gradient[row] += b[row]
+            normal.by_points[row] += by_depth * g
             for j in range(i + 1):
-                row, column = max(columns[i], columns[j]), min(columns[i], columns[j])
-                normal.matrix[row, column] += A[i, j] - E[i] / h * E[j]
+                matrix[row, columns[j]] -= by_depth * E[columns[j]]
         for i in range(count):
-            place[columns[i]], b[i], E[i] = -1, 0.0, 0.0
+            is_touched[columns[i]], b[columns[i]], E[columns[i]] = False, 0.0, 0.0

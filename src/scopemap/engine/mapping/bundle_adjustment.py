@@ -25,9 +25,10 @@ from typing import NamedTuple
 import numpy as np
 
 from scopemap.engine.geometry import least_squares
-from scopemap.engine.geometry.least_squares import Linear, Prior, ReducedModel, cauchy, minimise, robust_sigma_2d
+from scopemap.engine.geometry.least_squares import Linear, Prior, ReducedModel, cauchy, dots, minimise, robust_sigma_2d
 from scopemap.engine.geometry.se3 import hat, inverse, orthonormalised, se3_exp, se3_log
 from scopemap.engine.mapping.bundle_problem import (
+    PER_KEYFRAME,
     BundleProblem,
     BundleState,
     Errors,
@@ -40,7 +41,6 @@ from scopemap.engine.mapping.bundle_problem import (
     reprojection_errors,
 )
 
-_PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 CAUCHY = 2.0  # by hand: residuals of that many standard deviations get half the weight
 _BEHIND = 100.0  # guard: squared residual, in variances, of a point behind the camera
 _INVERSE_DEPTH_STEP = (0.1, 10.0)  # by hand: factor of the inverse depth in one step
@@ -156,7 +156,7 @@ def adjust(problem: BundleProblem, *, max_iterations: int = 20, min_decrease: fl
 
     def rescaled(state: BundleState) -> BundleState:
         seen = deviations_at(state).seen
-        lengths = np.linalg.norm(seen.error[seen.ahead], axis=1)
+        lengths = np.sqrt(dots(seen.error, seen.error)[seen.ahead])
         return state._replace(sigma_px=robust_sigma_2d(lengths, problem.least_sigma_px))
 
     options = least_squares.Options(np.inf, max_iterations, min_step=0.0, min_decrease=min_decrease)
@@ -175,12 +175,13 @@ def errors_px(problem: BundleProblem, state: BundleState) -> np.ndarray:
     if not len(problem.observations.point):
         return np.zeros(0)
     reprojection = reprojection_errors(problem, state)
-    return np.where(reprojection.ahead, np.linalg.norm(reprojection.error, axis=1), np.inf)
+    return np.where(reprojection.ahead, np.sqrt(dots(reprojection.error, reprojection.error)), np.inf)
 
 
 def weights(state: BundleState, seen: Errors | Reprojection) -> np.ndarray:
     """Return the robust weights (N,) of the observations, 1/px^2."""
-    return np.where(seen.ahead, cauchy((seen.error**2).sum(1) / state.sigma_px**2, CAUCHY)[1], 0) / state.sigma_px**2
+    square = dots(seen.error, seen.error) / state.sigma_px**2
+    return np.where(seen.ahead, cauchy(square, CAUCHY)[1], 0) / state.sigma_px**2
 
 
 def linearised(problem: BundleProblem, state: BundleState) -> ReducedModel:
@@ -189,11 +190,6 @@ def linearised(problem: BundleProblem, state: BundleState) -> ReducedModel:
 
 
 def _linearised(problem: BundleProblem, state: BundleState, at: _Deviations) -> ReducedModel:
-    unknowns = _PER_KEYFRAME * len(state.T_camera_world)
-    is_free = np.ones(unknowns + (problem.log_focal_sigma is not None), bool)
-    is_free[: max(6, _PER_KEYFRAME * problem.held)] = False
-    if problem.priors.scale == 0:
-        is_free[6:unknowns:_PER_KEYFRAME] = False
     return ReducedModel(
         problem.first_seen,
         problem.parts,
@@ -201,34 +197,31 @@ def _linearised(problem: BundleProblem, state: BundleState, at: _Deviations) -> 
         partial(_derivatives, problem, state),
         partial(_camera_priors, problem, state, at.edges),
         *_held_depths(problem, state),
-        free=np.flatnonzero(is_free),
-        unknowns=len(is_free),
+        scale=problem.touched[1],
+        free=problem.free,
+        unknowns=problem.unknowns,
     )
 
 
-def _held_depths(problem: BundleProblem, state: BundleState) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how far ln depth of the points (P,) is from the estimate, its weight, and the unknown of its scale."""
+def _held_depths(problem: BundleProblem, state: BundleState) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far ln depth of the points (P,) is from the estimate, and its weight."""
     points = problem.points
     off = state.log_depth - points.log_depth - state.log_scale[points.host]
-    return off, cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2, _PER_KEYFRAME * points.host + 6
+    return off, cauchy((off / points.sigma) ** 2, CAUCHY)[1] / points.sigma**2
 
 
 def _derivatives(problem: BundleProblem, state: BundleState, points: slice) -> Linear:
     """Return the derivatives of the observations of some points by the keyframes and ln f."""
     seen = reproject(problem, state, points)
-    by_camera, by_host, by_depth, by_focal = jacobians(problem, state, points, seen)
-    number, observer, _ = (part[problem.seen(points)] for part in problem.observations.columns)
-    first = _PER_KEYFRAME * np.column_stack([observer, problem.points.host[number]])
-    of_focal = _PER_KEYFRAME * len(state.T_camera_world) + np.tile(np.arange(by_focal.shape[2]), (len(number), 1))
-    columns = np.hstack([first[:, :1] + np.arange(6), first[:, 1:] + np.arange(6), of_focal])
-    by = np.concatenate([by_camera, by_host, by_focal], -1)
+    by, by_depth = jacobians(problem, state, points, seen)
+    columns = problem.touched[0][problem.seen(points)]
     return Linear(columns, by, by_depth, seen.error, weights(state, seen) / problem.correlated)
 
 
 def _cost(problem: BundleProblem, state: BundleState, at: _Deviations) -> float:
     """Return what is minimised, at a state."""
     points, priors, (seen, edges) = problem.points, problem.priors, at
-    square = np.where(seen.ahead, (seen.error**2).sum(1) / state.sigma_px**2, _BEHIND)
+    square = np.where(seen.ahead, dots(seen.error, seen.error) / state.sigma_px**2, _BEHIND)
     depth = (state.log_depth - points.log_depth - state.log_scale[points.host]) / points.sigma
     cost = cauchy(square, CAUCHY)[0].sum() / problem.correlated + cauchy(depth**2, CAUCHY)[0].sum()
     cost += 0.5 * (edges.information * edges.error**2).sum()
@@ -273,16 +266,16 @@ def _odometry_edges(problem: BundleProblem, state: BundleState) -> _OdometryEdge
 def _camera_priors(problem: BundleProblem, state: BundleState, edges: _OdometryEdges) -> list[Prior]:
     """Return the normal equations of the priors of pairs of keyframes, of all scales, and of ln f."""
     T, unit, (i, j) = state.T_camera_world, np.repeat([1.0, problem.unit_mm], 3), edges.pairs.T
-    own = _PER_KEYFRAME * np.repeat(edges.pairs, 6, axis=1) + np.tile(np.arange(6), 2)
+    own = PER_KEYFRAME * np.repeat(edges.pairs, 6, axis=1) + np.tile(np.arange(6), 2)
     by_i = -_adjoint(T[j] @ inverse(T[i]))
     J = np.concatenate([by_i, np.broadcast_to(np.eye(6), by_i.shape)], -1) * np.tile(unit, 2)
     weighted = J.swapaxes(1, 2) * edges.information
     priors = [Prior(own, weighted @ J, (weighted @ edges.error[..., None])[..., 0])]
     if problem.priors.scale > 0:
-        information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + _PER_KEYFRAME * np.arange(len(T))
+        information, own = np.full(len(T), problem.priors.scale**-2.0), 6 + PER_KEYFRAME * np.arange(len(T))
         priors.append(Prior(own[None], np.diag(information)[None], (information * state.log_scale)[None]))
     if problem.log_focal_sigma is not None:
-        information, own = np.array([problem.log_focal_sigma**-2.0]), np.array([_PER_KEYFRAME * len(T)])
+        information, own = np.array([problem.log_focal_sigma**-2.0]), np.array([PER_KEYFRAME * len(T)])
         change = np.array([state.log_focal - problem.tracked.log_focal])
         priors.append(Prior(own[None], np.diag(information)[None], (information * change)[None]))
     return priors
@@ -292,7 +285,7 @@ def with_points(problem: BundleProblem, state: BundleState) -> BundleState:
     """Return the state with the points where all observations place them, keyframes held."""
     for _ in range(_POINT_STEPS):
         h, g = _by_points(problem, state)
-        off, held, _ = _held_depths(problem, state)
+        off, held = _held_depths(problem, state)
         step = -(g + held * off) / (h + held)
         state = state._replace(log_depth=state.log_depth - np.log(np.clip(1 - step, *_INVERSE_DEPTH_STEP)))
     return state
@@ -309,10 +302,11 @@ def _by_points(problem: BundleProblem, state: BundleState) -> np.ndarray:
     found, number = np.zeros((2, len(problem.points.host))), problem.observations.point
     for points in problem.parts:
         seen = reproject(problem, state, points)
-        by_depth, weight = jacobians(problem, state, points, seen)[2], weights(state, seen)
+        by_depth = jacobians(problem, state, points, seen, of_depth_alone=True)[1]
+        weight = weights(state, seen)
         own, count = number[problem.seen(points)] - points.start, points.stop - points.start
         for row, by in zip(found, (by_depth, seen.error), strict=True):
-            row[points] = np.bincount(own, weight * (by_depth * by).sum(1), count)
+            row[points] = np.bincount(own, weight * dots(by_depth, by), count)
     return found
 
 
@@ -326,8 +320,8 @@ def _adjoint(T: np.ndarray) -> np.ndarray:
 
 def _retract(problem: BundleProblem, state: BundleState, step: np.ndarray) -> BundleState:
     """Return the state after a step; points move along their rays in inverse depth, which parallax is linear in."""
-    count = _PER_KEYFRAME * len(state.T_camera_world)
-    own = step[:count].reshape(-1, _PER_KEYFRAME)
+    count = PER_KEYFRAME * len(state.T_camera_world)
+    own = step[:count].reshape(-1, PER_KEYFRAME)
     twists = own[:, :6] * np.repeat([1.0, problem.unit_mm], 3)
     T = se3_exp(twists) @ state.T_camera_world
     log_focal = state.log_focal + (0.0 if problem.log_focal_sigma is None else float(step[count]))

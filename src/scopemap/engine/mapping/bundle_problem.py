@@ -21,6 +21,7 @@ from scopemap.engine.geometry.se3 import inverse
 
 _LEAST_Z = 1e-3  # guard: points nearer to the camera's plane, over their distance, are behind it
 _HELD_SIGMA = 0.01  # by hand: least standard deviation of ln depth of points that were adjusted before
+PER_KEYFRAME = 7  # unknowns of a keyframe: rotation, translation, ln of its depth scale
 _AT_ONCE = 20_000  # guard: observations whose derivatives are in memory at once, 1 kB each
 
 
@@ -122,6 +123,36 @@ class BundleProblem:
     def seen(self, points: slice) -> slice:
         """Return the observations of successive points."""
         return slice(*self.first_seen[[points.start, points.stop]].tolist())
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """Which unknowns may change (F,): seven of each keyframe, the last its ln scale, then ln f if it is unknown."""
+        keyframes = PER_KEYFRAME * len(self.T_camera_world)
+        is_free = np.ones(self.unknowns, bool)
+        is_free[: max(6, PER_KEYFRAME * self.held)] = False
+        if self.priors.scale == 0:
+            is_free[6:keyframes:PER_KEYFRAME] = False
+        return np.flatnonzero(is_free)
+
+    @property
+    def unknowns(self) -> int:
+        """How many unknowns there are beside the points."""
+        return PER_KEYFRAME * len(self.T_camera_world) + (self.log_focal_sigma is not None)
+
+    @cached_property
+    def touched(self) -> tuple[np.ndarray, np.ndarray]:
+        """Free unknowns that move each observation (N, U), and the scale of each point (P,); -1: one that is held.
+
+        U is 12, the observer's pose and the host's, or 13 with ln f.
+        """
+        place = np.full(self.unknowns, -1, np.int32)
+        place[self.free] = np.arange(len(self.free))
+        seen, host = self.observations, PER_KEYFRAME * self.points.host
+        first = np.column_stack([PER_KEYFRAME * seen.keyframe, host[seen.point]])
+        columns = [place[first[:, n, None] + np.arange(6)] for n in range(2)]
+        if self.log_focal_sigma is not None:
+            columns.append(np.full((len(first), 1), place[-1]))
+        return np.hstack(columns), place[host + 6].astype(np.int64)
 
     @property
     def begin(self) -> BundleState:
@@ -259,7 +290,8 @@ def reproject(problem: BundleProblem, state: BundleState, points: slice) -> Repr
     """Return where some points of a state are projected, against where they were observed."""
     some, T, focal = problem.seen(points), state.T_camera_world, math.exp(state.log_focal)
     number, pixel = problem.observations.point[some], problem.observations.pixel[some]
-    rays = np.column_stack([problem.points.pixel[points] / focal, np.ones(points.stop - points.start)])
+    rays = np.ones((points.stop - points.start, 3))
+    rays[:, :2] = problem.points.pixel[points] / focal
     in_host, point = np.exp(state.log_depth[points])[:, None] * rays, number - points.start
     pairs, which = problem.pairs[0], problem.pairs[1][some]
     least = int(which.min(initial=len(pairs)))  # pairs are sorted by host, too
@@ -270,15 +302,16 @@ def reproject(problem: BundleProblem, state: BundleState, points: slice) -> Repr
 
 
 def jacobians(
-    problem: BundleProblem, state: BundleState, points: slice, at: Reprojection
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the derivatives of pixels by twists of the observing camera and of the host (n, 2, 6), ln depth and ln f.
+    problem: BundleProblem, state: BundleState, points: slice, at: Reprojection, *, of_depth_alone: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (n, 2, U) of pixels by the unknowns of `touched`, and by ln depth of the points (n, 2).
 
-    By ln depth (n, 2); by ln f (n, 2, 1), (n, 2, 0) where it is known. Translations are in units of the typical
-    depth. at : what `reproject` returned for these points.
+    Twists of the observing camera and of the host, translations in units of the typical depth, then ln f where it is
+    unknown. at : what `reproject` returned for these points. of_depth_alone : U is 0.
     """
     corners, focal = problem.points.pixel[points], math.exp(state.log_focal)
-    return _derivatives(at, corners, focal, problem.unit_mm, problem.log_focal_sigma is not None)
+    count = 0 if of_depth_alone else problem.touched[0].shape[1]
+    return _derivatives(at, corners, focal, problem.unit_mm, count)
 
 
 @kernel
@@ -308,12 +341,11 @@ def _projected(
 
 @kernel
 def _derivatives(
-    at: Reprojection, corners: Float64_2d, focal: float, unit_mm: float, is_free: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return what `jacobians` does; corners : (p, 2) of the points, px from the centre. is_free : f is unknown."""
+    at: Reprojection, corners: Float64_2d, focal: float, unit_mm: float, unknowns: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `jacobians` does; corners : (p, 2) of the points, px from the centre. unknowns : 0, 12 or 13."""
     count, row, turned, X = len(at.point), np.zeros(3), np.zeros(3), np.zeros(3)
-    by_camera, by_host = np.empty((count, 2, 6)), np.empty((count, 2, 6))
-    by_depth, by_focal = np.zeros((count, 2)), np.empty((count, 2, 1 if is_free else 0))
+    by, by_depth = np.empty((count, 2, unknowns)), np.zeros((count, 2))
     for n in range(count):
         z = at.seen[n, 2] if at.ahead[n] else 1.0
         q, p = at.pair[n], at.point[n]
@@ -326,15 +358,17 @@ def _derivatives(
             for j in range(3):
                 turned[j] = row[0] * at.between[q, 0, j] + row[1] * at.between[q, 1, j] + row[2] * at.between[q, 2, j]
                 by_depth[n, axis] += turned[j] * X[j]
+            if unknowns == 0:
+                continue
             for i in range(3):
                 j, k = (i + 1) % 3, (i + 2) % 3
                 # d(exp(w) X)/dw = -hat(X), and a row vector times -hat(X) is the cross product X x row.
-                by_camera[n, axis, i] = at.seen[n, j] * row[k] - at.seen[n, k] * row[j]
-                by_host[n, axis, i] = turned[j] * X[k] - turned[k] * X[j]
-                by_camera[n, axis, 3 + i], by_host[n, axis, 3 + i] = unit_mm * row[i], -unit_mm * turned[i]
-            if is_free:
+                by[n, axis, i] = at.seen[n, j] * row[k] - at.seen[n, k] * row[j]
+                by[n, axis, 6 + i] = turned[j] * X[k] - turned[k] * X[j]
+                by[n, axis, 3 + i], by[n, axis, 9 + i] = unit_mm * row[i], -unit_mm * turned[i]
+            if unknowns > 12:
                 scale = X[2] / focal
-                by_focal[n, axis, 0] = at.pixel[n, axis]
+                by[n, axis, 12] = at.pixel[n, axis]
                 for j in range(2):
-                    by_focal[n, axis, 0] -= scale * turned[j] * corners[p, j]
-    return by_camera, by_host, by_depth, by_focal
+                    by[n, axis, 12] -= scale * turned[j] * corners[p, j]
+    return by, by_depth

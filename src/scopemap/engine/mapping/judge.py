@@ -33,7 +33,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.geometry.least_squares import robust_sigma_2d
+from scopemap.engine.geometry.least_squares import dots, robust_sigma_2d
 from scopemap.engine.mapping.bundle_adjustment import errors_px, with_points
 from scopemap.engine.mapping.bundle_problem import BundleProblem, BundleState, part_of, reprojection_errors
 from scopemap.engine.mapping.depth_correction import depth_disagreement
@@ -130,7 +130,7 @@ def placed(left_out: BundleProblem, keyframes: BundleState) -> BundleState:
     state = keyframes._replace(log_depth=left_out.points.log_depth + keyframes.log_scale[left_out.points.host])
     for _ in range(_RESCALINGS):
         seen = reprojection_errors(left_out, state)
-        sigma_px = robust_sigma_2d(np.linalg.norm(seen.error, axis=1), left_out.least_sigma_px)
+        sigma_px = robust_sigma_2d(np.sqrt(dots(seen.error, seen.error)), left_out.least_sigma_px)
         state = with_points(left_out, state._replace(sigma_px=sigma_px))
     return state
 
