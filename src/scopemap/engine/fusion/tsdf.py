@@ -27,6 +27,7 @@ from scopemap.engine.geometry.kernels import (
 )
 
 BLOCK = 8  # voxels along an edge of a block: 8, as Niessner et al. 2013 hash them
+_VOXELS = BLOCK**3
 # 21 bits of a key for each block coordinate.
 KEY_OFFSET = 1 << 20
 _KEY_MASK = (1 << 21) - 1  # 21 bits for each of three numbers of a block
@@ -221,86 +222,120 @@ def _touched_blocks(keys: Int64_1d, inverse_depth: Float32_2d, rays: Float64_2d,
 
 
 @inner_kernel
-def _whole_cells(inverse_depth: np.ndarray, largest_step: float) -> np.ndarray:
-    """Return whether a pixel, its right, its lower and its diagonal neighbour are one surface, (H, W) bool."""
+def _pixel_table(surface: MeasuredSurface, largest_step: float) -> np.ndarray:
+    """Return what a voxel looks up at a pixel, (2, H W + 1, 4) float32; the last place is for voxels outside.
+
+    First the inverse depth of the pixel, its right, its lower and its diagonal neighbour, the first NaN where they are
+    not one surface; then its inverse depth, plane and weight.
+    """
+    inverse_depth, plane_mm, weight = surface.inverse_depth, surface.plane_mm, surface.weight
     height, width = inverse_depth.shape
-    whole = np.zeros((height, width), np.bool_)
-    for row in range(height - 1):
-        for col in range(width - 1):
-            a, b = inverse_depth[row, col], inverse_depth[row, col + 1]
-            c, d = inverse_depth[row + 1, col], inverse_depth[row + 1, col + 1]
+    table = np.zeros((2, height * width + 1, 4), np.float32)
+    table[0, :, 0] = np.nan
+    for row in range(height):
+        for col in range(width):
+            a, place = inverse_depth[row, col], row * width + col
+            table[1, place, 0], table[1, place, 1], table[1, place, 2] = a, plane_mm[row, col], weight[row, col]
+            if row == height - 1 or col == width - 1:
+                continue
+            b, c, d = inverse_depth[row, col + 1], inverse_depth[row + 1, col], inverse_depth[row + 1, col + 1]
             low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
             known = a > 0 and b > 0 and c > 0 and d > 0
             # A cell's diagonal is sqrt(2) px long.
-            whole[row, col] = known and high - low <= 1.5 * largest_step * low
-    return whole
+            if known and high - low <= 1.5 * largest_step * low:
+                table[0, place, 0], table[0, place, 1], table[0, place, 2], table[0, place, 3] = a, b, c, d
+    return table
 
 
 @inner_kernel
-def _sample(inverse_depth: np.ndarray, whole: np.ndarray, u: float, v: float) -> float:
-    """Bilinear inverse depth where the four neighbours are one surface, else the nearest pixel's (NaN: none)."""
-    # Clamped, so that the outer half of a border pixel continues the cell inside it.
-    col = min(max(int(u), 0), inverse_depth.shape[1] - 2)
-    row = min(max(int(v), 0), inverse_depth.shape[0] - 2)
-    if whole[row, col]:
-        s, t = u - col, v - row
-        upper = (1 - s) * inverse_depth[row, col] + s * inverse_depth[row, col + 1]
-        return (1 - t) * upper + t * ((1 - s) * inverse_depth[row + 1, col] + s * inverse_depth[row + 1, col + 1])
-    return inverse_depth[int(v + 0.5), int(u + 0.5)]
-
-
-@inner_kernel
-def _integrate_block(
-    voxels: Voxels,
-    corner: np.ndarray,
-    surface: MeasuredSurface,
-    whole: np.ndarray,
-    picture: np.ndarray,
-    projection: np.ndarray,
-    grid: Grid,
-) -> None:
-    """Fuse a frame into the voxels of one block; the pixel of a point (x, y, z) mm is `projection` @ (x, y, z, 1)."""
-    # Outside the loop: numba counts references of arrays that are read from a tuple.
-    tsdf, weights, colour = voxels.tsdf, voxels.weight, voxels.colour
-    inverse_depths, plane_mm, pixel_weight = surface.inverse_depth, surface.plane_mm, surface.weight
-    height, width = inverse_depths.shape
-    p, voxel_mm = projection, grid.voxel_mm
+def _project(corner: np.ndarray, projection: np.ndarray, voxel_mm: float, at: np.ndarray) -> None:
+    """Put into `at` (3, 512) column and row, px, each times depth, and depth, mm, of the voxels of a block."""
+    p, z = projection, corner[2] * voxel_mm
     step_u, step_v, step_depth = voxel_mm * p[0, 2], voxel_mm * p[1, 2], voxel_mm * p[2, 2]
-    z = corner[2] * voxel_mm
     for line in range(BLOCK * BLOCK):
-        i, j = line // BLOCK, line % BLOCK
-        x, y = (corner[0] + i) * voxel_mm, (corner[1] + j) * voxel_mm
+        x, y = (corner[0] + line // BLOCK) * voxel_mm, (corner[1] + line % BLOCK) * voxel_mm
         first_u = p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]
         first_v = p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]
         first_depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
         for k in range(BLOCK):
-            depth = first_depth + k * step_depth
-            if depth <= 0:
-                continue
-            u, v = (first_u + k * step_u) / depth, (first_v + k * step_v) / depth
-            if not (-0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
-                continue
-            row, col = int(v + 0.5), int(u + 0.5)
-            weight = pixel_weight[row, col]
-            if weight == 0:
-                continue
-            inverse_depth = _sample(inverse_depths, whole, u, v)
-            # Relative to the depth of the voxel's pixel: how far in front of the surface, and the truncation.
-            gap, share = 1.0 - depth * inverse_depth, max(grid.truncation_mm * inverse_depth, grid.truncation_share)
-            if gap <= -share:
-                continue
-            if gap < 0:
-                weight *= min(1.0, (1.0 + gap / share) / (1.0 - grid.full_weight_share))
-            truncation = share / inverse_depth
-            distance = min(max(gap * plane_mm[row, col], -truncation), truncation)
-            total = weights[i, j, k] + weight
-            tsdf[i, j, k] += (distance - tsdf[i, j, k]) * weight / total
-            weights[i, j, k] = total
-            if abs(distance) <= _COLOUR_BAND_VOXELS * voxel_mm:
-                weight *= picture[row, col, 3]
-                for channel in range(3):
-                    colour[i, j, k, channel] += weight * picture[row, col, channel]
-                colour[i, j, k, 3] += weight
+            at[0, BLOCK * line + k] = first_u + k * step_u
+            at[1, BLOCK * line + k] = first_v + k * step_v
+            at[2, BLOCK * line + k] = first_depth + k * step_depth
+
+
+@inner_kernel
+def _locate(at: np.ndarray, places: np.ndarray, width: float, height: float) -> None:
+    """Put into `places` (2, 512) where voxels look up their cell and their pixel; in `at`, the place in that cell."""
+    last_row, last_col = max(height - 2.0, 0.0), max(width - 2.0, 0.0)
+    for n in range(_VOXELS):
+        depth = at[2, n]
+        u, v = at[0, n] / depth, at[1, n] / depth
+        inside = (depth > 0) & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+        u, v = u if inside else 0.0, v if inside else 0.0
+        row, col = float(np.int32(v + 0.5)), float(np.int32(u + 0.5))
+        places[1, n] = np.int32(row * width + col if inside else height * width)
+        # Clamped, so that the outer half of a border pixel continues the cell inside it.
+        above, left = float(np.int32(v)), float(np.int32(u))
+        above, left = above if above < last_row else last_row, left if left < last_col else last_col
+        places[0, n] = np.int32(above * width + left)
+        at[0, n], at[1, n] = u - left, v - above
+
+
+@inner_kernel
+def _look_up(table: np.ndarray, places: np.ndarray, seen: np.ndarray) -> None:
+    """Put into `seen` (7, 512) what voxels look up: four inverse depths of the cell; inverse depth, plane, weight."""
+    for n in range(_VOXELS):
+        cell, pixel = np.uint64(places[0, n]), np.uint64(places[1, n])
+        # Read before they are written: the compiler does not know that the arrays are apart.
+        a, b, c, d = table[0, cell, 0], table[0, cell, 1], table[0, cell, 2], table[0, cell, 3]
+        inverse_depth, plane_mm, weight = table[1, pixel, 0], table[1, pixel, 1], table[1, pixel, 2]
+        seen[0, n], seen[1, n], seen[2, n], seen[3, n] = a, b, c, d
+        seen[4, n], seen[5, n], seen[6, n] = inverse_depth, plane_mm, weight
+
+
+@inner_kernel
+def _average(tsdf: np.ndarray, weights: np.ndarray, at: np.ndarray, seen: np.ndarray, grid: Grid) -> None:
+    """Fuse what voxels have looked up into their distances and weights (512,); both, of the frame, are put into `at`.
+
+    The inverse depth is bilinear where the four neighbours are one surface, else the nearest pixel's.
+    """
+    truncation_mm, truncation_share, full = grid.truncation_mm, grid.truncation_share, 1.0 - grid.full_weight_share
+    for n in range(_VOXELS):
+        s, t = at[0, n], at[1, n]
+        upper, lower = (1 - s) * seen[0, n] + s * seen[1, n], (1 - s) * seen[2, n] + s * seen[3, n]
+        smooth, nearest = (1 - t) * upper + t * lower, float(seen[4, n])
+        inverse_depth = smooth if smooth == smooth else nearest
+        # Relative to the depth of the voxel's pixel: how far in front of the surface, and the truncation.
+        gap, share = 1.0 - at[2, n] * inverse_depth, truncation_mm * inverse_depth
+        share = share if share > truncation_share else truncation_share
+        fading, truncation = (1.0 + gap / share) / full, share / inverse_depth
+        weight = seen[6, n] * (fading if gap < 0 and fading < 1.0 else 1.0)
+        weight = weight if gap > -share else 0.0
+        distance = gap * seen[5, n]
+        distance = distance if distance > -truncation else -truncation
+        distance = distance if distance < truncation else truncation
+        total = weights[n] + weight
+        change = (distance - tsdf[n]) * weight / total
+        tsdf[n] += change if weight > 0 else 0.0
+        weights[n] = total
+        at[0, n], at[1, n] = distance, weight
+
+
+@inner_kernel
+def _colour(colour: np.ndarray, picture: np.ndarray, at: np.ndarray, pixels: np.ndarray, band_mm: float) -> None:
+    """Add the colours of `pixels` (512,) of a picture (H W, 4) to the voxels (512, 4) that are near the surface."""
+    near, count = np.empty(_VOXELS, np.int32), 0
+    # Listed first, without a branch, of which most would be guessed wrong.
+    for n in range(_VOXELS):
+        near[np.uint64(count)] = n
+        count += (at[1, n] > 0) & (abs(at[0, n]) <= band_mm)
+    for m in range(count):
+        voxel = np.uint64(near[m])
+        pixel = np.uint64(pixels[voxel])
+        weight = at[1, voxel] * picture[pixel, 3]
+        for channel in range(3):
+            colour[voxel, channel] += weight * picture[pixel, channel]
+        colour[voxel, 3] += weight
 
 
 def integrate_blocks(
@@ -335,7 +370,15 @@ def _integrate_blocks(
     projection: Float64_2d,
     grid: Grid,
 ) -> None:
-    whole = _whole_cells(surface.inverse_depth, grid.largest_step)
+    # Step by step for all voxels of a block, without branches: so that most steps are compiled to vector instructions.
+    height, width = surface.inverse_depth.shape
+    table, picture = _pixel_table(surface, grid.largest_step), picture.reshape(-1, 4)
+    at, places, seen = np.empty((3, _VOXELS)), np.empty((2, _VOXELS), np.int32), np.empty((7, _VOXELS), np.float32)
+    tsdf, weight = voxels.tsdf.reshape(-1, _VOXELS), voxels.weight.reshape(-1, _VOXELS)
+    colour = voxels.colour.reshape(-1, _VOXELS, 4)
     for n in range(len(slots)):
-        block = Voxels(voxels.tsdf[slots[n]], voxels.weight[slots[n]], voxels.colour[slots[n]])
-        _integrate_block(block, corners[n], surface, whole, picture, projection, grid)
+        _project(corners[n], projection, grid.voxel_mm, at)
+        _locate(at, places, float(width), float(height))
+        _look_up(table, places, seen)
+        _average(tsdf[slots[n]], weight[slots[n]], at, seen, grid)
+        _colour(colour[slots[n]], picture, at, places[1], _COLOUR_BAND_VOXELS * grid.voxel_mm)
