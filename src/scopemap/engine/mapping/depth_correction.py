@@ -20,7 +20,7 @@ import numpy as np
 from scipy import sparse
 
 from scopemap.engine.cameras.camera import PinholeCamera
-from scopemap.engine.geometry.kernels import Float32_2d, Float32_3d, kernel
+from scopemap.engine.geometry.kernels import Float32_2d, Float32_3d, inner_kernel, kernel
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.mapping.bundle_problem import Points
 
@@ -169,36 +169,51 @@ def depth_log_ratios(
     return known
 
 
+@inner_kernel
+def _first_columns(width: int) -> np.ndarray:
+    """Return the first column of the image that lies beyond each node of columns but the last; then the width."""
+    first = np.full(COLUMNS, width)
+    for col in range(width - 1, -1, -1):
+        first[min(int((_F32(col) + _F32(0.5)) * _F32((COLUMNS - 1) / width)), COLUMNS - 2)] = col
+    for node in range(COLUMNS - 2, -1, -1):
+        first[node] = min(first[node], first[node + 1])
+    return first
+
+
+@inner_kernel
+def _along_row(values: np.ndarray, row: int, height: int, line: np.ndarray) -> None:
+    """Put the values (6, 7, 4) of a field along an image's row into `line` (7, 4)."""
+    y = (row + 0.5) / height * (ROWS - 1)
+    above = min(int(y), ROWS - 2)
+    for k in range(COLUMNS):
+        for level in range(LEVELS):
+            low, high = values[above, k, level], values[above + 1, k, level]
+            line[k, level] = low + _F32(y - above) * (high - low)
+
+
 @kernel
 def _inverted(values: Float32_3d, log_depth: Float32_2d, nearest: float, farthest: float) -> np.ndarray:
     """Return a field's values (6, 7, 4) at what the ln depth (H, W) was before their addition, (H, W) float32."""
     height, width = log_depth.shape
-    found = np.empty((height, width), np.float32)
-    step = _F32((farthest - nearest) / (LEVELS - 1))
-    line, own = np.empty((COLUMNS, LEVELS), np.float32), np.empty(LEVELS, np.float32)
+    found, line = np.empty((height, width), np.float32), np.empty((COLUMNS, LEVELS), np.float32)
+    step, columns = float(_F32((farthest - nearest) / (LEVELS - 1))), _first_columns(width)
     for row in range(height):
-        y = (row + 0.5) / height * (ROWS - 1)
-        above = min(int(y), ROWS - 2)
-        for k in range(COLUMNS):
-            for level in range(LEVELS):
-                low, high = values[above, k, level], values[above + 1, k, level]
-                line[k, level] = low + _F32(y - above) * (high - low)
-        for col in range(width):
-            x = (_F32(col) + _F32(0.5)) * _F32((COLUMNS - 1) / width)
-            left, place = min(int(x), COLUMNS - 2), log_depth[row, col] - _F32(nearest)
-            for level in range(LEVELS):
-                low, high = line[left, level], line[left + 1, level]
-                own[level] = low + (x - _F32(left)) * (high - low)
-            # Piecewise linear: the first piece that ends beyond the depth holds it.
-            found[row, col] = own[0] if place == place else _F32(np.nan)
-            if place > own[0]:
-                found[row, col] = own[LEVELS - 1]
-                for level in range(LEVELS - 1):
-                    begin, end = step * level + own[level], step * (level + 1) + own[level + 1]
-                    if place <= end:
-                        share = (place - begin) / (end - begin)
-                        found[row, col] = own[level] + share * (own[level + 1] - own[level])
-                        break
+        _along_row(values, row, height, line)
+        for left in range(COLUMNS - 1):
+            # Between two nodes and without branches, so that it is compiled to vector instructions.
+            for col in range(columns[left], columns[left + 1]):
+                s = (_F32(col) + _F32(0.5)) * _F32((COLUMNS - 1) / width) - _F32(left)
+                place = log_depth[row, col] - _F32(nearest)
+                far = line[left, LEVELS - 1] + s * (line[left + 1, LEVELS - 1] - line[left, LEVELS - 1])
+                value = float(far)
+                # Piecewise linear: the first piece that ends beyond the depth holds it.
+                for level in range(LEVELS - 2, -1, -1):
+                    near = line[left, level] + s * (line[left + 1, level] - line[left, level])
+                    begin, end = step * level + near, step * (level + 1) + far
+                    value = near + (place - begin) / (end - begin) * (far - near) if place <= end else value
+                    far = near
+                value = value if place > far else float(far)
+                found[row, col] = value if place == place else np.nan
     return found
 
 
@@ -206,27 +221,24 @@ def _inverted(values: Float32_3d, log_depth: Float32_2d, nearest: float, farthes
 def _interpolated(values: Float32_3d, log_depth: Float32_2d, nearest: float, farthest: float) -> np.ndarray:
     """Return a field's values (6, 7, 4) at each pixel's ln depth (H, W), (H, W) float32; NaN where that is NaN."""
     height, width = log_depth.shape
-    found = np.empty((height, width), np.float32)
-    # In single precision and without branches, so that it is compiled to vector instructions.
-    first, per_level = _F32(nearest), _F32((LEVELS - 1) / (farthest - nearest))
+    found, line = np.empty((height, width), np.float32), np.empty((COLUMNS, LEVELS), np.float32)
+    first, per_level, columns = _F32(nearest), _F32((LEVELS - 1) / (farthest - nearest)), _first_columns(width)
     per_column, last = _F32((COLUMNS - 1) / width), _F32(LEVELS - 1)
-    line = np.empty((COLUMNS, LEVELS), np.float32)
     for row in range(height):
-        y = (row + 0.5) / height * (ROWS - 1)
-        above = min(int(y), ROWS - 2)
-        for k in range(COLUMNS):
-            for level in range(LEVELS):
-                low, high = values[above, k, level], values[above + 1, k, level]
-                line[k, level] = low + _F32(y - above) * (high - low)
-        for col in range(width):
-            x, z = (_F32(col) + _F32(0.5)) * per_column, (log_depth[row, col] - first) * per_level
-            z = z if z > _F32(0) else _F32(0)  # unknown depth, too
-            z = z if z < last else last
-            left, below = min(int(x), COLUMNS - 2), min(int(z), LEVELS - 2)
-            s, t = x - _F32(left), z - _F32(below)
-            near = line[left, below] + s * (line[left + 1, below] - line[left, below])
-            far = line[left, below + 1] + s * (line[left + 1, below + 1] - line[left, below + 1])
-            found[row, col] = near + t * (far - near) if log_depth[row, col] == log_depth[row, col] else _F32(np.nan)
+        _along_row(values, row, height, line)
+        for left in range(COLUMNS - 1):
+            # Between two nodes, in single precision and without branches: compiled to vector instructions.
+            for col in range(columns[left], columns[left + 1]):
+                s, z = (_F32(col) + _F32(0.5)) * per_column - _F32(left), (log_depth[row, col] - first) * per_level
+                z = z if z > _F32(0) else _F32(0)  # unknown depth, too
+                z = z if z < last else last
+                near, value = line[left, 0] + s * (line[left + 1, 0] - line[left, 0]), _F32(0)
+                for below in range(LEVELS - 1):
+                    low, high = line[left, below + 1], line[left + 1, below + 1]
+                    far = low + s * (high - low)
+                    value = near + (z - _F32(below)) * (far - near) if z >= _F32(below) else value
+                    near = far
+                found[row, col] = value if log_depth[row, col] == log_depth[row, col] else _F32(np.nan)
     return found
 
 
