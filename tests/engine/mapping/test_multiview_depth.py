@@ -90,7 +90,7 @@ def test_tissue_that_moves_is_not_triangulated() -> None:
 
 def test_a_wall_without_texture_is_not_triangulated() -> None:
     """Flow sees nothing there, so neighbours would agree on whatever depth they start from."""
-    flat = [_image(number, 0.2)._replace(contrast=np.full((128, 160, 3), 128, np.uint8)) for number in range(2, 7)]
+    flat = [_image(number, 0.2)._replace(contrast=np.full((128, 160), 128, np.uint8)) for number in range(2, 7)]
     assert triangulate_depth(flat[2], [flat[0], flat[1], flat[3], flat[4]], CAMERA, DisFlow()) is None
 
 

@@ -67,8 +67,8 @@ _WIDE_PX = 16.0  # by hand
 class PosedImage(NamedTuple):
     """A frame for triangulation.
 
-    contrast : (H, W, 3) uint8, grey values with normalised local contrast, from `normalised_contrast`. depth_mm :
-    (H, W) float32, NaN = unknown or not usable. T_world_camera : (4, 4).
+    contrast : (H, W) uint8, grey values with normalised local contrast, from `normalised_contrast`. depth_mm : (H, W)
+    float32, NaN = unknown or not usable. T_world_camera : (4, 4).
     """
 
     contrast: np.ndarray
@@ -89,10 +89,10 @@ class TriangulatedDepth(NamedTuple):
 
 
 def normalised_contrast(rgb: np.ndarray) -> np.ndarray:
-    """Return grey values (H, W, 3) uint8 without local mean and contrast, so that lamp and exposure cancel."""
+    """Return grey values (H, W) uint8 without local mean and contrast, so that lamp and exposure cancel."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     contrast = local_contrast(grey - local_mean(grey, _CONTRAST_PX), _CONTRAST_PX, unit=40.0, least=2.0)
-    return cv2.merge([np.clip(128 + contrast, 0, 255).astype(np.uint8)] * 3)
+    return np.clip(128 + contrast, 0, 255).astype(np.uint8)
 
 
 def choose_neighbours(
@@ -125,10 +125,10 @@ def triangulate_depth(
     image: PosedImage, neighbours: Iterable[PosedImage], camera: PinholeCamera, flow: FlowEstimator
 ) -> TriangulatedDepth | None:
     """Return the triangulated depth of an image; None where its neighbours disagree or are fewer than two."""
-    neighbours, total = list(neighbours), np.zeros_like(image.depth_mm)
+    neighbours, total, textured = list(neighbours), np.zeros_like(image.depth_mm), _textured(image.contrast)
     for _ in range(_WARPS):
         start = image._replace(depth_mm=image.depth_mm * np.exp(total))
-        estimates = _estimates(start, neighbours, camera, flow)
+        estimates = _estimates(start, textured, neighbours, camera, flow)
         if len(estimates) < 2:
             return None
         log_factor, information, scatter, compared = combine(*(np.stack(part) for part in zip(*estimates, strict=True)))
@@ -236,20 +236,28 @@ class KeyframeDepths:
         return found
 
 
+def _textured(contrast: np.ndarray) -> np.ndarray:
+    """Return where a picture has texture, (H, W) bool: elsewhere flow is what it started from."""
+    grey = contrast.astype(np.float32)
+    found: np.ndarray = _around(grey**2) - _around(grey) ** 2 > _MIN_SPREAD**2
+    return found
+
+
 def _estimates(
-    image: PosedImage, neighbours: Sequence[PosedImage], camera: PinholeCamera, flow: FlowEstimator
+    image: PosedImage,
+    textured: np.ndarray,
+    neighbours: Sequence[PosedImage],
+    camera: PinholeCamera,
+    flow: FlowEstimator,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return each neighbour's ln factor of an image's depth, and its information, 0 = unknown, (H, W) float32."""
-    # Flow of a picture without texture is what it started from.
-    grey = image.contrast[..., 0].astype(np.float32)
-    spread = _around(grey**2) - _around(grey) ** 2
-    textured, found = spread > _MIN_SPREAD**2, []
+    picture, found = cv2.merge([image.contrast] * 3), []
     for neighbour in neighbours:
         T = inverse(neighbour.T_world_camera) @ image.T_world_camera
         seen = project(image.depth_mm, np.isfinite(neighbour.depth_mm), T, _intrinsics(camera))
         warped = cv2.remap(neighbour.contrast, seen.x, seen.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        warped = np.where(seen.usable[..., None] > 0, warped, image.contrast)
-        log_factor, slope, across = epipolar_error(flow.estimate_small(image.contrast, warped), seen)
+        warped = np.where(seen.usable > 0, warped, image.contrast)
+        log_factor, slope, across = epipolar_error(flow.estimate_small(picture, cv2.merge([warped] * 3)), seen)
         # A neighbourhood that moves across the epipolar lines moves along them as well.
         variance_px = np.float32(_FLOW_SIGMA_PX**2) + across + _around(across)
         information = slope / (variance_px + np.float32(VIEW_SIGMA**2) * slope)

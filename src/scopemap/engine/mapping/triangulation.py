@@ -65,20 +65,22 @@ def project(depth_mm: Float32_2d, known: Bool_2d, T: Float64_2d, camera: Intrins
     """Project a frame's pixels into another; usable: known depth, seen at least 1 px inside, at `known` pixels."""
     height, width = depth_mm.shape
     planes = np.zeros((5, height, width), np.float32)
+    places = np.empty((2, width))
     for row in range(height):
+        # Without branches, so that it is compiled to vector instructions.
         for col in range(width):
-            depth = depth_mm[row, col]
-            planes[0, row, col] = planes[1, row, col] = _OUTSIDE_PX
-            if not depth > 0:
-                continue
+            depth = float(depth_mm[row, col])
             mx, my, mz = _seen_from(T, depth, (col - camera.cx) / camera.fx, (row - camera.cy) / camera.fy)
             z = mz + T[2, 3]
-            if z <= _LEAST_MM:
-                continue
             x, y = (mx + T[0, 3]) / z, (my + T[1, 3]) / z
+            seen = (depth > 0) & (z > _LEAST_MM)
             u, v = camera.fx * x + camera.cx, camera.fy * y + camera.cy
-            planes[0, row, col], planes[1, row, col] = u, v
-            planes[2, row, col], planes[3, row, col] = camera.fx * (mx - x * mz) / z, camera.fy * (my - y * mz) / z
+            places[0, col], places[1, col] = u if seen else _OUTSIDE_PX, v if seen else _OUTSIDE_PX
+            planes[0, row, col], planes[1, row, col] = u if seen else _OUTSIDE_PX, v if seen else _OUTSIDE_PX
+            planes[2, row, col] = camera.fx * (mx - x * mz) / z if seen else 0.0
+            planes[3, row, col] = camera.fy * (my - y * mz) / z if seen else 0.0
+        for col in range(width):
+            u, v = places[0, col], places[1, col]
             if 1 <= u <= width - 2 and 1 <= v <= height - 2 and known[int(v + 0.5), int(u + 0.5)]:
                 planes[4, row, col] = 1.0
     return Projection(planes[0], planes[1], planes[2], planes[3], planes[4])
@@ -132,29 +134,30 @@ def combine(log_factor: Float32_3d, information: Float32_3d) -> tuple[np.ndarray
     count, height, width = log_factor.shape
     planes = np.zeros((4, height, width), np.float32)
     mean, total, scatter, compared = planes[0], planes[1], planes[2], planes[3]
+    values, weights, sums = np.empty(width), np.empty(width), np.empty(width)
     for row in range(height):
+        # By row, and without branches, so that it is compiled to vector instructions.
         for col in range(width):
-            value, weight, views = 0.0, 0.0, 0
-            for step in range(_ITERATIONS + 1):
-                sum_weight, sum_value = 0.0, 0.0
-                for n in range(count):
-                    w = information[n, row, col]
-                    if step > 0:
-                        w /= 1 + w * (log_factor[n, row, col] - value) ** 2 / _CAUCHY**2
-                    sum_weight += w
-                    sum_value += w * log_factor[n, row, col]
-                if sum_weight <= 0:
-                    break
-                value, weight = sum_value / sum_weight, sum_weight
-            if weight <= 0:
-                continue
-            sum_weight, spread = 0.0, 0.0
+            values[col] = 0.0
+        for step in range(_ITERATIONS + 1):
+            for col in range(width):
+                weights[col] = sums[col] = 0.0
+            for n in range(count):
+                for col in range(width):
+                    log, w = log_factor[n, row, col], float(information[n, row, col])
+                    w /= 1 + (w if step > 0 else 0.0) * (log - values[col]) ** 2 / _CAUCHY**2
+                    weights[col] += w
+                    sums[col] += w * log
+            for col in range(width):
+                values[col] = sums[col] / weights[col] if weights[col] > 0 else 0.0
+        for col in range(width):
+            value, sum_weight, spread, views = values[col], 0.0, 0.0, 0.0
             for n in range(count):
                 w = information[n, row, col]
                 views += w > 0
                 sum_weight += w
                 spread += w * min((log_factor[n, row, col] - value) ** 2, 1.0)
-            mean[row, col], total[row, col] = value, weight
+            mean[row, col], total[row, col] = value, weights[col]
             if views > 1:
                 scatter[row, col], compared[row, col] = spread / sum_weight * views / (views - 1), 1.0
     return mean, total, scatter, compared
