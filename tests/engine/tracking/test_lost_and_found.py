@@ -72,6 +72,22 @@ def test_unsharp_frames_are_lost_and_never_a_keyframe(spoil) -> None:  # type: i
     assert way_mm < 0.3
 
 
+def test_what_is_too_unsharp_for_any_pose_is_not_searched_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched, find = [], relocalisation.Relocaliser.find
+
+    def noted(self: relocalisation.Relocaliser, frame: Frame, *arguments: Any, **named: Any) -> Any:
+        searched.append(frame.index)
+        return find(self, frame, *arguments, **named)
+
+    monkeypatch.setattr(relocalisation.Relocaliser, "find", noted)
+    frames = [plane_scene.frame(T, n) for n, T in enumerate(NEAR)]
+    nothing = replace(frames[5], rgb=cv2.GaussianBlur(frames[5].rgb, (0, 0), 30.0))
+    tracks = _tracked([*frames[:5], nothing, *frames[6:]])
+    assert tracks[5].status == "lost"
+    assert tracks[5].sharpness < 0.3
+    assert searched == [6]  # after the loss
+
+
 @pytest.mark.parametrize("remembered", [10, 0])
 def test_a_camera_that_went_far_unseen_is_found_by_its_landmarks(remembered: int) -> None:
     dark = replace(plane_scene.frame(NEAR[-1], 8), valid=np.zeros_like(plane_scene.EVERYWHERE))

@@ -258,6 +258,8 @@ class Tracker(FrameTracker):
         is, else the keyframe and the frame tracked last.
         """
         assert self._keyframe is not None
+        if sharpness < self._min_sharpness / 2:
+            return None  # whatever features find, `is_obscured` would refuse it
         views = pyramid or self._aligner.pyramid(self._keyframe, frame)
         near = [self._keyframe]
         if self._last is not None and self._last.index != self._keyframe.frame.index:
