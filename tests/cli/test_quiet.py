@@ -52,7 +52,7 @@ CLOSED = (
     *("locate run tiny --out located.csv", "coverage run --out covered", "compare-exams run run --out both"),
     "live clip.mp4 --seconds 20 --out live",
     *("phantom made --frames 3 --size 160x128", "compare run --truth tiny --out compared"),
-    *("climb run --out c --clip x", "bench", "bench speed in --frames 6"),
+    *("climb run --out c --clip x", "bench", "bench speed in --frames 0:6"),
     *("datasets list", "datasets check tiny", "models list", "models verify"),
 )
 # pydicom imports requests, where that is installed, which binds ::1 to see whether the machine has IPv6, no more.

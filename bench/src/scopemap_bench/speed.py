@@ -1,4 +1,4 @@
-"""Processor time of each stage of a run on this machine, and its comparison with an earlier measurement.
+"""Processor time of each stage of a run on this machine.
 
 A stage counts without the stages that it calls. Times of two machines are compared as ratios to a calibration, OpenCV's
 DIS flow of a fixed pair of images: not this package's code, and like most of its work. It is measured again and again
@@ -7,14 +7,13 @@ while the run lasts: a processor whose cores are all busy is slower than an idle
 
 from __future__ import annotations
 
-import json
 import tempfile
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
@@ -24,8 +23,9 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 
-from scopemap.engine.config import Config
+from scopemap.engine.config import Config, Preset
 from scopemap.engine.errors import InputError
+from scopemap.input.frame_choice import selection_text
 from scopemap.input.opening import open_sequence
 from scopemap.runner.reconstruct import reconstruct
 from scopemap_bench.phantom.spec import PhantomSpec
@@ -95,14 +95,16 @@ class StageTime:
 class Speed:
     """Processor time per frame of a run's stages on one machine.
 
+    video : its path below the folder of the data, None: the phantom. selection : its frames, "A:B:S", "": all.
     calibration_ms, cpu_ms : of the calibration, and of the whole process per frame. passed_ms : time that passed, per
     frame.
     size : (width, height) of the working images, px. stages : by name.
     """
 
-    clip: str
+    video: str | None
+    selection: str
     frames: int
-    preset: str
+    preset: Preset
     size: tuple[int, int]
     calibration_ms: float
     cpu_ms: float
@@ -115,13 +117,13 @@ class Speed:
         return self.cpu_ms / self.calibration_ms
 
     @property
+    def clip(self) -> str:
+        """Name of what was measured, such as "cecum_t1_a 0:60"."""
+        return " ".join(filter(None, ("phantom" if self.video is None else Path(self.video).name, self.selection)))
+
+    @property
     def _measured(self) -> str:
         return f"{self.frames} frames of {self.clip} at {self.size[0]}x{self.size[1]} px, preset {self.preset}"
-
-    def json(self) -> dict[str, Any]:
-        """Return the figures, rounded, as `read_speed` reads them."""
-        rounded: dict[str, Any] = json.loads(json.dumps(asdict(self)), parse_float=lambda text: round(float(text), 4))
-        return rounded
 
     def slower_than(self, before: Speed, tolerance: float, *, whole: bool = False) -> list[str]:
         """Return a line for each stage, and for the whole process, slower by more than the share `tolerance`.
@@ -141,38 +143,37 @@ class Speed:
         ]
 
 
-def read_speed(file: Path) -> Speed:
-    """Return the measurement that a file holds; raises `InputError` where it holds none."""
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        stages = {name: StageTime(**stage) for name, stage in content.pop("stages").items()}
-        return Speed(**content | {"size": tuple(content["size"])}, stages=stages)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise InputError(f"reading {file}: it holds no measurement of speed ({error})") from None
+@contextmanager
+def timed_runs(
+    video: str | None, frames: slice, config: Config, data: Path | None = None
+) -> Iterator[Callable[[], Speed]]:
+    """Yield what runs a video, each time anew, and returns the processor time of the stages; a short run warms it up.
 
+    OpenCV has one thread while the context lasts, so that its work is counted where it is called.
 
-def measure_speed(video: Path | None, config: Config, frames: int | None = None, runs: int = 1) -> Speed:
-    """Run a video, or by default a phantom, and return the processor time of its stages.
-
-    `frames`: None: all. `runs`: the one whose whole process has the median ratio counts. OpenCV has one thread
-    meanwhile, so that its work is counted where it is called.
+    Parameters
+    ----------
+    video : path below `data`, None: a phantom.
+    frames : which of its frames.
+    data : None: the working directory.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
         with tempfile.TemporaryDirectory() as folder:
+            path, out = Path(folder) / "phantom", Path(folder) / "run"
             if video is None:
-                write_phantom(PHANTOM, Path(folder) / "phantom")
-            path, out = video or Path(folder) / "phantom", Path(folder) / "run"
+                write_phantom(PHANTOM, path)
+            else:
+                path = (data or Path()) / video
             reconstruct(open_sequence(path, frames=slice(_WARM_UP_FRAMES)), config, out=out)
-            measured = [_measured(path, config, frames, out) for _ in range(runs)]
-            return sorted(measured, key=lambda speed: speed.whole_ratio)[runs // 2]
+            yield lambda: _measured(video, path, frames, config, out)
     finally:
         cv2.setNumThreads(threads)
 
 
-def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Speed:
-    sequence, clock = open_sequence(path, frames=slice(frames)), Stopwatch()
+def _measured(video: str | None, path: Path, frames: slice, config: Config, out: Path) -> Speed:
+    sequence, clock = open_sequence(path, frames=frames), Stopwatch()
     started, cpu_started = time.perf_counter(), time.process_time()
     with calibrating() as calibrations, clock.attached():
         result = reconstruct(sequence, config, out=out, overwrite=True)
@@ -181,7 +182,8 @@ def _measured(path: Path, config: Config, frames: int | None, out: Path) -> Spee
     passed_ms = 1e3 * (time.perf_counter() - started) / count
     calibration_ms = float(np.median(calibrations))
     size, stages = (sequence.camera.width, sequence.camera.height), clock.stages(count, calibration_ms)
-    return Speed(sequence.name, count, config.preset, size, calibration_ms, cpu_ms, passed_ms, stages)
+    measured = (calibration_ms, cpu_ms, passed_ms, stages)
+    return Speed(video, selection_text(frames), count, config.preset, size, *measured)
 
 
 class Stopwatch:

@@ -11,17 +11,13 @@ import typer
 
 from scopemap.engine.errors import InputError
 from scopemap.terminal.figures import print_json
-from scopemap.terminal.options import AsJson, Quiet
+from scopemap.terminal.options import AsJson, Quiet, parse_slice
 
 if TYPE_CHECKING:
     from scopemap_bench.entry import Entry
     from scopemap_bench.result import RunResult
-    from scopemap_bench.speed import Speed
 
 _Preset = Literal["default", "paper", "paper-strict", "realtime"]
-_TOLERANCE = 0.1  # share by which a stage may be slower
-_WHOLE_TOLERANCE = 0.15  # by which the whole process may be; on a busy machine it varies by a tenth
-_WHOLE_RUNS = 3  # the median counts
 
 
 def bench(
@@ -33,12 +29,14 @@ def bench(
         ),
     ] = None,
     video: Annotated[
-        Path | None, typer.Argument(metavar="[VIDEO]", help="Video that speed measures; default: a phantom.")
+        str | None, typer.Argument(metavar="[VIDEO]", help="Video that speed measures; default: a phantom.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for runs, tables and figures; an earlier call there is resumed.")
     ] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder that the plan's paths refer to.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder that the paths of a plan, and those of speed's videos, refer to.")
+    ] = None,
     dry_run: Annotated[
         bool,
         typer.Option("--dry-run", help="Only print sequences, rows, missing packages and weights, and expected hours."),
@@ -50,16 +48,23 @@ def bench(
     paper_units: Annotated[
         bool, typer.Option("--paper-units", help="Print rotations of tables 1 to 3 in radians; default: degrees.")
     ] = False,
-    frames: Annotated[int | None, typer.Option(min=2, help="For speed: use the first N frames; default: all.")] = None,
+    frames: Annotated[
+        slice | None,
+        typer.Option(parser=parse_slice, metavar="A:B:S", help="For speed: frames to use, such as 0:60; default: all."),
+    ] = None,
     compare: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="For speed: name the stages that are slower than in FILE, which --json wrote."
+            metavar="FILE",
+            help="For speed: measure what FILE holds, which --json wrote, and name the stages that are slower now.",
         ),
     ] = None,
     whole: Annotated[
         bool,
-        typer.Option("--whole", help="With --compare: look at the whole process alone, by the median of three runs."),
+        typer.Option(
+            "--whole",
+            help="With --compare: look at the whole process alone; if it is slower, the median of three runs counts.",
+        ),
     ] = False,
     preset: Annotated[_Preset | None, typer.Option(help="For speed: preset of the run; default: default.")] = None,
     as_json: AsJson = False,
@@ -69,16 +74,23 @@ def bench(
 
     The exit code is 1 if no row of the plan is done.
     """
-    of_plans = {"--out": out, "--data": data, "--timeout": timeout_s}
+    of_plans = {"--out": out, "--timeout": timeout_s}
     of_plans |= {"--dry-run": dry_run or None, "--retry": retry or None, "--paper-units": paper_units or None}
-    of_speed = {"VIDEO": video, "--frames": frames, "--compare": compare, "--preset": preset, "--whole": whole or None}
-    unused = of_plans if plan == "speed" else of_speed
+    of_clip = {"VIDEO": video, "--frames": frames, "--preset": preset}
+    unused = of_plans if plan == "speed" else of_clip | {"--compare": compare, "--whole": whole or None}
     if given := [name for name, value in unused.items() if value is not None]:
         raise typer.BadParameter(f"only {'plans take' if plan == 'speed' else 'speed takes'} it", param_hint=given[0])
     if plan == "speed":
-        if whole and compare is None:
+        from scopemap_bench.cli.speed import compare_speed, print_speed
+
+        if compare is None and whole:
             raise typer.BadParameter("it needs --compare", param_hint="--whole")
-        _print_speed(video, frames, preset or "default", compare, whole, as_json)
+        if compare is None:
+            print_speed(video, frames or slice(None), preset or "default", data, as_json)
+        elif given := [name for name, value in of_clip.items() if value is not None]:
+            raise typer.BadParameter("--compare measures what its file holds", param_hint=given[0])
+        else:
+            compare_speed(compare, data, whole, as_json)
         return
     from scopemap_bench.plan import read_plan
 
@@ -122,41 +134,6 @@ def _need_a_row(results: list[RunResult]) -> None:
     found = " and ".join(f"{count} {status}" for status, count in counts.items())
     first = results[0]
     raise InputError(f"no row is done ({found}); the first, {first.sequence} by {first.method}: {first.error}")
-
-
-def _print_speed(
-    video: Path | None, frames: int | None, preset: _Preset, compare: Path | None, whole: bool, as_json: bool
-) -> None:
-    """Measure and print; ends with code 1 where a stage, or the whole, is slower than in the file to compare with."""
-    from scopemap.engine.config import Config
-    from scopemap_bench.speed import measure_speed, read_speed
-
-    before, tolerance = None if compare is None else read_speed(compare), _WHOLE_TOLERANCE if whole else _TOLERANCE
-    speed = measure_speed(video, Config.load(preset), frames, _WHOLE_RUNS if whole else 1)
-    slower = [] if before is None else speed.slower_than(before, tolerance, whole=whole)
-    if as_json:
-        print_json(speed.json())
-    else:
-        _print_stages(speed)
-    for line in slower:
-        typer.echo(f"slower: {line}", err=True)
-    if slower:
-        raise typer.Exit(1)
-    if before is not None and not as_json:
-        what = "the whole process is not" if whole else "no stage is"
-        typer.echo(f"{what} more than {tolerance:.0%} slower than in {compare}")
-
-
-def _print_stages(speed: Speed) -> None:
-    width, height = speed.size
-    typer.echo(f"{speed.clip}: {speed.frames} frames of {width}x{height} px, processor time per frame")
-    typer.echo(f"calibration (one DIS flow at 320x256 px): {speed.calibration_ms:.1f} ms\n")
-    typer.echo(f"{'stage':28s}{'ms':>8s}{'ratio':>8s}{'share':>8s}  thread")
-    for name, stage in speed.stages.items():
-        typer.echo(f"{name:28s}{stage.ms:8.2f}{stage.ratio:8.2f}{stage.share:8.1%}  {stage.thread}")
-    passed = f"{speed.passed_ms:.1f} ms passed, {1e3 / speed.passed_ms:.1f} frames/s"
-    flows = f"{speed.cpu_ms:.1f} ms of processor time, {speed.whole_ratio:.1f} DIS flows"
-    typer.echo(f"\nwhole process, start and compilers too: {flows}, {passed}")
 
 
 def _list_plans() -> None:
