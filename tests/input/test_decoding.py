@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from scopemap.engine.errors import InputError
-from scopemap.input.decoding import decoded, read_decoded
+from scopemap.input.decoding import decoded, read_decoded, stated_size
 
 HUGE = 60_000
 
@@ -95,3 +95,32 @@ def test_a_chunk_that_claims_gigabytes_takes_no_memory() -> None:
     assert decoded(damaged) is None
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000, "kB of memory"
     assert decoded(sound) is not None
+
+
+def _turned_png(place: str) -> bytes:
+    """A PNG of 12x20 px that is to be shown turned by a quarter, as its chunk before or behind the picture says."""
+    plain = encoded(".png", grey())
+    tiff = b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 0x0112, 3, 1, 6, 0, 0)  # one entry: orientation 6
+    kind, body = {
+        "before": (b"eXIf", tiff),
+        "behind": (b"eXIf", tiff),
+        "xmp": (b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + b'<x tiff:Orientation="6"/>'),
+    }[place]
+    chunk = struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+    at = plain.index(b"IEND") - 4 if place == "behind" else plain.index(b"IDAT") - 4
+    return plain[:at] + chunk + plain[at:]
+
+
+@pytest.mark.parametrize("place", ["before", "behind", "xmp"])
+def test_the_size_of_a_png_is_that_to_be_shown_wherever_it_is_stated(place: str, tmp_path: Path) -> None:
+    (tmp_path / "plain.png").write_bytes(encoded(".png", grey()))
+    (tmp_path / "turned.png").write_bytes(_turned_png(place))
+    assert stated_size(tmp_path / "plain.png") == (12, 20)
+    assert stated_size(tmp_path / "turned.png") == (20, 12)
+
+
+def test_the_size_of_a_png_is_known_without_its_picture(tmp_path: Path) -> None:
+    content = encoded(".png", grey())
+    start = content.index(b"IDAT") + 4
+    (tmp_path / "damaged.png").write_bytes(content[:start] + bytes(len(content) - start))
+    assert stated_size(tmp_path / "damaged.png") == (12, 20)

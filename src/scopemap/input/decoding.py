@@ -23,6 +23,8 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_MISSING_BYTES = 16 << 20
 _WIDTH = 256  # TIFF 6.0, section 8
 _HEIGHT = 257
+# Where Pillow finds the orientation of a PNG; eXIf may stand behind the picture.
+_ORIENTATION_OF_PNG = (b"eXIf", b"Raw profile type exif", b"XML:com.adobe.xmp")
 _ON_THEIR_SIDE = (5, 6, 7, 8)  # orientations of Exif 2.32, 4.6.4
 
 
@@ -102,10 +104,18 @@ def stated_size(file: Path) -> tuple[int, int] | None:
     try:
         with warnings.catch_warnings(), Image.open(file) as image:
             warnings.simplefilter("ignore")
+            if image.format == "PNG" and not _states_orientation(file):
+                return image.height, image.width
             swapped = image.getexif().get(ExifTags.Base.Orientation, 1) in _ON_THEIR_SIDE
             return (image.width, image.height) if swapped else (image.height, image.width)
     except Exception:  # damaged headers end in exceptions of any kind
         return None
+
+
+def _states_orientation(png: Path) -> bool:
+    """Return whether a PNG may state an orientation: to look for it, Pillow decodes the picture."""
+    content = png.read_bytes()
+    return any(name in content for name in _ORIENTATION_OF_PNG)
 
 
 def _holds_its_chunks(content: bytes) -> bool:
