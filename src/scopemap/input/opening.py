@@ -26,7 +26,7 @@ from scopemap.input.images import ImageFolder
 from scopemap.input.pair_check import check_pair
 from scopemap.input.plugins import plugins
 from scopemap.input.prepared import UNKNOWN_MAKE, of_one_view, prepared
-from scopemap.input.sampling import SAMPLED_EVERY
+from scopemap.input.sampling import SAMPLED_EVERY, SampledPair
 from scopemap.input.scopes import SCOPES
 from scopemap.input.sequence import Sequence
 from scopemap.input.source import Source, assumed_camera
@@ -84,17 +84,13 @@ def open_sequence(
     settings : how the input is read, by default `Config().input`.
     """
     settings = settings or InputSettings()
-    frames = slice_of(settings.frames or None if frames is None else frames)
-    if frames.step is not None and frames.step <= 0:
-        raise InputError(f"selecting frames: the step must be positive, got {frames.step}")
+    frames = _selection(settings.frames or None if frames is None else frames)
     if size is not None and not (isinstance(size, tuple | list) and len(size) == 2):
         raise InputError(f"the working size {str(size)[:80]!r} is invalid: give (width, height), such as (320, 256)")
     with _errors_of_the_system(path):
         reader = _reader(Path(path), dataset)
     sequence = sequence_of(reader, camera=camera, fov_deg=fov_deg, size=size, frames=frames, settings=settings)
-    if sequence.count is not None and sequence.count < 2 and not isinstance(reader, VideoFile):
-        of = f" of its {reader.count}, by --frames {selection_text(frames)}" if frames != slice(None) else ""
-        raise InputError(f"reading {sequence.path}: {sequence.count} frame(s) selected{of}, two are needed")
+    _check_count(sequence, reader)
     return sequence
 
 
@@ -112,8 +108,67 @@ def sequence_of(
     with _errors_of_the_system(reader.path):
         reader.begin_at(frames or slice(None))
         source = _prepared(reader, settings, size)
+    return _of_prepared(source, camera, fov_deg, size, frames or slice(None), settings)
+
+
+def open_reader(path: Path | str, *, dataset: str | None = None, frames: slice | None = None) -> Source:
+    """Return the frames of an input as in the file, for `sequence_of_sampled`; raises `InputError`.
+
+    What may change within the input, such as the pictures' size, is as at the first of `frames`.
+    """
+    frames = _selection(frames)
+    with _errors_of_the_system(path):
+        reader = _reader(Path(path), dataset)
+        reader.begin_at(frames)
+        return reader
+
+
+def sequence_of_sampled(
+    reader: Source,
+    pairs: list[SampledPair],
+    *,
+    camera: Path | str | None,
+    frames: slice | None,
+    settings: InputSettings,
+) -> Sequence:
+    """Return the frames of an `open_reader`, as `open_sequence` returns those of a path.
+
+    pairs : what `sample_pairs` has returned of it, from which `settings` may have been chosen.
+    """
+    with _errors_of_the_system(reader.path):
+        source = prepared(reader, settings, pairs=pairs)
+    sequence = _of_prepared(source, camera, None, None, frames or slice(None), settings)
+    _check_count(sequence, reader)
+    return sequence
+
+
+def _selection(frames: slice | str | None) -> slice:
+    frames = slice_of(frames)
+    if frames.step is not None and frames.step <= 0:
+        raise InputError(f"selecting frames: the step must be positive, got {frames.step}")
+    return frames
+
+
+def _check_count(sequence: Sequence, reader: Source) -> None:
+    """Raise `InputError` where fewer than two frames are selected; of a video only reading tells how many there are."""
+    if sequence.count is not None and sequence.count < 2 and not isinstance(reader, VideoFile):
+        frames = sequence.selection
+        of = f" of its {reader.count}, by --frames {selection_text(frames)}" if frames != slice(None) else ""
+        raise InputError(f"reading {sequence.path}: {sequence.count} frame(s) selected{of}, two are needed")
+
+
+def _of_prepared(
+    source: Source,
+    camera: Path | str | None,
+    fov_deg: float | None,
+    size: tuple[int, int] | None,
+    frames: slice,
+    settings: InputSettings,
+) -> Sequence:
+    """Return the frames of what `prepared` returned."""
+    with _errors_of_the_system(source.path):
         calibration, calibrated = _calibration_of(source, camera, fov_deg, settings)
-    pair = _pair_of(source, camera, settings.camera_fit, frames or slice(None)) if settings.uses_both_views else None
+    pair = _pair_of(source, camera, settings.camera_fit, frames) if settings.uses_both_views else None
     size_source = "chosen" if size is None else "given (--size)"
     size = size or working_size(source.width, source.height, settings.longest_side_px)
     working = f"the working size {size[0]}x{size[1]} px"
@@ -135,7 +190,7 @@ def sequence_of(
         size_source=size_source,
         calibrated=calibrated,
         focal_is_stated=fov_deg not in (None, _USUAL_FOV_DEG),
-        selection=frames or slice(None),
+        selection=frames,
         depth_scale_mm=calibration.depth_scale_mm or source.depth_scale_mm,
         choice=FrameChoice(settings.fps, settings.skip_duplicates and source.name in UNKNOWN_MAKE),
         pair=pair,

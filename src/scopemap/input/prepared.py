@@ -40,13 +40,18 @@ _LEFT = {"left-right": "the left half", "top-bottom": "the upper half"}
 
 
 def prepared(
-    source: Source, settings: InputSettings, second: Source | None = None, size: tuple[int, int] | None = None
+    source: Source,
+    settings: InputSettings,
+    second: Source | None = None,
+    size: tuple[int, int] | None = None,
+    pairs: list[SampledPair] | None = None,
 ) -> Source:
     """Return the source with boxes blackened, one view and one field per picture; the source itself where it is so.
 
     With `stereo` = auto, the packing is detected in videos and folders of images of no data set, and with `deinterlace`
     = auto, whether they are interlaced. Both views are kept where they are used; `second` holds the right one where it
-    is another file. size : working size (width, height), px; None: by the settings.
+    is another file. size : working size (width, height), px; None: by the settings. pairs : what `sample_pairs` has
+    returned of the source, None: it is called.
     Raises `InputError` where `stereo` names the views of a data set, whose reader defines them, where there are no two
     views to be used, and for a box outside of the pictures.
     """
@@ -58,7 +63,10 @@ def prepared(
             outside = f"is outside of the pictures of {source.width}x{source.height} px"
             named = f"the box {','.join(map(str, box))} to blacken (--redact, X,Y,WIDTH,HEIGHT)"
             raise InputError(f"reading {source.path}: {named} {outside}")
-    pairs = sample_pairs(source) if source.name in UNKNOWN_MAKE else []
+    if source.name not in UNKNOWN_MAKE:
+        pairs = []
+    elif pairs is None:
+        pairs = sample_pairs(source)
     pairs = [(redacted(rgb, settings.redact), redacted(later, settings.redact)) for rgb, later in pairs]
     packed, note = _packing(source, settings, [rgb for rgb, _ in pairs])
     one_field = _uses_one_field(source, settings, packed, pairs, size)

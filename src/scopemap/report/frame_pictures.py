@@ -111,9 +111,14 @@ class FramePictures:
 
 def shrunk(image: np.ndarray, longest_px: int, interpolation: int = cv2.INTER_AREA) -> np.ndarray:
     """Return a copy of an image whose longer side is at most `longest_px`."""
-    scale = min(1.0, longest_px / max(image.shape[:2]))
-    size = (max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0])))
-    return cv2.resize(image, size, interpolation=interpolation)
+    height, width = shrunk_shape(image.shape, longest_px)
+    return cv2.resize(image, (width, height), interpolation=interpolation)
+
+
+def shrunk_shape(shape: tuple[int, ...], longest_px: int) -> tuple[int, int]:
+    """Return height and width of an image of some shape (h, w, ...) whose longer side is to be at most `longest_px`."""
+    scale = min(1.0, longest_px / max(shape[:2]))
+    return max(1, round(scale * shape[0])), max(1, round(scale * shape[1]))
 
 
 def thinned(values: np.ndarray, widest_px: int) -> np.ndarray:

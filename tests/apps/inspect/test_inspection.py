@@ -276,6 +276,16 @@ def test_time_stamps_of_bags_and_dicom_are_their_own(tmp_path: Path) -> None:
     assert video.container["width"] == video.size[0]
 
 
+@pytest.mark.parametrize(
+    ("frames", "why"), [(slice(0, 1), r"1 frame\(s\) selected of its 4, by --frames 0:1"), (slice(0, 4, 0), "step")]
+)
+def test_a_selection_that_no_run_takes_is_refused(frames: slice, why: str, tmp_path: Path) -> None:
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), tissue(number))
+    with pytest.raises(InputError, match=why):
+        inspect(tmp_path, frames=frames)
+
+
 def test_what_breaks_off_is_reported_and_what_is_no_video_refused(tmp_path: Path) -> None:
     file = write(tmp_path / "whole.avi", clip(COUNT))
     broken = tmp_path / "broken.avi"

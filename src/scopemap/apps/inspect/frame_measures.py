@@ -12,7 +12,7 @@ from scopemap.engine.frame import Frame, is_constant
 from scopemap.engine.masking.masker import BRIGHT_LEVEL, FieldOfView, Masker, darker_channels, is_lit, specular
 from scopemap.engine.tracking.sharpness import sharpness
 from scopemap.input.picture_difference import LEAST_DIFFERENCE, mean_difference
-from scopemap.report.frame_pictures import shrunk
+from scopemap.report.frame_pictures import shrunk, shrunk_shape
 
 _SMALL_PX = 320
 _FLOW_PX = 160
@@ -67,9 +67,13 @@ class InspectedFrame:
 
 
 class FrameInspector:
-    """Measures the frames of a video in their order; keeps the last one of a part that was no repeat."""
+    """Measures the frames of a video in their order; keeps the last one of a part that was no repeat.
 
-    def __init__(self) -> None:
+    frames_only_resize : whether a run's frame is the whole picture at another size.
+    """
+
+    def __init__(self, *, frames_only_resize: bool) -> None:
+        self._frames_only_resize = frames_only_resize
         self._field, self._masker = FieldOfView(), Masker(MaskSettings())
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
@@ -83,7 +87,9 @@ class FrameInspector:
         """
         if part != self._part:
             self._part, self._kept, self._before = part, None, None
-        small = shrunk(rgb, _SMALL_PX)
+        # Most runs' frames have the small picture's size.
+        is_small = self._frames_only_resize and frame.rgb.shape[:2] == shrunk_shape(rgb.shape, _SMALL_PX)
+        small = frame.rgb if is_small else shrunk(rgb, _SMALL_PX)
         lit = is_lit(small)
         field, masked = self._field(lit, np.ones_like(lit)), self._masker(frame)
         inside = field if field.any() else np.ones_like(field)

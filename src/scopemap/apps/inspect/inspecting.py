@@ -19,7 +19,7 @@ from scopemap.apps.inspect.frame_measures import FrameInspector, InspectedFrame
 from scopemap.engine.config import InputSettings
 from scopemap.engine.errors import InputError, ScopemapError
 from scopemap.engine.frame import Frame
-from scopemap.input.opening import open_sequence, open_source
+from scopemap.input.opening import open_reader, sequence_of_sampled
 from scopemap.input.prepared import OF_UNKNOWN_VIEWS, sample_pairs, shows_two_fields
 from scopemap.input.sequence import Sequence, in_thread
 from scopemap.input.source import SourceFrame
@@ -158,13 +158,13 @@ def _opened(
     """Return the pictures as they are in the input, of two views the first; their layout; whether they have fields."""
     plain = InputSettings(stereo="none", skip_duplicates=False, deinterlace="off")
     # Whether there are two views comes first: the camera may be that of one.
-    source = open_source(path, dataset=dataset, settings=plain)
-    unknown = source.name in OF_UNKNOWN_VIEWS  # the readers of data sets know what a picture holds
-    pairs = sample_pairs(source)
-    packed = packing([rgb for rgb, _ in pairs], source.pixel_aspect) if unknown else None
+    reader = open_reader(path, dataset=dataset, frames=frames)
+    unknown = reader.name in OF_UNKNOWN_VIEWS  # the readers of data sets know what a picture holds
+    pairs = sample_pairs(reader)
+    packed = packing([rgb for rgb, _ in pairs], reader.pixel_aspect) if unknown else None
     settings = plain if packed is None else plain.model_copy(update={"stereo": packed.layout})
-    sequence = open_sequence(path, dataset=dataset, camera=camera, frames=frames, settings=settings)
-    return sequence, packed, shows_two_fields(source, pairs)
+    sequence = sequence_of_sampled(reader, pairs, camera=camera, frames=frames, settings=settings)
+    return sequence, packed, shows_two_fields(reader, pairs)
 
 
 def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:
@@ -174,7 +174,7 @@ def _inspected(sequence: Sequence) -> Iterator[InspectedFrame]:
     """
     known = sequence.source.stamps(slice(None)) or []
     positions = {index: position for position, (index, _) in enumerate(known)}
-    inspector = FrameInspector()
+    inspector = FrameInspector(frames_only_resize=sequence.rectifier.only_resizes)
     is_video = sequence.source.media() is not None
     # Decoding and measuring take about the same time.
     for part, number, item in in_thread(_read(sequence), "read"):
