@@ -17,7 +17,7 @@ from scopemap.engine.errors import InputError, SettingsError
 from scopemap.engine.fusion.frame_store import FrameStore
 from scopemap.engine.fusion.surface_fusion import SurfaceFusion
 from scopemap.engine.fusion.tsdf import pack
-from scopemap.engine.fusion.voxel_blocks import VoxelBlocks
+from scopemap.engine.fusion.voxel_blocks import VoxelBlocks, dense
 from scopemap.engine.mapping.mapper import MOST_OBSERVATIONS
 from scopemap.runner.memory import MemoryPlan, memory_plan
 from scopemap.runner.network_cost import network_cost
@@ -72,10 +72,11 @@ def test_a_halved_field_holds_every_second_voxel() -> None:
     slots = blocks.slots(keys)
     for array in blocks.voxels:
         array[slots] = rng.random(array[slots].shape)
-    before = blocks.dense(np.array([-20, -20, -20]), 40)
+    before, slots = blocks.voxels, blocks.box(np.full(3, -20), np.full(3, 40))
     blocks.halve()
-    for finer, coarser in zip(before, blocks.dense(np.array([-10, -10, -10]), 20), strict=True):
-        np.testing.assert_array_equal(finer[::2, ::2, ::2], coarser)
+    halved = blocks.box(np.full(3, -10), np.full(3, 20))
+    for finer, coarser in zip(before, blocks.voxels, strict=True):
+        np.testing.assert_array_equal(dense(finer[slots])[::2, ::2, ::2], dense(coarser[halved]))
 
 
 @pytest.mark.parametrize("at_end", [True, False])

@@ -16,6 +16,8 @@ from scopemap.engine.depth.mapis import DenseCorrespondence, Mapis, RefinedDepth
 from scopemap.engine.depth.shading import ShadingDepth
 from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.surface_fusion import TsdfVolume
+from scopemap.engine.fusion.tsdf import Voxels
+from scopemap.engine.fusion.voxel_blocks import dense
 from scopemap.engine.geometry.uncertainty import blended_sigma, by_variance, depth_trust, faded_sigma, relative_sigma
 
 SHAPE = (48, 64)
@@ -154,7 +156,8 @@ def _field(*frames: Frame, **changes: Any) -> Any:
     volume = TsdfVolume(FusionSettings(voxel_mm=1.0, max_depth_mm=150.0, **changes))
     for frame in frames:
         volume.integrate(frame)
-    return volume._blocks.dense(np.array([-1, 0, 6]), 2)
+    slots = volume._blocks.box(np.array([-1, 0, 6]), np.full(3, 2))
+    return Voxels(*(dense(array[slots]) for array in volume._blocks.voxels))
 
 
 def test_a_fused_pixel_counts_by_its_trust_and_never_more_than_without() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 
 from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.mesh_faces import without_unused
 from scopemap.engine.geometry.se3 import transform
 
 
@@ -30,11 +31,11 @@ def depth_mesh(frame: Frame, step_px: int, min_incidence: float) -> trimesh.Trim
     with np.errstate(invalid="ignore"):
         near_mm, far_mm = corners_mm.min(1), corners_mm.max(1)
         faces = faces[far_mm - near_mm <= largest_step * near_mm]
-    used, faces = np.unique(faces, return_inverse=True)
+    used, faces = without_unused(faces, rows * columns)
     points = (frame.camera.rays[some] * depth_mm[..., None]).reshape(-1, 3)[used]
     return trimesh.Trimesh(
         transform(frame.T_world_camera, points),
-        faces.reshape(-1, 3),
+        faces,
         vertex_colors=frame.rgb[some].reshape(-1, 3)[used],
         process=False,
     )

@@ -10,8 +10,8 @@ import trimesh
 
 from scopemap.engine.config.mapping import FusionSettings
 from scopemap.engine.fusion.albedo import displayed
-from scopemap.engine.fusion.tsdf import BLOCK, Voxels, unpack
-from scopemap.engine.fusion.voxel_blocks import VoxelBlocks
+from scopemap.engine.fusion.tsdf import BLOCK, unpack
+from scopemap.engine.fusion.voxel_blocks import VoxelBlocks, dense
 from scopemap.engine.geometry.kernels import (
     Float32_3d,
     Float64_1d,
@@ -21,6 +21,7 @@ from scopemap.engine.geometry.kernels import (
     inner_kernel,
     kernel,
 )
+from scopemap.engine.geometry.mesh_faces import connected_parts, without_unused
 
 _CHUNK_BLOCKS = 8  # by hand, for memory: the result does not depend on it
 _CHUNK = _CHUNK_BLOCKS * BLOCK
@@ -63,9 +64,8 @@ def extract_mesh(
     `vertex_attributes["confidence"]`: (V,) float32, 0..1, 1 - exp(-weight / 1.5). median_level : median grey level,
     0..255, that the colours are scaled to; None: they stay as they are.
     """
-    corners = np.unique(unpack(blocks.keys()) // _CHUNK_BLOCKS, axis=0)
     least = _MIN_WEIGHT if settings.weighted else 0.0
-    chunks = [_extract_chunk(blocks, corner * _CHUNK_BLOCKS, voxel_mm, least) for corner in corners]
+    chunks = [_extract_chunk(blocks, own, voxel_mm, least) for own in _by_chunk(unpack(blocks.keys()))]
     mesh = _weld([chunk for chunk in chunks if chunk is not None])
     vertices, faces, values = _without_floaters(*mesh, settings.min_component_share)
     shown = np.round(displayed(values[:, :3], median_level)).astype(np.uint8)
@@ -73,17 +73,39 @@ def extract_mesh(
     return trimesh.Trimesh(vertices * voxel_mm, faces, vertex_colors=shown, vertex_attributes=confidence, process=False)
 
 
-def _extract_chunk(blocks: VoxelBlocks, corner: np.ndarray, voxel_mm: float, min_weight: float) -> _Chunk | None:
-    samples = Voxels(*(array[(slice(_CHUNK + 1),) * 3] for array in blocks.dense(corner, _CHUNK_BLOCKS + 1)))
+def _by_chunk(coordinates: np.ndarray) -> list[np.ndarray]:
+    """Return the coordinates (N, 3) of blocks by the chunk that they are in, each (n, 3)."""
+    corners, chunk = np.unique(coordinates // _CHUNK_BLOCKS, axis=0, return_inverse=True)
+    order, chunk = np.argsort(chunk.ravel()), np.sort(chunk.ravel())
+    return np.split(coordinates[order], np.searchsorted(chunk, np.arange(1, len(corners)))) if len(corners) else []
+
+
+def _extract_chunk(blocks: VoxelBlocks, own: np.ndarray, voxel_mm: float, min_weight: float) -> _Chunk | None:
+    """Return the mesh of the cells whose first corner is in the blocks (n, 3) of a chunk; None: no surface."""
+    first, count = own.min(axis=0), np.ptp(own, axis=0) + 1
+    slots = blocks.box(first, count + 1)
+    # Of the blocks beyond them the first samples alone.
+    inside = tuple(slice(BLOCK * blocks_along + 1) for blocks_along in count.tolist())
+    tsdf, weight = (dense(array[slots])[inside] for array in (blocks.voxels.tsdf, blocks.voxels.weight))
     smallest = _SMALLEST_DISTANCE_VOXELS * voxel_mm
-    tsdf = np.where(np.abs(samples.tsdf) < smallest, np.copysign(np.float32(smallest), samples.tsdf), samples.tsdf)
-    known = samples.weight >= max(min_weight, np.finfo(np.float32).tiny)
+    tsdf = np.where(np.abs(tsdf) < smallest, np.copysign(np.float32(smallest), tsdf), tsdf)
+    known = weight >= max(min_weight, np.finfo(np.float32).tiny)
     cells = _crossed_cells(tsdf, known, _LARGEST_SPREAD_VOXELS * voxel_mm)
     if not cells.any():
         return None
-    local, faces = marching_cubes(tsdf, cells)
-    low, high, offset = np.floor(local).astype(np.int64), np.ceil(local).astype(np.int64), corner * BLOCK
-    return _Chunk(local + offset, low + high + 2 * offset, _values(samples, local, low, high), faces)
+    # Counted from the chunk's corner, so that how they are rounded does not depend on which blocks are there.
+    corner, start = first // _CHUNK_BLOCKS * _CHUNK, first % _CHUNK_BLOCKS * BLOCK
+    local, faces = marching_cubes(tsdf, cells, tuple(start.tolist()))
+    low, high = np.floor(local).astype(np.int64), np.ceil(local).astype(np.int64)
+    ends = [(_colours(blocks, slots, end), weight[tuple(end.T)]) for end in (low - start, high - start)]
+    share = np.ascontiguousarray((local - low).T).max(axis=0)[:, None]
+    return _Chunk(local + corner, low + high + 2 * corner, _values(share, *ends), faces)
+
+
+def _colours(blocks: VoxelBlocks, slots: np.ndarray, voxels: np.ndarray) -> np.ndarray:
+    """Return the colours (N, 4) of voxels (N, 3) of a box of blocks, counted from its first one."""
+    block, (i, j, k) = voxels // BLOCK, voxels.T % BLOCK
+    return np.asarray(blocks.voxels.colour[slots[tuple(block.T)], i, j, k])
 
 
 def _crossed_cells(tsdf: np.ndarray, known: np.ndarray, largest_spread_mm: float) -> np.ndarray:
@@ -99,12 +121,13 @@ def _corners(samples: np.ndarray, combine: np.ufunc) -> np.ndarray:
     return combine(samples[:, :, 1:], samples[:, :, :-1])
 
 
-def _values(samples: Voxels, vertices: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Mix the two ends of each vertex's grid edge: colour, an end counting by how well seen it is, and confidence."""
-    share = (vertices - low).max(axis=1, keepdims=True)
-    ends = tuple(low.T), tuple(high.T)
-    total = (1 - share) * samples.colour[ends[0]] + share * samples.colour[ends[1]]
-    weight = (1 - share) * samples.weight[ends[0]][:, None] + share * samples.weight[ends[1]][:, None]
+def _values(share: np.ndarray, low: tuple[np.ndarray, np.ndarray], high: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Mix the two ends of each vertex's grid edge: colour, an end counting by how well seen it is, and confidence.
+
+    share : (V, 1), of the second end. low, high : colours (V, 4) and weights (V,) at the ends.
+    """
+    total = (1 - share) * low[0] + share * high[0]
+    weight = (1 - share) * low[1][:, None] + share * high[1][:, None]
     seen = total[:, 3:] > 0
     colours = np.where(seen, total[:, :3] / np.where(seen, total[:, 3:], 1.0), _UNSEEN_GREY)
     return np.hstack([colours, 1 - np.exp(-weight / _CONFIDENT_WEIGHT)])
@@ -129,28 +152,32 @@ def _without_floaters(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not len(faces):
         return vertices, faces, values
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    component = trimesh.graph.connected_component_labels(edges, node_count=len(vertices))[faces[:, 0]]
+    component = connected_parts(np.concatenate([faces[:, :2], faces[:, 1:]]), len(vertices))[0][faces[:, 0]]
     sizes = np.bincount(component)
     large = sizes >= min(min_share * len(faces), sizes.max())
-    used, renumbered = np.unique(faces[large[component]], return_inverse=True)
-    return vertices[used], renumbered.reshape(-1, 3), values[used]
+    used, kept = without_unused(faces[large[component]], len(vertices))
+    return vertices[used], kept, values[used]
 
 
-def marching_cubes(field: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def marching_cubes(
+    field: np.ndarray, cells: np.ndarray, first: tuple[int, int, int] = (0, 0, 0)
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the zero level of a field: vertices (V, 3) float64 in samples, faces (F, 3) int64.
 
-    field : (l, m, n). cells : (l - 1, m - 1, n - 1) bool, those that give faces. Normals are towards positive values,
-    each crossed edge has one vertex. Lorensen and Cline, SIGGRAPH 1987; faces of a cell with positive and negative
-    corners across are cut as the bilinear interpolation between them is (Nielson and Hamann, Visualization 1991), so
-    that neighbouring cells fit together. Parts of the surface are not joined through the inside of a cell.
+    field : (l, m, n). cells : (l - 1, m - 1, n - 1) bool, those that give faces. first : coordinates of the first
+    sample. Normals are towards positive values, each crossed edge has one vertex. Lorensen and Cline, SIGGRAPH 1987;
+    faces of a cell with positive and negative corners across are cut as the bilinear interpolation between them is
+    (Nielson and Hamann, Visualization 1991), so that neighbouring cells fit together. Parts of the surface are not
+    joined through the inside of a cell.
     """
     positive = field > 0
     used = np.flatnonzero(cells & _corners(positive, np.logical_or) & ~_corners(positive, np.logical_and))
     # Of this, the operating system gives as much memory as is written.
     vertices = np.empty(((len(_EDGES) + 4) * len(used), 3))
     faces = np.empty((_MOST_TRIANGLES * len(used), 3), np.int64)
-    vertex_count, face_count = _march(np.ascontiguousarray(field), used, _all_contours(), vertices, faces)
+    vertex_count, face_count = _march(
+        np.ascontiguousarray(field), used, np.array(first), _all_contours(), vertices, faces
+    )
     return vertices[:vertex_count].copy(), faces[:face_count].copy()
 
 
@@ -166,9 +193,12 @@ def _all_contours() -> np.ndarray:
 
 @kernel
 def _march(
-    field: Float32_3d, used: Int64_1d, contours: Int64_2d, vertices: Float64_2d, faces: Int64_2d
+    field: Float32_3d, used: Int64_1d, first: Int64_1d, contours: Int64_2d, vertices: Float64_2d, faces: Int64_2d
 ) -> tuple[int, int]:
-    """Fill in vertices and faces of the used cells, flat numbers in increasing order; return how many there are."""
+    """Fill in vertices and faces of the used cells, flat numbers in increasing order; return how many there are.
+
+    first : (3,), coordinates of the first sample.
+    """
     rows, columns = field.shape[1] - 1, field.shape[2] - 1
     # Numbers of the vertices on edges that begin in this layer of samples or the next, by axis.
     numbers: np.ndarray = np.full((2, rows + 1, columns + 1, 3), -1)
@@ -186,13 +216,14 @@ def _march(
             corners[c] = field[i + (c >> 2), j + (c >> 1 & 1), k + (c & 1)]
             signs |= (corners[c] > 0) << c
         following = contours[signs].copy() if contours[signs, 0] > -2 else _contours(corners)
-        for first in range(len(_EDGES)):
-            size, edge = 0, first
+        for beginning in range(len(_EDGES)):
+            size, edge = 0, beginning
             while following[edge] >= 0:
                 low, high, axis = _EDGES[edge, 0], _EDGES[edge, 1], edge // 4
                 a, b, c = i + (low >> 2), j + (low >> 1 & 1), k + (low & 1)
                 if numbers[a % 2, b, c, axis] < 0:
-                    vertices[vertex_count, 0], vertices[vertex_count, 1], vertices[vertex_count, 2] = a, b, c
+                    vertices[vertex_count, 0], vertices[vertex_count, 1] = first[0] + a, first[1] + b
+                    vertices[vertex_count, 2] = first[2] + c
                     vertices[vertex_count, axis] += corners[low] / (corners[low] - corners[high])
                     numbers[a % 2, b, c, axis] = vertex_count
                     vertex_count += 1

@@ -54,19 +54,17 @@ class VoxelBlocks:
         keys = np.asarray(pack.py_func(*coordinates.T))
         return np.array([self._slots.get(key, 0) for key in keys.tolist()], dtype=np.int64)
 
-    def dense(self, corner: np.ndarray, blocks: int) -> Voxels:
-        """Return `blocks`^3 blocks from coordinate `corner` (3,) on, dense (8 blocks, ...), weight 0 where none is."""
-        slots = self.find(corner + np.argwhere(np.ones((blocks,) * 3)))
-        return Voxels(*(_assemble(array[slots], blocks) for array in self.voxels))
+    def box(self, first: np.ndarray, shape: np.ndarray) -> np.ndarray:
+        """Return the slots (l, m, n) int64 of a box of this shape from coordinate `first` (3,) on; 0: no block."""
+        return self.find(first + np.argwhere(np.ones(shape))).reshape(shape)
+
+
+def dense(voxels: np.ndarray) -> np.ndarray:
+    """Turn the voxels of a box of blocks, (l, m, n, 8, 8, 8, ...), into (8 l, 8 m, 8 n, ...)."""
+    (i, j, k), rest = voxels.shape[:3], voxels.shape[6:]
+    return np.moveaxis(voxels, (3, 4, 5), (1, 3, 5)).reshape(BLOCK * i, BLOCK * j, BLOCK * k, *rest)
 
 
 def _zeros(blocks: int) -> Voxels:
     shape = (blocks, BLOCK, BLOCK, BLOCK)
     return Voxels(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros((*shape, 4), np.float32))
-
-
-def _assemble(array: np.ndarray, blocks: int) -> np.ndarray:
-    """Turn (blocks^3, 8, 8, 8, ...) into (8 blocks, 8 blocks, 8 blocks, ...)."""
-    side, rest = blocks * BLOCK, array.shape[4:]
-    cube = np.moveaxis(array.reshape(blocks, blocks, blocks, BLOCK, BLOCK, BLOCK, *rest), (3, 4, 5), (1, 3, 5))
-    return cube.reshape(side, side, side, *rest)
