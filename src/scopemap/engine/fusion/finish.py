@@ -10,6 +10,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from scopemap.engine.config import FusionSettings
+from scopemap.engine.geometry.kernels import Float64_1d, Int64_2d, kernel
+from scopemap.engine.geometry.mesh_faces import without_unused
 from scopemap.engine.geometry.rendering import vertex_colours
 
 # Taubin, SIGGRAPH 1995: steps that shrink and steps that grow, 1 / 0.5 - 1 / 0.52 = 0.08, hardly change the volume.
@@ -46,8 +48,8 @@ def with_normals_alone(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     Angles, triangles and normals of faces take 60 MB of a submap, and an examination has dozens.
     """
     if not len(mesh.faces):
-        return mesh  # trimesh cannot copy coloured vertices without a face
-    lean = mesh.copy()
+        return mesh
+    lean = _moved(mesh, np.asarray(mesh.vertices))
     lean.vertex_normals = mesh.vertex_normals  # type: ignore[method-assign]  # a property
     return lean
 
@@ -84,15 +86,14 @@ def without_small_holes(mesh: trimesh.Trimesh, largest_perimeter_mm: float) -> t
     vertex attributes, such as `confidence`. Vertices and faces keep their numbers, new ones follow. Islands and open
     ends stay as they are.
     """
-    vertices, loops = np.asarray(mesh.vertices), _LoopVertices([])
-    if len(mesh.faces):
-        starts, ends = border_edges(mesh).T
-        lengths = np.linalg.norm(vertices[starts] - vertices[ends], axis=1)
-        if found := _loops(starts, ends, lengths, largest_perimeter_mm):
-            are_holes = _are_holes(vertices, np.asarray(mesh.vertex_normals), _LoopVertices(found))
-            loops = _LoopVertices([loop for loop, is_hole in zip(found, are_holes.tolist(), strict=True) if is_hole])
-    if not len(loops.counts):
+    if not len(mesh.faces):
         return mesh
+    vertices, edges = np.asarray(mesh.vertices), border_edges(mesh)
+    lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+    found = _LoopVertices(*_loops(edges, lengths, len(vertices), largest_perimeter_mm))
+    if not len(found.counts) or not (is_hole := _are_holes(mesh, found)).any():
+        return mesh
+    loops = _LoopVertices(found.vertices[is_hole[found.loop]], found.counts[is_hole])
     fans = np.stack([loops.vertices[loops.after], loops.vertices, len(vertices) + loops.loop], axis=1)
     colours = vertex_colours(mesh)
     shades = np.round(loops.means(colours)).astype(colours.dtype)
@@ -109,32 +110,40 @@ def without_small_holes(mesh: trimesh.Trimesh, largest_perimeter_mm: float) -> t
     )
 
 
-def _loops(starts: np.ndarray, ends: np.ndarray, lengths: np.ndarray, longest: float) -> list[list[int]]:
-    """Return the closed loops of directed edges, as vertices, that are not longer; where two touch they are parted."""
-    onwards: dict[int, list[tuple[int, float]]] = {}
-    for start, end, length in zip(starts.tolist(), ends.tolist(), lengths.tolist(), strict=True):
-        onwards.setdefault(start, []).append((end, length))
-    loops = []
-    while onwards:
-        path, travelled = [next(iter(onwards))], [0.0]
-        place = {path[0]: 0}
-        while choices := onwards.get(path[-1]):
-            end, length = choices.pop()
-            if not choices:
-                del onwards[path[-1]]
-            travelled.append(travelled[-1] + length)
-            if end not in place:
-                place[end] = len(path)
-                path.append(end)
+@kernel
+def _loops(edges: Int64_2d, lengths: Float64_1d, count: int, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the closed loops of directed edges (E, 2) that are not longer: their vertices, and how many each has.
+
+    lengths : (E,), of the edges. count : of the mesh's vertices. Where two loops touch they are parted.
+    """
+    # Edges by the vertex where they begin; of each vertex, those that are not gone yet.
+    order, ends = np.argsort(edges[:, 0], kind="mergesort"), np.zeros(count + 1, np.int64)
+    for edge in range(len(edges)):
+        ends[edges[edge, 0] + 1] += 1
+    ends = np.cumsum(ends)
+    firsts, lasts, place = ends[:-1], ends[1:].copy(), np.full(count, -1)
+    path, travelled = np.empty(len(edges) + 1, np.int64), np.empty(len(edges) + 1)
+    found, counts, size, loops = np.empty(len(edges), np.int64), np.empty(len(edges), np.int64), 0, 0
+    for edge in range(len(edges)):
+        path[0], travelled[0], last = edges[edge, 0], 0.0, 0
+        place[path[0]] = 0
+        while lasts[path[last]] > firsts[path[last]]:
+            lasts[path[last]] -= 1
+            onwards = order[lasts[path[last]]]
+            end, far = edges[onwards, 1], travelled[last] + lengths[onwards]
+            if place[end] < 0:
+                last += 1
+                place[end], path[last], travelled[last] = last, end, far
                 continue
             # The path has come back: what it encloses is a loop, and it goes on from there.
             back = place[end]
-            if travelled[-1] - travelled[back] <= longest:
-                loops.append(path[back:])
-            for vertex in path[back + 1 :]:
-                del place[vertex]
-            del path[back + 1 :], travelled[back + 1 :]
-    return loops
+            if far - travelled[back] <= longest:
+                found[size : size + last + 1 - back], counts[loops] = path[back : last + 1], last + 1 - back
+                size, loops = size + last + 1 - back, loops + 1
+            place[path[back + 1 : last + 1]] = -1
+            last = back
+        place[path[: last + 1]] = -1
+    return found[:size].copy(), counts[:loops].copy()
 
 
 class _LoopVertices:
@@ -144,13 +153,12 @@ class _LoopVertices:
     each in its loop is. counts : (L,) how many each loop has.
     """
 
-    def __init__(self, loops: list[list[int]]) -> None:
-        self.vertices = np.array([vertex for loop in loops for vertex in loop], int)
-        self.counts = np.array([len(loop) for loop in loops], int)
-        self.loop = np.repeat(np.arange(len(loops)), self.counts)
-        ends = np.cumsum(self.counts)
-        self.after = np.arange(1, len(self.vertices) + 1)
-        self.after[ends - 1] = ends - self.counts
+    def __init__(self, vertices: np.ndarray, counts: np.ndarray) -> None:
+        self.vertices, self.counts = vertices, counts
+        self.loop = np.repeat(np.arange(len(counts)), counts)
+        ends = np.cumsum(counts)
+        self.after = np.arange(1, len(vertices) + 1)
+        self.after[ends - 1] = ends - counts
 
     def sums(self, values: np.ndarray) -> np.ndarray:
         """Return the sums (L, n) of values (N, n)."""
@@ -162,10 +170,15 @@ class _LoopVertices:
         return self.sums(values[self.vertices]) / self.counts[:, None]
 
 
-def _are_holes(vertices: np.ndarray, normals: np.ndarray, loops: _LoopVertices) -> np.ndarray:
+def _are_holes(mesh: trimesh.Trimesh, loops: _LoopVertices) -> np.ndarray:
     """Return whether loops of border vertices, directed as their faces, go around a hole in the surface, (L,) bool."""
+    vertices, faces, at_border = np.asarray(mesh.vertices), np.asarray(mesh.faces), np.zeros(len(mesh.vertices), bool)
+    at_border[loops.vertices] = True
+    # Normals of all vertices would take most of the time.
+    beside = trimesh.Trimesh(vertices, faces[_with_any(at_border, faces)], process=False)
     arms = vertices[loops.vertices] - loops.means(vertices)[loops.loop]
-    areas, around = loops.sums(np.cross(arms, arms[loops.after])), loops.sums(normals[loops.vertices])
+    areas = loops.sums(np.cross(arms, arms[loops.after]))
+    around = loops.sums(np.asarray(beside.vertex_normals)[loops.vertices])
     found: np.ndarray = (areas * around).sum(axis=1) < _HOLE_COSINE * (
         np.linalg.norm(areas, axis=1) * np.linalg.norm(around, axis=1)
     )
@@ -185,7 +198,7 @@ def with_even_border(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     faces, at_border = np.asarray(mesh.faces), np.zeros(len(mesh.vertices), bool)
     at_border[border_edges(mesh)] = True
     inside = ~_grown(at_border, faces, _BORDER_RINGS)
-    kept = _grown(inside, faces, _GROWN_RINGS)[faces].all(axis=1)
+    kept = ~_with_any(~_grown(inside, faces, _GROWN_RINGS), faces)
     if kept.sum() < _LEAST_BROAD * len(faces):
         return mesh
     return _with_smooth_border(mesh if kept.all() else _part(mesh, kept))
@@ -193,28 +206,37 @@ def with_even_border(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def border_edges(mesh: trimesh.Trimesh) -> np.ndarray:
     """Return the edges (E, 2) that only one face has, directed as in their face, sorted by their vertices."""
-    edges = np.asarray(mesh.faces)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    keys = np.minimum(edges[:, 0], edges[:, 1]) * len(mesh.vertices) + np.maximum(edges[:, 0], edges[:, 1])
-    order = np.argsort(keys)
-    differs = np.diff(keys[order], prepend=-1, append=-1) != 0
-    return edges[order[differs[1:] & differs[:-1]]]
+    starts = np.asarray(mesh.faces).T.ravel()
+    ends, count = np.roll(starts, -len(mesh.faces)), len(mesh.vertices)
+    # Numbers that hold both vertices and the direction: they are sorted in half the time of their order.
+    keys = np.sort(2 * (np.minimum(starts, ends) * count + np.maximum(starts, ends)) + (starts > ends))
+    differs = np.diff(keys >> 1, prepend=-1, append=-1) != 0
+    keys = keys[differs[1:] & differs[:-1]]
+    edges = np.stack(np.divmod(keys >> 1, max(count, 1)), axis=1)
+    return np.where((keys & 1 > 0)[:, None], edges[:, ::-1], edges)
 
 
 def _grown(chosen: np.ndarray, faces: np.ndarray, rings: int) -> np.ndarray:
     """Return the chosen vertices (V,) bool with so many rings around them."""
     grown = chosen.copy()
     for _ in range(rings):
-        grown[faces[grown[faces].any(axis=1)]] = True
+        grown[faces[_with_any(grown, faces)]] = True
     return grown
+
+
+def _with_any(chosen: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the faces (F,) bool that have any of the chosen vertices (V,) bool."""
+    a, b, c = faces.T
+    return np.asarray(chosen[a] | chosen[b] | chosen[c])
 
 
 def _part(mesh: trimesh.Trimesh, kept: np.ndarray) -> trimesh.Trimesh:
     """Return the kept faces (F,) bool of a mesh and their vertices."""
-    used, faces = np.unique(np.asarray(mesh.faces)[kept], return_inverse=True)
+    used, faces = without_unused(np.asarray(mesh.faces)[kept], len(mesh.vertices))
     attributes: dict[str, Any] = {name: np.asarray(values)[used] for name, values in mesh.vertex_attributes.items()}
     return trimesh.Trimesh(
         np.asarray(mesh.vertices)[used],
-        faces.reshape(-1, 3),
+        faces,
         vertex_colors=vertex_colours(mesh)[used],
         vertex_attributes=attributes,
         process=False,
@@ -225,15 +247,25 @@ def _with_smooth_border(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return the mesh with its border's vertices smoothed along it; where borders touch they stay."""
     starts, ends = border_edges(mesh).T
     vertices = np.asarray(mesh.vertices).copy()
-    neighbours = np.bincount(np.concatenate([starts, ends]), minlength=len(vertices))
-    free = np.flatnonzero(neighbours == 2)
-    sums = np.zeros_like(vertices)
+    one, other = np.concatenate([starts, ends]), np.concatenate([ends, starts])
+    free = np.flatnonzero(np.bincount(one, minlength=len(vertices)) == 2)
+    order = np.argsort(one)
+    first = order[np.searchsorted(one, free, sorter=order)]
+    second = order[np.searchsorted(one, free, side="right", sorter=order) - 1]
+    before, after = other[first], other[second]
     # No step grows: points of a comb are to become flat, and a line as long as a border does not shrink.
     for _ in range(_BORDER_STEPS):
-        sums[:] = 0
-        np.add.at(sums, starts, vertices[ends])
-        np.add.at(sums, ends, vertices[starts])
-        vertices[free] += _SHRINK * (sums[free] / 2 - vertices[free])
-    even = mesh.copy()
-    even.vertices = vertices
-    return even
+        vertices[free] += _SHRINK * ((vertices[before] + vertices[after]) / 2 - vertices[free])
+    return _moved(mesh, vertices)
+
+
+def _moved(mesh: trimesh.Trimesh, vertices: np.ndarray) -> trimesh.Trimesh:
+    """Return the mesh with its vertices (V, 3) elsewhere; `copy` of trimesh finds the colours of all faces, too."""
+    has_colours = mesh.visual is not None and mesh.visual.defined
+    return trimesh.Trimesh(
+        vertices,
+        mesh.faces.copy(),
+        vertex_colors=vertex_colours(mesh).copy() if has_colours else None,
+        vertex_attributes=dict(mesh.vertex_attributes),
+        process=False,
+    )
