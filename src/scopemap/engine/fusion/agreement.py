@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -17,8 +18,11 @@ from scopemap.engine.fusion.albedo import lit_by_lamp
 from scopemap.engine.geometry.rendering import Rendering, render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
 from scopemap.engine.geometry.similarity import structural_similarity
+from scopemap.engine.models.device import cpu_threads
 
 _NEAR = float(np.log(1.1))  # within 10 %
+_Item = TypeVar("_Item")
+_Found = TypeVar("_Found")
 _SAME_SURFACE = 0.02  # by hand: between a vertex and what is rendered at its pixel, of its depth: it is not hidden
 
 
@@ -107,23 +111,26 @@ class RenderedFrame(NamedTuple):
 
 def rendered_frames(mesh: trimesh.Trimesh, frames: list[Frame]) -> list[RenderedFrame]:
     """Return renderings of a fusion's surface at some of its frames; [] without a surface or frames."""
-    found = []
-    for frame in frames if len(mesh.faces) else []:
-        if frame.T_world_camera is not None and frame.depth_mm is not None:
-            rendering = render_mesh(mesh, frame.camera, frame.T_world_camera)
-            found.append(RenderedFrame(frame, np.asarray(mesh.vertices), rendering))
-    return found
+    usable = [frame for frame in frames if frame.T_world_camera is not None and frame.depth_mm is not None]
+
+    def rendered(frame: Frame) -> RenderedFrame:
+        rendering = render_mesh(mesh, frame.camera, np.asarray(frame.T_world_camera))
+        return RenderedFrame(frame, np.asarray(mesh.vertices), rendering)
+
+    return _in_threads(rendered, usable) if len(mesh.faces) else []
 
 
 def surface_agreement(frames: list[RenderedFrame], settings: FusionSettings) -> dict[str, float]:
     """Return the figures of a fusion's surface with some of its frames; {} without any."""
-    agreements = []
-    for frame, _, rendering in frames:
+
+    def agreement(one: RenderedFrame) -> FrameAgreement:
+        frame, rendering = one.frame, one.rendering
         depth_mm = np.where(frame.valid, np.asarray(frame.depth_mm), np.nan)
         if settings.without_light:
             rendering = lit_like(rendering, frame.camera, frame.rgb, depth_mm)
-        agreements.append(compare_rendering(rendering, frame.rgb, depth_mm))
-    return agreement_figures(agreements) if agreements else {}
+        return compare_rendering(rendering, frame.rgb, depth_mm)
+
+    return agreement_figures(_in_threads(agreement, frames)) if frames else {}
 
 
 def vertex_sigmas(count: int, frames: list[RenderedFrame]) -> np.ndarray:
@@ -134,18 +141,30 @@ def vertex_sigmas(count: int, frames: list[RenderedFrame]) -> np.ndarray:
     count : of the vertices, V.
     """
     total, seen_by = np.zeros(count), np.zeros(count)
-    for frame, vertices, rendering in frames:
-        assert frame.T_world_camera is not None
-        in_camera = transform(inverse(frame.T_world_camera), vertices)
-        pixels, shown = frame.camera.project(in_camera), rendering.depth_mm
-        limits = [frame.camera.width - 0.5, frame.camera.height - 0.5]
-        inside = np.flatnonzero(((pixels >= -0.5) & (pixels < limits)).all(axis=1))
-        (column, row), z_mm = np.round(pixels[inside]).astype(int).T, in_camera[inside, 2]
-        error = np.abs(np.asarray(frame.depth_mm)[row, column] - z_mm)
-        if frame.depth_sigma_mm is not None:
-            error = np.fmax(error, np.asarray(frame.depth_sigma_mm)[row, column])
-        seen = frame.valid[row, column] & np.isfinite(error) & (np.abs(shown[row, column] / z_mm - 1) < _SAME_SURFACE)
-        total[inside[seen]] += error[seen] ** 2
-        seen_by[inside[seen]] += 1
+    for seen, error in _in_threads(_vertex_errors, frames):
+        total[seen] += error**2
+        seen_by[seen] += 1
     mean = np.divide(total, seen_by, out=np.full(count, np.nan), where=seen_by > 0)
     return np.sqrt(mean).astype(np.float32)
+
+
+def _vertex_errors(one: RenderedFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Return which vertices (N,) a frame sees, and the deviation of each, (N,) mm."""
+    frame, shown = one.frame, one.rendering.depth_mm
+    in_camera = transform(inverse(np.asarray(frame.T_world_camera)), one.vertices)
+    x, y = np.moveaxis(frame.camera.project(in_camera), -1, 0)
+    inside = np.flatnonzero(
+        (x >= -0.5) & (y >= -0.5) & (x < frame.camera.width - 0.5) & (y < frame.camera.height - 0.5)
+    )
+    column, row, z_mm = np.rint(x[inside]).astype(int), np.rint(y[inside]).astype(int), in_camera[inside, 2]
+    error = np.abs(np.asarray(frame.depth_mm)[row, column] - z_mm)
+    if frame.depth_sigma_mm is not None:
+        error = np.fmax(error, np.asarray(frame.depth_sigma_mm)[row, column])
+    seen = frame.valid[row, column] & np.isfinite(error) & (np.abs(shown[row, column] / z_mm - 1) < _SAME_SURFACE)
+    return inside[seen], error[seen]
+
+
+def _in_threads(function: Callable[[_Item], _Found], items: Iterable[_Item]) -> list[_Found]:
+    """Return what a function returns for each item, in order; its work is done without Python's lock."""
+    with ThreadPoolExecutor(cpu_threads()) as pool:
+        return list(pool.map(function, items))

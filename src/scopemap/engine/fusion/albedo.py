@@ -13,6 +13,7 @@ are noise, and bright ones clipped.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -90,8 +91,7 @@ class AlbedoPainter:
 def relative_light(surface: MeasuredSurface, camera: TsdfCamera) -> np.ndarray:
     """Return the light of each pixel over the image's median, (H, W) float32, 1/3..3; NaN where depth is unknown."""
     inverse_depth = surface.inverse_depth
-    x, y = ((np.arange(n) - c) / f for n, c, f in zip(inverse_depth.shape[::-1], camera[4:], camera[2:4], strict=True))
-    log_ray = 0.5 * np.log1p(x**2 + y[:, None] ** 2).astype(np.float32)
+    log_ray = _log_rays(inverse_depth.shape, camera[2:])
     with np.errstate(divide="ignore", invalid="ignore"):
         log_distance = log_ray - np.log(inverse_depth)
         log_cosine = np.log(surface.plane_mm) - log_distance
@@ -104,6 +104,14 @@ def relative_light(surface: MeasuredSurface, camera: TsdfCamera) -> np.ndarray:
     return np.exp(most * np.tanh(log_light / most))
 
 
+@lru_cache(maxsize=4)
+def _log_rays(shape: tuple[int, int], intrinsics: tuple[float, ...]) -> np.ndarray:
+    """Return the logarithms (H, W) float32 of the lengths of the rays, z = 1, of a camera's fx, fy, cx, cy."""
+    fx, fy, cx, cy = intrinsics
+    x, y = (np.arange(shape[1]) - cx) / fx, (np.arange(shape[0]) - cy) / fy
+    return np.asarray(0.5 * np.log1p(x**2 + y[:, None] ** 2).astype(np.float32))
+
+
 def lit_by_lamp(rgb: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     """Return a picture of albedo (H, W, 3) under the lamp, levels that may exceed 255, float32; 0 without depth.
 
@@ -114,12 +122,19 @@ def lit_by_lamp(rgb: np.ndarray, depth_mm: np.ndarray, camera: PinholeCamera) ->
     surface = measure_surface(inverse_depth, pinhole, _STEEPEST / camera.fx, 0.0, np.inf)
     # Beside depth edges the slope is unknown: a surface that faces the lamp.
     unknown = np.isnan(surface.inverse_depth)
-    facing_mm = depth_mm * np.linalg.norm(camera.rays, axis=-1)
+    facing_mm = depth_mm * _ray_lengths(camera)
     plane_mm = np.where(unknown, facing_mm, surface.plane_mm).astype(np.float32)
     light = relative_light(MeasuredSurface(inverse_depth, plane_mm, surface.weight), pinhole)
     known = light > 0
     log_light = _mean(np.log(light, out=np.zeros_like(light), where=known), known)
-    return rgb * np.where(known, np.exp(log_light), 0)[..., None]
+    return rgb * cv2.cvtColor(np.where(known, np.exp(log_light), np.float32(0)), cv2.COLOR_GRAY2RGB)
+
+
+@lru_cache(maxsize=4)
+def _ray_lengths(camera: PinholeCamera) -> np.ndarray:
+    """Return the lengths (H, W) float32 of a camera's rays."""
+    x, y, z = np.moveaxis(camera.rays, -1, 0)
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def displayed(colours: np.ndarray, median_level: float | None) -> np.ndarray:

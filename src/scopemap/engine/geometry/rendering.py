@@ -42,20 +42,17 @@ def render_mesh(mesh: trimesh.Trimesh, camera: PinholeCamera, T_world_camera: np
     """
     T = inverse(T_world_camera)
     points = np.asarray(mesh.vertices) @ T[:3, :3].T + T[:3, 3]
-    ahead = points[:, 2] > _NEAR_MM
-    z = np.where(ahead, points[:, 2], 1.0)
-    pixels = points[:, :2] / z[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    corners = np.column_stack([pixels, np.where(ahead, 1 / z, -1.0)])
+    corners = _projected(points, camera.fx, camera.fy, camera.cx, camera.cy)
     texture = mesh.visual if isinstance(mesh.visual, trimesh.visual.TextureVisuals) else None
-    colours = vertex_colours(mesh)[:, :3] if texture is None else np.column_stack([texture.uv, np.zeros(len(points))])
-    colours = colours.astype(np.float32)
+    colours = vertex_colours(mesh) if texture is None else np.column_stack([texture.uv, np.zeros(len(points))])
     inverse_depth = np.zeros((camera.height, camera.width), np.float32)
     rgb = np.zeros((camera.height, camera.width, 3), np.float32)
-    _rasterise(corners, colours, np.asarray(mesh.faces), inverse_depth, rgb)
-    depth_mm = np.divide(1, inverse_depth, out=np.full_like(inverse_depth, np.nan), where=inverse_depth > 0)
+    _rasterise(corners, colours.astype(np.float32), np.asarray(mesh.faces), inverse_depth, rgb)
+    with np.errstate(divide="ignore"):
+        depth_mm = np.where(inverse_depth > 0, 1 / inverse_depth, np.float32(np.nan))
     if texture is not None:
         return Rendering(depth_mm, _from_texture(rgb, inverse_depth > 0, texture))
-    return Rendering(depth_mm, np.round(rgb).astype(np.uint8))
+    return Rendering(depth_mm, np.asarray(cv2.convertScaleAbs(rgb)))
 
 
 def _from_texture(uv: np.ndarray, seen: np.ndarray, texture: trimesh.visual.TextureVisuals) -> np.ndarray:
@@ -96,10 +93,26 @@ def render_points(
 
 
 @kernel
+def _projected(points: Float64_2d, fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Return u, v, 1 / z of points (V, 3) in the camera, (V, 3); the last is negative where they are not ahead."""
+    corners = np.empty(points.shape)
+    for n in range(len(points)):
+        is_ahead = points[n, 2] > _NEAR_MM
+        z = points[n, 2] if is_ahead else 1.0
+        corners[n, 0] = points[n, 0] / z * fx + cx
+        corners[n, 1] = points[n, 1] / z * fy + cy
+        corners[n, 2] = 1 / z if is_ahead else -1.0
+    return corners
+
+
+@kernel
 def _rasterise(
     corners: Float64_2d, colours: Float32_2d, faces: Int64_2d, inverse_depth: Float32_2d, rgb: Float32_3d
 ) -> None:
-    """Draw faces (F, 3) of corners (V, 3): u, v, 1 / z, negative behind the camera. Changes both images."""
+    """Draw faces (F, 3) of corners (V, 3) as `_projected` returns them. Changes both images.
+
+    colours : (V, 3 or more), of which the first three are drawn.
+    """
     height, width = inverse_depth.shape
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
