@@ -8,6 +8,7 @@ rectpack places the charts in the picture. What no frame shows has the colours o
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
@@ -22,8 +23,10 @@ from scopemap.engine.fusion.texture_alignment import shifts_px
 from scopemap.engine.fusion.texture_levels import ChartVertices, chart_vertices, level_gains
 from scopemap.engine.fusion.texture_views import pieces_of
 from scopemap.engine.geometry.kernels import Float32_3d, Float64_3d, UInt8_2d, UInt8_3d, kernel
+from scopemap.engine.geometry.mesh_faces import without_unused
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.engine.models.device import cpu_threads
 
 LARGEST_PX = 4096
 """Largest side of a texture: what every graphics card of the last ten years shows (WebGL 2 on phones, too)."""
@@ -90,11 +93,16 @@ def textured_mesh(
     texture = np.zeros((height, width, 3), np.uint8)
     by_chart = np.argsort(chart, kind="stable")
     ends = np.searchsorted(chart[by_chart], np.arange(len(crops) + 1))
-    for number, crop in enumerate(crops):
+
+    def paint(number: int) -> None:
         corners = places.of_corner[by_chart[ends[number] : ends[number + 1]]]
         at = layout.pixels[corners] - layout.first[number]
         (x, y), (across, down) = layout.place[number], layout.size[number]
-        texture[y : y + down, x : x + across] = _painted(crop, at, gains[corners])
+        texture[y : y + down, x : x + across] = _painted(crops[number], at, gains[corners])
+
+    # Most of it runs without Python's lock, and charts do not overlap.
+    with ThreadPoolExecutor(cpu_threads()) as pool:
+        list(pool.map(paint, range(len(crops))))
     uv = np.zeros((len(faces), 3, 2))
     inside = chart[some]
     uv[some] = layout.pixels[places.of_corner[some]] + (layout.place - layout.first)[inside][:, None]
@@ -202,7 +210,9 @@ def _cut(
             (x, y), (width, height) = layout.first[chart], layout.size[chart]
             columns = np.clip(np.arange(x, x + width), 0, picture.shape[1] - 1)
             rows = np.clip(np.arange(y, y + height), 0, picture.shape[0] - 1)
-            crops[chart] = picture[rows[:, None], columns]
+            inside = picture[max(y, 0) : y + height, max(x, 0) : x + width]
+            is_whole = min(x, y) >= 0 and inside.shape[:2] == (height, width)
+            crops[chart] = inside.copy() if is_whole else picture[rows[:, None], columns]
     return crops, shown
 
 
@@ -219,7 +229,9 @@ def _painted(crop: np.ndarray, corners: np.ndarray, gains: np.ndarray) -> np.nda
     place = np.zeros(int(nearest.max()) + 1, np.int64)
     of_covered = np.flatnonzero(covered)
     place[nearest.ravel()[of_covered]] = of_covered
-    levels: np.ndarray = np.clip(np.rint(painted.reshape(-1, 3)[place[nearest]]), 0, 255).astype(np.uint8)
+    levels, gaps = np.asarray(cv2.convertScaleAbs(painted)), np.flatnonzero(covered == 0)
+    pixels = levels.reshape(-1, 3)
+    pixels[gaps] = pixels[place[nearest.ravel()[gaps]]]
     return levels
 
 
@@ -278,13 +290,13 @@ def _split(
     vertex.append(np.asarray(mesh.faces)[unseen].ravel())
     uv_of = np.zeros((count + len(vertex[1]), 2))
     uv_of[faces] = uv
-    used, packed = np.unique(faces, return_inverse=True)
+    used, packed = without_unused(faces, len(uv_of))
     of_mesh = np.concatenate(vertex)[used]
     at = uv_of[used] * [1, -1] + [0, 1]  # trimesh counts from the lower left
     material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(texture))
     return trimesh.Trimesh(
         np.asarray(mesh.vertices)[of_mesh],
-        packed.reshape(faces.shape),
+        packed,
         vertex_normals=np.asarray(mesh.vertex_normals)[of_mesh],
         visual=trimesh.visual.TextureVisuals(uv=at, material=material),
         process=False,

@@ -9,6 +9,8 @@ optimization", SIGGRAPH 2014, find such a place by joint optimisation of poses a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,6 +21,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.geometry.local_contrast import local_mean
 from scopemap.engine.geometry.rendering import render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.engine.models.device import cpu_threads
 
 _SAME_SURFACE = 0.03  # by hand: between the depths of a point in two views, of them: it is not hidden
 _LEAST_OVERLAP = 0.05  # by hand: of the picture
@@ -38,16 +41,17 @@ def shifts_px(mesh: trimesh.Trimesh, frames: Sequence[Frame], others: Sequence[F
     the pixels where the poses place the points: the mean over the frame itself and the others, 0 where nothing of the
     surface is seen.
     """
-    flow_of = DisFlow()
-    seen_by = [(one, np.nan_to_num(_depth_mm(mesh, one))) for one in others]
-    for frame in frames:
-        yield _shift_px(_depth_mm(mesh, frame), frame, seen_by, flow_of)
+    some = {frame.index: frame for frame in (*others, *frames)}
+    # Kernels, OpenCV and arithmetic of whole pictures run without Python's lock.
+    with ThreadPoolExecutor(cpu_threads()) as pool:
+        depth_mm = dict(zip(some, pool.map(partial(_depth_mm, mesh), some.values()), strict=True))
+        seen_by = [(one, np.nan_to_num(depth_mm[one.index])) for one in others]
+        yield from pool.map(lambda frame: _shift_px(depth_mm[frame.index], frame, seen_by), frames)
 
 
-def _shift_px(
-    depth_mm: np.ndarray, frame: Frame, others: Sequence[tuple[Frame, np.ndarray]], flow_of: DisFlow
-) -> np.ndarray:
+def _shift_px(depth_mm: np.ndarray, frame: Frame, others: Sequence[tuple[Frame, np.ndarray]]) -> np.ndarray:
     assert frame.T_world_camera is not None
+    flow_of = DisFlow()  # its buffers are for one thread
     seen = np.isfinite(depth_mm)
     points = transform(frame.T_world_camera, frame.camera.rays * np.where(seen, depth_mm, 1)[..., None])
     total, weight = np.zeros((*depth_mm.shape, 2), np.float32), np.ones(depth_mm.shape, np.float32)

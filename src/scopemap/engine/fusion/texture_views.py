@@ -9,6 +9,8 @@ color!", ECCV 2014) weighs such a quality against seams. Here the few views and 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -17,8 +19,10 @@ import scipy.sparse as sparse
 import trimesh
 
 from scopemap.engine.frame import Frame
+from scopemap.engine.geometry.mesh_faces import connected_parts
 from scopemap.engine.geometry.rendering import Rendering, render_mesh
 from scopemap.engine.geometry.se3 import inverse, transform
+from scopemap.engine.models.device import cpu_threads
 
 _BORDER = 1 / 100  # by hand: of the picture's width, that is left out along borders of the mask
 _HIDDEN = 1.02  # by hand: a vertex farther than what is rendered at its pixel by this factor is hidden
@@ -47,17 +51,15 @@ def choose_views(mesh: trimesh.Trimesh, frames: Iterable[Frame]) -> tuple[list[i
     the surface alone. Returns numbers of frames, the most useful first, and (F,) int32, places in that list, -1: none
     shows the triangle.
     """
-    numbers, qualities = list[int](), list[np.ndarray]()
     corners, areas_mm2 = np.asarray(mesh.vertices)[mesh.faces], np.asarray(mesh.area_faces)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     triangles = _Triangles(areas_mm2, corners.mean(axis=1), normals, np.linalg.norm(normals, axis=1))
-    for frame in frames:
-        numbers.append(frame.index)
-        qualities.append(_quality(mesh, triangles, frame))
-    label = np.full(len(mesh.faces), -1, np.int32)
-    if not numbers or not len(mesh.faces):
+    label, candidates = np.full(len(mesh.faces), -1, np.int32), list(frames)
+    if not candidates or not len(mesh.faces):
         return [], label
-    quality = np.stack(qualities, axis=1)
+    # Kernels, OpenCV and arithmetic of whole pictures run without Python's lock.
+    with ThreadPoolExecutor(cpu_threads()) as pool:
+        quality = np.stack(list(pool.map(partial(_quality, mesh, triangles), candidates)), axis=1)
     # Relative to the best view of each triangle: otherwise the nearest part alone would count.
     quality /= np.maximum(quality.max(axis=1, keepdims=True), np.float32(1e-9))
     chosen = _greedy(quality, areas_mm2)
@@ -65,7 +67,7 @@ def choose_views(mesh: trimesh.Trimesh, frames: Iterable[Frame]) -> tuple[list[i
     used = np.unique(label[label >= 0])
     place = np.full(len(chosen) + 1, -1, np.int32)
     place[used] = np.arange(len(used))
-    return [numbers[chosen[one]] for one in used], place[label]
+    return [candidates[chosen[one]].index for one in used], place[label]
 
 
 class _Triangles(NamedTuple):
@@ -84,22 +86,23 @@ def _quality(mesh: trimesh.Trimesh, triangles: _Triangles, frame: Frame) -> np.n
     usable = usable_pixels(frame, rendering)
     in_camera = transform(inverse(frame.T_world_camera), np.asarray(mesh.vertices))
     pixels = frame.camera.project(in_camera)
-    seen = np.isfinite(pixels).all(axis=1)
-    column, row = np.rint(np.where(seen[:, None], pixels, -1.0)).astype(int).T
+    # Column by column: numpy reduces axes of two or three numbers slowly.
+    x, y = np.moveaxis(pixels, -1, 0)
+    seen = np.isfinite(x) & np.isfinite(y)
+    column, row = (np.rint(np.where(seen, one, -1.0)).astype(int) for one in (x, y))
     seen &= (column >= 0) & (row >= 0) & (column < frame.camera.width) & (row < frame.camera.height)
     column, row = np.where(seen, column, 0), np.where(seen, row, 0)
     # Of the pixels around: on a steep surface depth changes from one to the next.
     in_front = cv2.dilate(np.nan_to_num(rendering.depth_mm, nan=np.inf), np.ones((3, 3), np.uint8))[row, column]
     seen &= usable[row, column] & (in_camera[:, 2] <= _HIDDEN * in_front)
-    faces = np.asarray(mesh.faces)
-    a, b, c = (pixels[faces[:, corner]] for corner in range(3))
-    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    a, b, c = np.asarray(mesh.faces).T
+    ux, uy, vx, vy = x[b] - x[a], y[b] - y[a], x[c] - x[a], y[c] - y[a]
     with np.errstate(invalid="ignore", divide="ignore"):
         per_mm = np.sqrt(np.abs(ux * vy - uy * vx) / 2 / triangles.areas_mm2)
     to_camera = frame.T_world_camera[:3, 3] - triangles.middles
     length = triangles.lengths * np.linalg.norm(to_camera, axis=1)
     cosine = np.abs(np.einsum("ij,ij->i", triangles.normals, to_camera)) / np.maximum(length, 1e-12)
-    shown = seen[faces].all(axis=1) & (cosine > _LEAST_COSINE) & np.isfinite(per_mm)
+    shown = seen[a] & seen[b] & seen[c] & (cosine > _LEAST_COSINE) & np.isfinite(per_mm)
     return np.where(shown, per_mm * max(frame.quality, 0.05), 0).astype(np.float32)
 
 
@@ -134,7 +137,8 @@ def _other_colours(frame: Frame, rendering: Rendering) -> np.ndarray:
         small = _mean(levels, all_known, _STEP_PX)[some]
         ratios += sign * _mean(small, known, max(1, round(_COLOUR_BLUR * width)))
     ratios -= _mean(ratios, known, round(_LIGHT_BLUR * width))
-    found = (np.abs(ratios).max(axis=-1) > _OTHER_COLOUR) & (known > 0)
+    red, green, blue = cv2.split(np.abs(ratios))
+    found = (np.maximum(np.maximum(red, green), blue) > _OTHER_COLOUR) & (known > 0)
     size = frame.camera.width, frame.camera.height
     return cv2.resize(found.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
@@ -142,8 +146,9 @@ def _other_colours(frame: Frame, rendering: Rendering) -> np.ndarray:
 def _mean(values: np.ndarray, known: np.ndarray, window_px: int) -> np.ndarray:
     """Return the local mean of values (H, W, 3) over the known pixels (H, W) float32."""
     window = (max(1, window_px),) * 2
-    mean: np.ndarray = cv2.blur(values * known[..., None], window)
-    return mean / np.maximum(cv2.blur(known, window), np.float32(1e-6))[..., None]
+    mean = cv2.blur(values * cv2.cvtColor(known, cv2.COLOR_GRAY2RGB), window)
+    share = np.maximum(cv2.blur(known, window), np.float32(1e-6))
+    return np.asarray(mean / cv2.cvtColor(share, cv2.COLOR_GRAY2RGB))
 
 
 def _greedy(quality: np.ndarray, areas_mm2: np.ndarray) -> list[int]:
@@ -171,9 +176,10 @@ def _labels(quality: np.ndarray, adjacent: np.ndarray) -> np.ndarray:
         return label
     shows, smooth = quality > 0, quality
     mean = _mean_of_neighbours(len(quality), adjacent)
+    # A triangle that a view does not show says nothing about the view's worth beside it.
+    known = np.maximum(mean @ shows.astype(np.float32), np.float32(1e-6))
     for _ in range(_SMOOTHED):
-        # A triangle that a view does not show says nothing about the view's worth beside it.
-        smooth = (mean @ smooth) / np.maximum(mean @ shows.astype(np.float32), np.float32(1e-6)) * shows
+        smooth = (mean @ smooth) / known * shows
     some = shows.any(axis=1)
     label[some] = np.argmax(np.where(shows, smooth, -1.0)[some], axis=1)
     return _joined(label, shows, adjacent)
@@ -209,10 +215,7 @@ def _joined(label: np.ndarray, shows: np.ndarray, adjacent: np.ndarray) -> np.nd
 
 def pieces_of(label: np.ndarray, adjacent: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the number of the connected piece of one label (F,) that each triangle is in, (F,), and their count."""
-    same = adjacent[label[adjacent[:, 0]] == label[adjacent[:, 1]]]
-    links = sparse.coo_array((np.ones(len(same), bool), same.T), shape=(len(label),) * 2)
-    count, piece = sparse.csgraph.connected_components(links, directed=False)
-    return piece, int(count)
+    return connected_parts(adjacent[label[adjacent[:, 0]] == label[adjacent[:, 1]]], len(label))
 
 
 def spread(numbers: Sequence[int], quality: Sequence[float], most: int) -> list[int]:
