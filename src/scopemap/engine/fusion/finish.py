@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from scopemap.engine.config import FusionSettings
-from scopemap.engine.geometry.kernels import Float64_1d, Int64_2d, kernel
+from scopemap.engine.geometry.kernels import Float64_1d, Int64_1d, Int64_2d, kernel
 from scopemap.engine.geometry.mesh_faces import without_unused
 from scopemap.engine.geometry.rendering import vertex_colours
 
@@ -110,26 +110,41 @@ def without_small_holes(mesh: trimesh.Trimesh, largest_perimeter_mm: float) -> t
     )
 
 
-@kernel
-def _loops(edges: Int64_2d, lengths: Float64_1d, count: int, longest: float) -> tuple[np.ndarray, np.ndarray]:
+def _loops(edges: np.ndarray, lengths: np.ndarray, count: int, longest: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the closed loops of directed edges (E, 2) that are not longer: their vertices, and how many each has.
 
     lengths : (E,), of the edges. count : of the mesh's vertices. Where two loops touch they are parted.
     """
-    # Edges by the vertex where they begin; of each vertex, those that are not gone yet.
-    order, ends = np.argsort(edges[:, 0], kind="mergesort"), np.zeros(count + 1, np.int64)
-    for edge in range(len(edges)):
-        ends[edges[edge, 0] + 1] += 1
-    ends = np.cumsum(ends)
-    firsts, lasts, place = ends[:-1], ends[1:].copy(), np.full(count, -1)
+    order, of_vertex = np.argsort(edges[:, 0], kind="stable"), np.bincount(edges[:, 0], minlength=count)
+    lasts = np.cumsum(of_vertex)
+    found, counts = np.empty(len(edges), np.int64), np.empty(len(edges), np.int64)
+    size, loops = _follow(edges, order, np.column_stack([lasts - of_vertex, lasts]), lengths, longest, found, counts)
+    return found[:size].copy(), counts[:loops].copy()
+
+
+@kernel
+def _follow(
+    edges: Int64_2d,
+    order: Int64_1d,
+    remaining: Int64_2d,
+    lengths: Float64_1d,
+    longest: float,
+    found: Int64_1d,
+    counts: Int64_1d,
+) -> tuple[int, int]:
+    """Put the vertices of the loops into `found`, how many each has into `counts`; return how many there are of both.
+
+    order : edges by the vertex where they begin. remaining : (V, 2), of each vertex, its first edge in this order and
+    the one after its last, which counts down.
+    """
+    place, size, loops = np.full(len(remaining), -1), 0, 0
     path, travelled = np.empty(len(edges) + 1, np.int64), np.empty(len(edges) + 1)
-    found, counts, size, loops = np.empty(len(edges), np.int64), np.empty(len(edges), np.int64), 0, 0
     for edge in range(len(edges)):
         path[0], travelled[0], last = edges[edge, 0], 0.0, 0
         place[path[0]] = 0
-        while lasts[path[last]] > firsts[path[last]]:
-            lasts[path[last]] -= 1
-            onwards = order[lasts[path[last]]]
+        while remaining[path[last], 1] > remaining[path[last], 0]:
+            remaining[path[last], 1] -= 1
+            onwards = order[remaining[path[last], 1]]
             end, far = edges[onwards, 1], travelled[last] + lengths[onwards]
             if place[end] < 0:
                 last += 1
@@ -138,12 +153,17 @@ def _loops(edges: Int64_2d, lengths: Float64_1d, count: int, longest: float) -> 
             # The path has come back: what it encloses is a loop, and it goes on from there.
             back = place[end]
             if far - travelled[back] <= longest:
-                found[size : size + last + 1 - back], counts[loops] = path[back : last + 1], last + 1 - back
-                size, loops = size + last + 1 - back, loops + 1
-            place[path[back + 1 : last + 1]] = -1
+                for n in range(back, last + 1):
+                    found[size] = path[n]
+                    size += 1
+                counts[loops] = last + 1 - back
+                loops += 1
+            for n in range(back + 1, last + 1):
+                place[path[n]] = -1
             last = back
-        place[path[: last + 1]] = -1
-    return found[:size].copy(), counts[:loops].copy()
+        for n in range(last + 1):
+            place[path[n]] = -1
+    return size, loops
 
 
 class _LoopVertices:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-
-from scopemap.engine.geometry.kernels import Int64_2d, kernel
+from scipy import sparse
+from scipy.sparse import csgraph
 
 
 def without_unused(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -17,28 +17,11 @@ def without_unused(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarra
     return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[faces]
 
 
-@kernel
-def connected_parts(pairs: Int64_2d, count: int) -> tuple[np.ndarray, int]:
-    """Return the number of the connected part that each of `count` places is in, (count,) int64, and of the parts.
+def connected_parts(pairs: np.ndarray, count: int) -> tuple[np.ndarray, int]:
+    """Return the number of the connected part that each of `count` places is in, (count,), and of the parts.
 
-    pairs : (P, 2), places that are connected. Parts are numbered in the order of their first places.
+    pairs : (P, 2), places that are connected.
     """
-    # Of each place one of the same part that is not behind it; of the part's first one itself (union-find).
-    before = np.arange(count)
-    for n in range(len(pairs)):
-        one, other = pairs[n, 0], pairs[n, 1]
-        while before[one] != one:
-            before[one] = before[before[one]]
-            one = before[one]
-        while before[other] != other:
-            before[other] = before[before[other]]
-            other = before[other]
-        before[max(one, other)] = min(one, other)
-    part, parts = np.empty(count, np.int64), 0
-    for place in range(count):
-        if before[place] == place:
-            part[place] = parts
-            parts += 1
-        else:
-            part[place] = part[before[place]]
-    return part, parts
+    links = sparse.coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
+    parts, part = csgraph.connected_components(links, directed=False)
+    return part, int(parts)
