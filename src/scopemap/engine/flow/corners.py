@@ -20,9 +20,10 @@ _CORNER_BLOCK_PX = 5  # by hand: window of a corner's strength
 _BORDER_PX = 3  # by hand: corners keep so far from what is masked
 _CELL_PX = 12  # by hand: the strongest corner of each cell of that size
 _CONSISTENCY_PX = 1.0  # by hand: largest forward-backward error of flow, the default of `mapis.consistency_px`
-# Of the corners, whose patches must align. Where fewer do, those that flow alone matches count, too: on
-# colonoscopy_nflba_03 as many frames are tracked as by flow between the whole images, in a third of the time.
-_ALIGNED_COVERAGE = 0.5  # by hand
+# Of the corners that flow between small images must match, now and on average over some frames: where flow matches few,
+# that between the whole images gives keyframes more in common.
+_SMALL_COVERAGE = 0.5  # by hand
+_FRAMES_BEFORE = 10  # by hand
 _EXPECTED_PX = 8  # by hand: between the pixels of a flow that is only a start
 _START_COVERAGE = 0.3  # by hand: of the corners that must be matched for the flow to be the next frame's start
 # Refinement.
@@ -82,7 +83,7 @@ class KeyframeMatcher:
     _flows: FlowPair | None = None
 
     def __init__(self, flow: FlowEstimator) -> None:
-        self.flow = flow
+        self.flow, self._usual_coverage = flow, 1.0
         self._small = np.zeros((0, 0, 3), np.uint8)  # the keyframe's picture at the size that was matched last
         self._patterns = np.zeros((0, 0), np.uint8)
         self._corners = np.zeros((0, 2), dtype=int)
@@ -109,15 +110,13 @@ class KeyframeMatcher:
         if self._keyframe is None or not len(self._corners):
             return None
         size = frame.valid.shape[::-1]
-        small = small_flow_size(self.flow, size)
-        matched, pixels = self._matched_in(frame, small)
-        if small != size:
-            aligned, refined = self._aligned_in(frame, matched, pixels)
-            if len(aligned) >= _ALIGNED_COVERAGE * len(self._corners):
-                matched, pixels = aligned, refined
-            else:
-                pixels[np.searchsorted(matched, aligned)] = refined
+        small, matched = small_flow_size(self.flow, size), np.zeros(0, int)
+        if small != size and self._usual_coverage >= _SMALL_COVERAGE:
+            matched, pixels = self._aligned_in(frame, *self._matched_in(frame, small))
+        if len(matched) < _SMALL_COVERAGE * len(self._corners):
+            matched, pixels = self._matched_in(frame, size)
         coverage = len(matched) / len(self._corners)
+        self._usual_coverage += (coverage - self._usual_coverage) / _FRAMES_BEFORE
         if coverage < _START_COVERAGE:
             self._flows = None
         return Correspondences2D3D(self._points_mm[matched], pixels, coverage, self._keyframe.index)
