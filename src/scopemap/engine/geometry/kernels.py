@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -99,9 +100,9 @@ inner_kernel: Callable[..., Any] = partial(njit, **_OPTIONS, cache=IS_CACHED, no
 
 
 def compiled_mark() -> Path:
-    """Return the file that is there where all kernels of the cache were compiled, by this numba for this processor."""
-    folder = Path(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
-    return folder / f"compiled-{numba.__version__}-{get_host_cpu_name()}"
+    """Return the file that is there where all kernels were compiled by this Python and numba for this processor."""
+    folder, python = Path(numba.config.CACHE_DIR), f"py{sys.version_info.major}{sys.version_info.minor}"  # type: ignore[attr-defined]
+    return folder / f"compiled-{python}-{numba.__version__}-{get_host_cpu_name()}"
 
 
 def compile_kernel(kernel: Dispatcher) -> None:
