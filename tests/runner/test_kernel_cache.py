@@ -16,6 +16,7 @@ from numba import config, njit
 import scopemap
 from scopemap.engine.geometry.kernels import KERNELS, Float32_2d, cache_folder, compile_kernel, kernel, use_cache
 from scopemap.result.summary import compiling_words
+from scopemap.runner import kernels, preparation
 from scopemap.runner.run import compiling_s
 
 _READ_ONLY = """
@@ -110,6 +111,17 @@ def test_kernels_are_compiled_for_the_types_of_their_parameters() -> None:
     # Every second column: another type, for which it is compiled, too.
     assert _total(Pair(np.full((2, 4), 2, np.float32)[:, ::2], 3.0), 4) == 10.0
     assert len(_total.signatures) == 2
+
+
+def test_kernels_are_compiled_where_no_mark_says_that_they_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark, done, said = tmp_path / "compiled", [], list[str]()
+    monkeypatch.setattr(preparation, "compiled_mark", lambda: mark)
+    monkeypatch.setattr(kernels, "compile_kernels", lambda: done.append(mark.touch()))
+    for _ in range(2):
+        preparation.compile_once(lambda _, call: call(), lambda doing, *_: said.append(doing))
+    assert (len(done), said) == (1, ["compiling kernels, once"])
 
 
 _RUNS = """

@@ -24,12 +24,7 @@ def prepare(
     sequence: Sequence, config: Config, timed: Timed, progress: Progress, own: CustomEstimators | None = None
 ) -> tuple[Sequence, Config, Estimators, list[Notice]]:
     """Return a sequence with a focal length, resolved settings, the estimators, and notices of what was estimated."""
-    if IS_CACHED and not compiled_mark().exists():
-        # Once for each machine.
-        from scopemap.runner.kernels import compile_kernels
-
-        progress("compiling kernels, once", 0, 0)
-        timed("compile kernels", compile_kernels)
+    compile_once(timed, progress)
     progress("preparing", 0, 0)
     estimators = timed("prepare", create_estimators, config, sequence, own)
     if not (sequence.calibrated or sequence.is_estimated):
@@ -43,6 +38,15 @@ def prepare(
         config, estimators, of_files = timed("prepare", with_files_judged, sequence, config, estimators)
         notices = [*notices, *of_files]
     return sequence, config, estimators, notices
+
+
+def compile_once(timed: Timed, progress: Progress) -> None:
+    """Compile all kernels where that has not been done on this machine; before processes that would all do it, too."""
+    if IS_CACHED and not compiled_mark().exists():
+        from scopemap.runner.kernels import compile_kernels
+
+        progress("compiling kernels, once", 0, 0)
+        timed("compile kernels", compile_kernels)
 
 
 def _with_estimated_focal(

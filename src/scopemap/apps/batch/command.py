@@ -126,7 +126,12 @@ def batch(
             return
         from scopemap.apps.batch.batch import INDEX, TABLE, run_batch
         from scopemap.report.batch_page import counts_of
+        from scopemap.runner.preparation import compile_once
 
+        if engine == "processes":
+            compile_once(
+                lambda _, call: call(), lambda doing, *_: None if quiet or as_json else typer.echo(doing, err=True)
+            )
         with _lines(silent=quiet or as_json) as show:
 
             def shown(row: BatchRow, left: int) -> None:
