@@ -53,11 +53,13 @@ def _path(folder: Path) -> set[str]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)  # type: ignore[arg-type]
-    # What is written down for a run that resumes this one changes no frame. The texture is made of few frames, not of
-    # each one; ARCHITECTURE.md has its files below the table.
-    texture = {"runner/texturing.py"} | {f"engine/fusion/texture_{part}.py" for part in ("views", "alignment")}
-    assert texture <= files
-    return (files - texture - {"runner/checkpoints.py", "runner/tracking_log.py"}) | {
+    # What is written down for a run that resumes this one changes no frame. The surface is checked and its texture made
+    # with few frames, not with each one; ARCHITECTURE.md has these files below the table.
+    few = {"runner/texturing.py"} | {
+        f"engine/fusion/{part}.py" for part in ("agreement", "texture_views", "texture_alignment")
+    }
+    assert few <= files
+    return (files - few - {"runner/checkpoints.py", "runner/tracking_log.py"}) | {
         "apps/run/command.py",
         "runner/run.py",
     }
