@@ -124,6 +124,24 @@ def test_kernels_are_compiled_where_no_mark_says_that_they_were(
     assert (len(done), said) == (1, ["compiling kernels, once"])
 
 
+@pytest.mark.parametrize("executable", [sys.executable, "/opt/viewer/Viewer"])
+def test_a_run_goes_on_where_no_process_can_be_started(
+    executable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = list[str]()
+
+    def refuse(command: list[str], **_: object) -> None:
+        started.append(command[0])
+        raise OSError("no process may be started")
+
+    monkeypatch.setattr(kernels, "compiled_mark", lambda: tmp_path / "compiled")
+    monkeypatch.setattr(sys, "executable", executable)
+    monkeypatch.setattr(kernels.subprocess, "Popen", refuse)
+    kernels.compile_kernels()
+    assert started == ([executable] if "python" in executable else [])
+    assert not (tmp_path / "compiled").exists()
+
+
 _RUNS = """
 import sys
 from pathlib import Path

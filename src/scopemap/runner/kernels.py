@@ -11,6 +11,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,21 +24,24 @@ _IN_PROCESS = "from scopemap.runner.kernels import compile_some; compile_some({!
 
 
 def compile_kernels() -> None:
-    """Have all kernels in the cache; those with which that fails are compiled when they are needed."""
+    """Have all kernels in the cache; those with which that fails are compiled when a run needs them."""
+    # An application that Python is embedded in must not be started.
     if not Path(sys.executable or "").name.lower().startswith("python"):
-        return  # an application that Python is embedded in must not be started
-    with TemporaryDirectory() as taken:
+        return
+    # No process may be started, or the disk is full: the run goes on without.
+    with suppress(OSError), TemporaryDirectory() as taken:
         # -P: what lies in the working folder is not imported.
         command = [sys.executable, "-P", "-c", _IN_PROCESS.format(taken)]
-        count = min(cpu_threads(), _MOST_PROCESSES)
-        processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for _ in range(count)]
+        processes: list[subprocess.Popen[bytes]] = []
         try:
+            for _ in range(min(cpu_threads(), _MOST_PROCESSES)):
+                processes.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
             failed = [process.wait() for process in processes]
         finally:
             for process in processes:
                 process.kill()
-    if not any(failed):
-        compiled_mark().touch()
+        if not any(failed):
+            compiled_mark().touch()
 
 
 def compile_some(taken: str) -> None:
