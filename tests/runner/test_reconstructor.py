@@ -51,6 +51,15 @@ def test_stepping_gives_what_a_run_gives(preset: Any, folder: Path) -> None:
     _assert_equal(overlapping.result(), by_run)
 
 
+def test_a_pose_does_not_wait_for_the_surface(folder: Path) -> None:
+    with Reconstructor("realtime", open_sequence(folder)) as one:
+        faces: list[int] = []
+        for _ in one.steps(one.frames(), posed=lambda step: faces.append(len(one.surface().faces))):
+            faces.append(len(one.surface().faces))
+    assert faces[0] == 0  # posed
+    assert faces[1] > 0  # fused
+
+
 def _pictures(folder: Path) -> list[np.ndarray]:
     return [cv2.imread(str(file))[..., ::-1] for file in sorted(folder.glob("*_color.png"))]
 

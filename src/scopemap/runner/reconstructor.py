@@ -111,16 +111,23 @@ class Reconstructor:
         step: Any = self._frame(picture, time_s, index)
         for part, call in self._pipeline.steps.items():
             step = self._run.clock.timed(part, call, step)
-        self._run.clock.timed("store or fuse", self._pipeline.fuse, step)
         self._run.take(step)
         return step
 
-    def steps(self, pictures: Iterable[np.ndarray | Frame], *, ahead: int = 2) -> Iterator[Step]:
+    def steps(
+        self,
+        pictures: Iterable[np.ndarray | Frame],
+        *,
+        ahead: int = 2,
+        posed: Callable[[Step], None] = lambda step: None,
+    ) -> Iterator[Step]:
         """Yield the step of each picture, the same as by `step`: stages overlap, each `ahead` frames ahead of the next.
 
-        This is about twice as fast on two cores, and each step comes some frames after its picture was taken.
+        This is about twice as fast on two cores, and each step comes some frames after its picture was taken. posed :
+        called with each step before it is fused, for whom the pose must not wait for the surface.
         """
         for step in overlapped((self._frame(picture) for picture in pictures), self._pipeline, self._run.clock, ahead):
+            posed(step)
             self._run.take(step)
             yield step
 

@@ -131,8 +131,9 @@ class Run:
             raise stop
 
     def take(self, step: Step) -> None:
-        """Collect the results of a step, and forget what is beyond the limits."""
+        """Fuse or store the frame of a step, collect its results, and forget what is beyond the limits."""
         fusion, limits = self.pipeline.fusion, self.kept_maps.limits
+        self.clock.timed("store or fuse", self.pipeline.fuse, step)
         self.replay(step)
         self.frames.append(step.row)
         is_beyond = limits.exceeded(frames=len(self.frames), stored=len(fusion.store))
@@ -332,7 +333,10 @@ def overlapped(
     ahead: int = 2,
     checkpoints: CheckpointWriter | None = None,
 ) -> Iterator[Step]:
-    """Yield the steps of all frames; each stage but the last runs in a thread of its own, `ahead` frames ahead."""
+    """Yield the steps of all frames, not yet fused; each stage runs in a thread of its own, `ahead` frames ahead.
+
+    A checkpoint is committed when the next step is asked for: the one before is fused by then.
+    """
 
     def stage(part: str, call: Callable[[Any], Any], items: Iterable[Any]) -> Generator[Any, None, None]:
         def results() -> Iterator[Any]:
@@ -351,7 +355,6 @@ def overlapped(
         items = stage(part, call, items)
     with closing(items):
         for step, due in items:
-            clock.timed("store or fuse", pipeline.fuse, step)
             yield step
             if due and checkpoints is not None:
                 checkpoints.commit(step.frame.index)

@@ -107,10 +107,10 @@ def live(
             kept = KeptDepth(Path(stack.enter_context(TemporaryDirectory())))
             covered = stack.enter_context(LiveCoverage(kept))
             shown = None if view is None else ShownSession(view, covered, writes=out is not None)
-            observers = observe, *sender, *([kept.observe] if folder or shown else [])
+            observers = observe, *([kept.observe] if folder or shown else [])
             observers += (covered.observe, shown.observe) if shown else ()
             snapshots = (folder or Path("scopemap-live")) / "snapshots"
-            session = LiveSession(reading, sequence, config, observers=observers, snapshots=snapshots)
+            session = LiveSession(reading, sequence, config, followers=sender, observers=observers, snapshots=snapshots)
             actions |= {
                 "pause": session.pause,
                 "reset": session.reset,

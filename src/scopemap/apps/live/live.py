@@ -6,6 +6,7 @@ import json
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -31,11 +32,11 @@ LIMITS = Limits(frames=50_000, maps=8, blocks=80_000, stored=9_000)
 """Of a session: about 60 MB of rows, 1 GB of surfaces, and on disk 4 GB of frames: ten minutes at 15 frames/s."""
 _REMEMBERED = 300  # latencies
 _AHEAD = 1
-_MOST_AT_ONCE = 2  # frames between source and step, one for each of two cores: more wait for each other, and come late
 _WITHOUT_STEP_S = 1.0  # guard: after which a frame that never became a step holds up no other
 
 LiveObserver = Callable[[Step, Reconstructor], None]
-"""Called with each step, in the thread that fuses."""
+"""Called with each step, in the thread that fuses: followers as soon as its pose is known, observers when it is fused.
+"""
 
 
 class LiveSession:
@@ -47,12 +48,14 @@ class LiveSession:
         sequence: Sequence,
         config: Config,
         *,
+        followers: tuple[LiveObserver, ...] = (),
         observers: tuple[LiveObserver, ...] = (),
         snapshots: Path,
         progress: Progress = lambda doing, done, total: None,
     ) -> None:
         self._source, self._sequence, self._config = source, sequence, config
-        self._observers, self._snapshots, self._progress = observers, snapshots, progress
+        self._followers, self._observers = followers, observers
+        self._snapshots, self._progress = snapshots, progress
         self._frames, self._lock = sequence.frames(), threading.Lock()
         self._wants_reset = self._wants_snapshot = False
         self._forget()
@@ -67,8 +70,9 @@ class LiveSession:
                 warm.step(Frame(index, float(index), picture, warm.camera, self._sequence.rectifier.valid))
         while True:
             reconstructor = Reconstructor(self._config, self._sequence, progress=self._progress, limits=LIMITS)
-            for step in reconstructor.steps(self._until_reset(), ahead=_AHEAD):
-                self._take(step, reconstructor)
+            follow = partial(self._follow, reconstructor=reconstructor)
+            for step in reconstructor.steps(self._until_reset(), ahead=_AHEAD, posed=follow):
+                self._observe(step, reconstructor)
             if not self._wants_reset:
                 self._ended = True
                 return reconstructor
@@ -131,27 +135,35 @@ class LiveSession:
         self._latencies_ms: deque[float] = deque(maxlen=_REMEMBERED)
         self._times_s: deque[float] = deque(maxlen=_REMEMBERED)
         self._step: Step | None = None
-        self._places = threading.Semaphore(_MOST_AT_ONCE)
+        self._place = threading.Semaphore(1)
         self._tracked = self._lost = 0
         self._scale_known = self._full = False
 
     def _until_reset(self) -> Iterator[Frame]:
-        """Yield the newest frame whenever few are on their way; the source leaves out those that come meanwhile."""
+        """Yield the newest frame when the pose of the one before is known; the source leaves out those between.
+
+        Two at once come twice as late, at about as many frames a second on two cores: the one is fused meanwhile.
+        """
         while not self._wants_reset:
-            self._places.acquire(timeout=_WITHOUT_STEP_S)
+            self._place.acquire(timeout=_WITHOUT_STEP_S)
             if (frame := next(self._frames, None)) is None:
                 return
             yield frame
 
-    def _take(self, step: Step, reconstructor: Reconstructor) -> None:
+    def _follow(self, step: Step, reconstructor: Reconstructor) -> None:
+        """Take a step whose pose is known: what it took since the picture is the latency."""
+        for follower in self._followers:
+            follower(step, reconstructor)
         now_s = self._source.now_s()
-        self._places.release()
+        self._place.release()
         with self._lock:
             self._step, is_lost = step, step.track.status == "lost"
             self._tracked, self._lost = self._tracked + (not is_lost), self._lost + is_lost
             self._latencies_ms.append(1000 * (now_s - step.frame.time_s))
             self._times_s.append(now_s)
             self._scale_known, self._full = reconstructor.scale_known, reconstructor.surface_is_full
+
+    def _observe(self, step: Step, reconstructor: Reconstructor) -> None:
         if self._wants_snapshot:
             self._wants_snapshot = False
             self._write_snapshot(step, reconstructor)
