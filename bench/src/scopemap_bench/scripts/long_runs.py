@@ -1,9 +1,12 @@
 """Time and memory of long runs, and of a live session that is played to at the clip's own speed.
 
-    python -m scopemap_bench.scripts.long_runs [--frames 300 1200] [--live CLIP [--minutes 1]]
+    python -m scopemap_bench.scripts.long_runs [--frames 300 1200]
+        [--clip CLIP [--count 18000] [--camera FILE] [--presets default realtime]] [--live CLIP [--minutes 1]]
 
 First table: a phantom's frames there and back, one run of the command line each: memory at each tenth of the time, ATE
-after a Sim(3) alignment. Second table: a clip, there and back, played as `scopemap live` plays it to a session here.
+after a Sim(3) alignment. Second: the same of a clip at its own size, which is written as a video there and back; ATE
+where the clip's folder has poses (`pose.txt`). Third: such a video, played as `scopemap live` plays it to a session
+here.
 """
 
 from __future__ import annotations
@@ -32,8 +35,9 @@ from scopemap_bench.scripts import measuring
 PERIOD = 300  # frames of the phantom
 EVERY_S = 1.0
 PARTS = 5  # of a live session
-FPS = 15
-MOST_READ = 250  # frames of the clip
+FPS = 15  # of the session
+CLIP_FPS = 30
+MOST_READ = 300  # frames of the clip
 
 
 def write_input(folder: Path, source: Path, count: int) -> None:
@@ -48,10 +52,10 @@ def write_input(folder: Path, source: Path, count: int) -> None:
         (folder / camera.name).symlink_to(camera)
 
 
-def print_run(source: Path, out: Path, count: int) -> None:
-    """Run a source in a process that is watched, and print its row."""
+def print_run(source: Path, out: Path, count: int, truth: Path | None, *words: object) -> None:
+    """Run a source, with more words of the command line, in a process that is watched, and print its row."""
     started, seen = time.perf_counter(), []
-    process = subprocess.Popen(measuring.command_line("run", source, "--out", out, "--quiet"))
+    process = subprocess.Popen(measuring.command_line("run", source, "--out", out, "--quiet", *words))
     while True:
         ended, status, used = os.wait4(process.pid, os.WNOHANG)
         if ended:
@@ -63,23 +67,67 @@ def print_run(source: Path, out: Path, count: int) -> None:
         raise SystemExit(f"the run of {source} failed")
     tenths = [f"{seen[len(seen) * k // 10][0]:.0f}" for k in range(1, 10)]
     per_frame_ms = 1e3 * (used.ru_utime + used.ru_stime) / count
-    ate_mm = measuring.evaluated(out, "--truth", source, "--align", "sim3")["ate_rmse_mm"]
+    figures = {} if truth is None else measuring.evaluated(out, "--truth", truth, "--align", "sim3")
     cells = [count, f"{time.perf_counter() - started:.0f}", f"{per_frame_ms:.0f}"]
     cells += [f"{used.ru_maxrss * 1024 / 1e6:.0f}", " ".join(tenths), max(files for _, files in seen)]
-    measuring.print_row(*cells, f"{ate_mm:.2f}")
+    measuring.print_row(*cells, measuring.cell(figures, ".2f", "ate_rmse_mm"))
 
 
-def write_loop(clip: Path, file: Path, count: int) -> None:
-    """Write `count` frames of a clip, there and back, as H.264."""
+def print_heads() -> None:
+    """Print the head of a table of runs."""
+    heads = ("frames", "seconds", "processor time a frame, ms", "peak MB", "MB each tenth")
+    measuring.print_head(*heads, "open files at most", "ATE mm")
+
+
+def write_loop(clip: Path, file: Path, count: int, fps: int) -> None:
+    """Write `count` frames of a clip, there and back, as H.264: the way there and back is encoded once."""
+    once = file.with_name("once.mp4")
     frames = [item.rgb for item in islice(open_sequence(clip).source.frames(slice(None)), MOST_READ)]
-    with av.open(str(file), "w") as container:
-        stream = container.add_stream("libx264", rate=FPS, options={"crf": "16", "preset": "veryfast"})
+    order = measuring.there_and_back(2 * len(frames) - 2, len(frames))
+    with av.open(str(once), "w") as container:
+        stream = container.add_stream("libx264", rate=fps, options={"crf": "16", "preset": "veryfast"})
         stream.height, stream.width = frames[0].shape[0] // 2 * 2, frames[0].shape[1] // 2 * 2
         stream.pix_fmt = "yuv420p"
-        for index in measuring.there_and_back(count, len(frames)):
+        for index in order:
             picture = np.ascontiguousarray(frames[index][: stream.height, : stream.width])
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
+    with av.open(str(file), "w") as container:
+        stream, written, begin = None, 0, 0
+        while written < count:
+            with av.open(str(once)) as loop:
+                stream = stream or container.add_stream_from_template(loop.streams.video[0])
+                packets = [packet for packet in loop.demux(loop.streams.video[0]) if packet.dts is not None]
+                for packet in packets[: count - written]:
+                    packet.pts, packet.dts, packet.stream = packet.pts + begin, packet.dts + begin, stream
+                    container.mux(packet)
+                begin += sum(packet.duration for packet in packets)
+                written += len(packets)
+    once.unlink()
+
+
+def written_loop(clip: Path, file: Path, count: int, fps: int) -> Path:
+    """Write a loop in a process of its own, whose memory is not that of what is measured, and return it."""
+    writing = Process(target=write_loop, args=(clip, file, count, fps))
+    writing.start()
+    writing.join()
+    if writing.exitcode:
+        raise SystemExit(f"the loop of {clip} could not be written")
+    return file
+
+
+def measure_clip(given: argparse.Namespace, folder: Path) -> None:
+    """Write the clip's loop, run it with each preset, and print a row each."""
+    file = written_loop(given.clip, folder / "clip.mp4", given.count, CLIP_FPS)
+    poses, truth = given.clip / "pose.txt", None
+    if poses.is_file():
+        truth, lines = folder / "pose.txt", poses.read_text().splitlines()[:MOST_READ]
+        truth.write_text("".join(f"{lines[index]}\n" for index in measuring.there_and_back(given.count, len(lines))))
+    camera = [] if given.camera is None else ["--camera", given.camera]
+    for preset in given.presets:
+        print(f"\n{given.clip.name} there and back, {given.count / CLIP_FPS / 60:.1f} minutes, {preset}\n")
+        print_heads()
+        print_run(file, folder / f"out-{preset}", given.count, truth, "--preset", preset, *camera)
 
 
 class LiveTable:
@@ -131,10 +179,8 @@ def print_live(file: Path, seconds: float) -> None:
 
 def measure_live(given: argparse.Namespace, folder: Path) -> None:
     """Write the clip's loop and play it."""
-    file, seconds = folder / "loop.mp4", 60 * given.minutes
-    writing = Process(target=write_loop, args=(given.live, file, round(seconds * FPS)))
-    writing.start()  # its memory is not that of the session
-    writing.join()
+    seconds = 60 * given.minutes
+    file = written_loop(given.live, folder / "loop.mp4", round(seconds * FPS), FPS)
     print(f"\n{given.live.name} at {FPS} frames/s for {given.minutes:g} minutes\n")
     print_live(file, seconds)
 
@@ -143,6 +189,10 @@ def main() -> None:
     """Render, run, print."""
     parser = measuring.options_of(__doc__)
     parser.add_argument("--frames", type=int, nargs="*", default=[300, 1200])
+    parser.add_argument("--clip", type=Path, metavar="CLIP")
+    parser.add_argument("--count", type=int, default=18_000, help="frames of the clip's video")
+    parser.add_argument("--camera", type=Path, help="calibration of the clip")
+    parser.add_argument("--presets", nargs="+", default=["default", "realtime"])
     parser.add_argument("--live", type=Path, metavar="CLIP")
     parser.add_argument("--minutes", type=float, default=1.0)
     given = parser.parse_args()
@@ -150,11 +200,12 @@ def main() -> None:
         folder = Path(scratch)
         if given.frames:
             drawn = measuring.phantom(folder / "phantom", "--frames", PERIOD, "--size", "320x256")
-            heads = ("frames", "seconds", "processor time a frame, ms", "peak MB", "MB each tenth")
-            measuring.print_head(*heads, "open files at most", "ATE mm")
+            print_heads()
         for count in sorted(given.frames):
             write_input(folder / f"input-{count}", drawn, count)
-            print_run(folder / f"input-{count}", folder / f"out-{count}", count)
+            print_run(folder / f"input-{count}", folder / f"out-{count}", count, folder / f"input-{count}")
+        if given.clip:
+            measure_clip(given, folder)
         if given.live:
             measure_live(given, folder)
 
