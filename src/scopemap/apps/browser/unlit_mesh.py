@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from scopemap.engine.fusion.open_glb import (
     WRITTEN_COLOURS,
@@ -56,7 +57,7 @@ def texture_before_tone_mapping(picture: np.ndarray) -> bytes:
         part = picture[first : first + _ROWS]
         shares = before_tone_mapping(LINEAR[part.reshape(-1, 3)]) / _LARGEST_IN_TEXTURE
         parts.append(srgb_picture(np.clip(shares, 0, 1)).reshape(part.shape))
-    return texture_bytes(np.concatenate(parts))
+    return texture_bytes(Image.fromarray(np.concatenate(parts)))
 
 
 def _glb(vertices: np.ndarray, faces: np.ndarray, attributes: dict[str, Any], jpeg: bytes = b"") -> bytes:

@@ -16,7 +16,6 @@ from scopemap.engine.fusion.open_glb import (
     WRITTEN_UV,
     OpenGlb,
     texture_bytes,
-    texture_picture,
     with_gltf_names,
 )
 from scopemap.engine.geometry.rendering import vertex_colours
@@ -83,7 +82,9 @@ def read_textured(file: Path) -> trimesh.Trimesh | None:
         content = file.read_bytes()
         if not OpenGlb(content).tree.get("images"):
             return None
-        mesh: Any = trimesh.load(io.BytesIO(content), file_type="glb", force="mesh", process=False)
+        # As one mesh trimesh would copy the texture, three times the picture's memory.
+        scene: Any = trimesh.load_scene(io.BytesIO(content), file_type="glb", process=False)
+        (mesh,) = scene.geometry.values()
         material = trimesh.visual.material.SimpleMaterial(image=mesh.visual.material.baseColorTexture)
         return trimesh.Trimesh(
             mesh.vertices @ np.linalg.inv(T_GLTF_WORLD)[:3, :3].T,
@@ -96,7 +97,8 @@ def read_textured(file: Path) -> trimesh.Trimesh | None:
 
 def texture_jpeg(textured: trimesh.Trimesh) -> bytes:
     """Return the texture of a surface as JPEG."""
-    return texture_bytes(texture_picture(textured))
+    visual: Any = textured.visual
+    return texture_bytes(visual.material.image)
 
 
 def save_meshes_in_time(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from typing import Any
 
-import cv2
 import numpy as np
 import trimesh
+from PIL import Image
 
 # trimesh writes colours with 8 bits, but any attribute as it is, with an underscore before its name.
 WRITTEN_COLOURS = "_COLOR_0"
@@ -21,10 +22,7 @@ _LINEAR_MIPMAPS = 9987  # the same
 _CLAMPED = 33071  # the same
 # Vessels are red on red: at full resolution of the colours. The quality by hand, that of the frame store less what it
 # needs to be opened again.
-_TEXTURE_QUALITY = [
-    *(cv2.IMWRITE_JPEG_QUALITY, 92),
-    *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
-]
+_TEXTURE_QUALITY = {"quality": 92, "subsampling": 0}
 
 
 def texture_picture(textured: trimesh.Trimesh) -> np.ndarray:
@@ -33,9 +31,12 @@ def texture_picture(textured: trimesh.Trimesh) -> np.ndarray:
     return np.asarray(visual.material.image)[..., :3]
 
 
-def texture_bytes(picture: np.ndarray) -> bytes:
-    """Return a texture, (H, W, 3) uint8 RGB, as JPEG."""
-    return cv2.imencode(".jpg", picture[..., ::-1], _TEXTURE_QUALITY)[1].tobytes()
+def texture_bytes(picture: Image.Image) -> bytes:
+    """Return a texture as JPEG."""
+    content = io.BytesIO()
+    # Of 4096x4096 px a copy would take 67 MB.
+    (picture if picture.mode == "RGB" else picture.convert("RGB")).save(content, "JPEG", **_TEXTURE_QUALITY)
+    return content.getvalue()
 
 
 def with_gltf_names(primitive: dict[str, Any]) -> dict[str, int]:

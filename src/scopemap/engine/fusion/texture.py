@@ -22,7 +22,7 @@ from scopemap.engine.frame import Frame
 from scopemap.engine.fusion.texture_alignment import shifts_px
 from scopemap.engine.fusion.texture_levels import ChartVertices, chart_vertices, level_gains
 from scopemap.engine.fusion.texture_views import pieces_of
-from scopemap.engine.geometry.kernels import Float32_3d, Float64_3d, UInt8_2d, UInt8_3d, kernel
+from scopemap.engine.geometry.kernels import Float32_3d, Float64_3d, Int32_2d, UInt8_2d, UInt8_3d, kernel
 from scopemap.engine.geometry.mesh_faces import without_unused
 from scopemap.engine.geometry.rendering import vertex_colours
 from scopemap.engine.geometry.se3 import inverse, transform
@@ -40,6 +40,8 @@ _SMALLEST_PX = 64  # by hand: side of the smallest texture
 _SAMPLE_SHARE = 0.5  # by hand: sigma of the mean of levels at a vertex, over the median edge
 _MOST_SAMPLES = 30_000  # OpenCV's remap takes fewer than 32767 in a row
 _OUTSIDE = -1e-6  # rounding: a pixel on the edge of two triangles belongs to both
+
+_NOTHING = np.zeros((0, 0, 3), np.uint8)
 
 Pictures = Callable[[Sequence[int], PinholeCamera], Iterable[tuple[int, np.ndarray]]]
 """Yields, for numbers of frames, each number with its picture, (H, W, 3) uint8 sRGB, as a camera sees it; any order."""
@@ -99,6 +101,7 @@ def textured_mesh(
         at = layout.pixels[corners] - layout.first[number]
         (x, y), (across, down) = layout.place[number], layout.size[number]
         texture[y : y + down, x : x + across] = _painted(crops[number], at, gains[corners])
+        crops[number] = _NOTHING  # all of them take as much memory as the texture
 
     # Most of it runs without Python's lock, and charts do not overlap.
     with ThreadPoolExecutor(cpu_threads()) as pool:
@@ -193,7 +196,7 @@ def _cut(
 
     A picture is forgotten before the next one is read.
     """
-    crops: list[np.ndarray] = [np.zeros((0, 0, 3), np.uint8)] * len(view)
+    crops = [_NOTHING] * len(view)
     shown = np.zeros((len(places.vertex), 3), np.float32)
     number_of = {frame.index: number for number, frame in enumerate(frames)}
     corners = layout.pixels[places.of_corner[places.chart[places.of_corner[:, 0]] >= 0]]
@@ -221,22 +224,17 @@ def _painted(crop: np.ndarray, corners: np.ndarray, gains: np.ndarray) -> np.nda
 
     corners : (F, 3, 2), px in the crop. gains : (F, 3, 3), of each corner by colour.
     """
-    painted, covered = np.zeros(crop.shape, np.float32), np.zeros(crop.shape[:2], np.uint8)
-    _paint(crop, corners, gains, painted, covered)
+    levels, covered = np.zeros(crop.shape, np.uint8), np.zeros(crop.shape[:2], np.uint8)
+    _paint(crop, corners, gains, levels, covered)
     if not covered.any():  # thinner than a pixel: nothing of it shows
         return crop
-    _, nearest = cv2.distanceTransformWithLabels(1 - covered, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    place = np.zeros(int(nearest.max()) + 1, np.int64)
-    of_covered = np.flatnonzero(covered)
-    place[nearest.ravel()[of_covered]] = of_covered
-    levels, gaps = np.asarray(cv2.convertScaleAbs(painted)), np.flatnonzero(covered == 0)
-    pixels = levels.reshape(-1, 3)
-    pixels[gaps] = pixels[place[nearest.ravel()[gaps]]]
+    nearest = cv2.distanceTransformWithLabels(1 - covered, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    _fill_gaps(levels, covered, np.asarray(nearest), int(nearest.max()))
     return levels
 
 
 @kernel
-def _paint(crop: UInt8_3d, corners: Float64_3d, gains: Float32_3d, painted: Float32_3d, covered: UInt8_2d) -> None:
+def _paint(crop: UInt8_3d, corners: Float64_3d, gains: Float32_3d, levels: UInt8_3d, covered: UInt8_2d) -> None:
     """Multiply the pixels inside of triangles (F, 3, 2) by their gains, linear inside each. Changes the last two."""
     height, width = covered.shape
     for face in range(len(corners)):
@@ -260,7 +258,25 @@ def _paint(crop: UInt8_3d, corners: Float64_3d, gains: Float32_3d, painted: Floa
                     gain = (
                         at_a * gains[face, 0, channel] + at_b * gains[face, 1, channel] + at_c * gains[face, 2, channel]
                     )
-                    painted[row, col, channel] = crop[row, col, channel] * gain
+                    level = np.rint(np.float32(crop[row, col, channel] * gain))
+                    levels[row, col, channel] = min(abs(level), 255)
+
+
+@kernel
+def _fill_gaps(levels: UInt8_3d, covered: UInt8_2d, nearest: Int32_2d, count: int) -> None:
+    """Give each pixel that is not covered the colour of the nearest one that is: `nearest` numbers these 1 to count."""
+    height, width = covered.shape
+    place = np.zeros((count + 1, 2), np.int32)
+    for row in range(height):
+        for col in range(width):
+            if covered[row, col]:
+                place[nearest[row, col], 0], place[nearest[row, col], 1] = row, col
+    for row in range(height):
+        for col in range(width):
+            if not covered[row, col]:
+                number = nearest[row, col]
+                for channel in range(3):
+                    levels[row, col, channel] = levels[place[number, 0], place[number, 1], channel]
 
 
 def _draw_cells(texture: np.ndarray, cells: np.ndarray, colours: np.ndarray) -> np.ndarray:
