@@ -195,6 +195,7 @@ class Run:
         last = self.frames.last_index if self.interrupted else None
         from scopemap.runner.texturing import put_textures  # not loaded before there is a surface
 
+        trim_memory()  # the volume
         put_textures(result, self.sequence, self.pipeline, self.progress)
         notices = notices_of_end(result.frames, last, self.kept_maps.forgotten, self.kept_maps.limits)
         result.provenance["notices"] += facts_of_notices(notices)

@@ -111,12 +111,30 @@ class _Pictures:
 
 
 def read_again(source: Source, selection: slice, numbers: Sequence[int]) -> Iterator[SourceFrame]:
-    """Yield pictures of a source as it is: those with some ascending numbers, if there, and others between."""
+    """Yield pictures of a source as it is: those with some ascending numbers, if there, and others between.
+
+    A video is entered anew where that is nearer than to read on.
+    """
     if source.numbers is None:
-        first = numbers[0] if source.name == "video" and (selection.start or 0) >= 0 else selection.start
-        yield from source.frames(slice(first, selection.stop))
+        if source.name == "video" and (selection.start or 0) >= 0:
+            for first, last in _passes(source, numbers):
+                yield from source.frames(slice(first, last + 1))
+        else:
+            yield from source.frames(slice(selection.start, selection.stop))
         return
     place = {number: place for place, number in enumerate(source.numbers)}
     for number in numbers:
         if number in place:
             yield from source.frames(slice(place[number], place[number] + 1))
+
+
+def _passes(source: Source, numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Return first and last number of each pass over a video: another one begins where a key picture comes before."""
+    passes = [(numbers[0], numbers[0])]
+    for number in numbers[1:]:
+        first, last = passes[-1]
+        if source.entry(number) > last:
+            passes.append((number, number))
+        else:
+            passes[-1] = first, number
+    return passes

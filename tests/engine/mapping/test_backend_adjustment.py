@@ -173,12 +173,13 @@ def test_depth_uncertainty_follows_from_the_baseline() -> None:
     assert np.isinf(found.log_depth_sigma[49])
 
 
-def test_a_step_leaves_the_model_as_it_is() -> None:
+def test_a_step_can_be_asked_for_again_and_the_last_unknown_is_as_sure_as_the_inverse_says() -> None:
     rng = np.random.default_rng(0)
     T, points, observations = world(rng)
-    problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, FOCAL_PX)
-    model = linearised(problem, problem.begin)
-    matrix = model.matrix.copy()
+    problem = BundleProblem(tracked(T, rng), points, observations, LOOSE, LINE, FOCAL_PX, log_focal_sigma=0.5)
+    model = linearised(problem, problem.begin._replace(sigma_px=1.0))
+    lower = np.tril(model._normal.matrix)
+    inverse = np.linalg.inv(lower + np.tril(lower, -1).T)
     step = model.gauss_newton_step()
-    np.testing.assert_array_equal(model.matrix, matrix)
     np.testing.assert_array_equal(model.gauss_newton_step(), step)
+    np.testing.assert_allclose(model.last_sigma, np.sqrt(inverse[-1, -1]), rtol=1e-6)

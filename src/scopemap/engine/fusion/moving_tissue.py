@@ -14,7 +14,7 @@ _STEP_PX = 8  # by hand: between the pixels that are used
 _SOME = (slice(_STEP_PX // 2, None, _STEP_PX),) * 2  # such pixels, from the middle of the first cell
 _SEEN = np.dtype([("key", np.int64), ("seen", np.int64), ("moving", np.int64)])
 _EDGE_SHARE = 0.13  # by hand: edge of a block over the clip's median depth
-_MOST_ROWS = 1_000_000  # guard: memory; rows are summed up above
+_MOST_ROWS = 200_000  # guard: memory; rows are summed up above. A million took 45 MB more, and as long
 _CORNERS = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)  # of a block
 
 

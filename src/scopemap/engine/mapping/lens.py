@@ -54,12 +54,12 @@ def lens_test(problem: BundleProblem, solution: BundleState) -> LensTest:
     freed = replace(adjusted, start=held, log_focal_sigma=_PRIOR_SIGMA)
     free = search(freed).state
     try:
-        covariance = np.linalg.pinv(linearised(freed, free).matrix, hermitian=True)
+        deviation = linearised(freed, free).last_sigma
     except np.linalg.LinAlgError:
         return LensTest()
     change = free.log_focal - math.log(problem.focal_px)
     held_px, free_px, tracked_px = (left_out_px(left_out, placed(left_out, s)) for s in (held, free, left_out.tracked))
-    return LensTest(held_px, free_px, change, math.sqrt(covariance[-1, -1]), tracked_px)
+    return LensTest(held_px, free_px, change, deviation, tracked_px)
 
 
 @dataclass(frozen=True)
