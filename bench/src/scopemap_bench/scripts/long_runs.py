@@ -1,7 +1,7 @@
 """Time and memory of long runs, and of a live session that is played to at the clip's own speed.
 
     python -m scopemap_bench.scripts.long_runs [--frames 300 1200]
-        [--clip CLIP [--count 18000] [--camera FILE] [--presets default realtime]] [--live CLIP [--minutes 1]]
+        [--clip CLIP [--count 18000] [--presets default realtime]] [--live CLIP [--minutes 1]]
 
 First table: a phantom's frames there and back, one run of the command line each: memory at each tenth of the time, ATE
 after a Sim(3) alignment. Second: the same of a clip at its own size, which is written as a video there and back; ATE
@@ -27,6 +27,7 @@ import numpy as np
 from scopemap.apps.live.live import LiveSession, finished
 from scopemap.engine.config import Config
 from scopemap.engine.odometry import Step
+from scopemap.input.camera_files.writing import write_calibration
 from scopemap.input.live_source import LiveSource
 from scopemap.input.opening import open_sequence, sequence_of
 from scopemap.runner.reconstructor import Reconstructor
@@ -80,9 +81,11 @@ def print_heads() -> None:
 
 
 def write_loop(clip: Path, file: Path, count: int, fps: int) -> None:
-    """Write `count` frames of a clip, there and back, as H.264: the way there and back is encoded once."""
-    once = file.with_name("once.mp4")
-    frames = [item.rgb for item in islice(open_sequence(clip).source.frames(slice(None)), MOST_READ)]
+    """Write `count` frames of a clip, there and back, as H.264; beside it the camera, where it is known."""
+    once, sequence = file.with_name("once.mp4"), open_sequence(clip)
+    if sequence.calibrated:
+        write_calibration(sequence.rectifier.source, file.with_suffix(".yaml"))
+    frames = [item.rgb for item in islice(sequence.source.frames(slice(None)), MOST_READ)]
     order = measuring.there_and_back(2 * len(frames) - 2, len(frames))
     with av.open(str(once), "w") as container:
         stream = container.add_stream("libx264", rate=fps, options={"crf": "16", "preset": "veryfast"})
@@ -123,7 +126,7 @@ def measure_clip(given: argparse.Namespace, folder: Path) -> None:
     if poses.is_file():
         truth, lines = folder / "pose.txt", poses.read_text().splitlines()[:MOST_READ]
         truth.write_text("".join(f"{lines[index]}\n" for index in measuring.there_and_back(given.count, len(lines))))
-    camera = [] if given.camera is None else ["--camera", given.camera]
+    camera = ["--camera", file.with_suffix(".yaml")] if file.with_suffix(".yaml").is_file() else []
     for preset in given.presets:
         print(f"\n{given.clip.name} there and back, {given.count / CLIP_FPS / 60:.1f} minutes, {preset}\n")
         print_heads()
@@ -191,7 +194,6 @@ def main() -> None:
     parser.add_argument("--frames", type=int, nargs="*", default=[300, 1200])
     parser.add_argument("--clip", type=Path, metavar="CLIP")
     parser.add_argument("--count", type=int, default=18_000, help="frames of the clip's video")
-    parser.add_argument("--camera", type=Path, help="calibration of the clip")
     parser.add_argument("--presets", nargs="+", default=["default", "realtime"])
     parser.add_argument("--live", type=Path, metavar="CLIP")
     parser.add_argument("--minutes", type=float, default=1.0)

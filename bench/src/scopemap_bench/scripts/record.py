@@ -45,6 +45,7 @@ TABLES: dict[str, tuple[str, str]] = {
     "ablations": (f"{PLAN} real-and-phantom-ablations --data DATA --out OUT/ablations", "ablations/tables/overview.md"),
     "verdicts": (f"{SCRIPT}.verdicts --data DATA --out OUT/verdicts", ""),
     "lesions": (f"{SCRIPT}.lesions --out OUT/lesions", ""),
+    "long-clip": (f"{SCRIPT}.long_runs --frames --clip DATA/endoscopy/c3vd/cecum_t1_a", ""),
     "long-runs": (
         f"{SCRIPT}.long_runs --frames 300 1200 --live DATA/endoscopy/video/laparoscopy_rvim.mp4 --minutes 0.5"
         f" && {SCRIPT}.robustness --kills 16 --failures 6 --videos 6",
