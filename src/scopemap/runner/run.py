@@ -26,7 +26,7 @@ from scopemap.result.result import Result
 from scopemap.result.surface_segments import main_segment
 from scopemap.result.verdict import graded
 from scopemap.result.wording import facts_of_notices
-from scopemap.runner.memory import MemoryPlan, trim_memory
+from scopemap.runner.memory import MemoryPlan, keep_freed_arrays, trim_memory
 from scopemap.runner.observers import FrameWriter, Observer, Progress, RunStopped
 from scopemap.runner.provenance import Limits, facts_of_segment, motion_notices, notices_of_end, provenance_of
 from scopemap.runner.submap_frames import check_tracked, frames_of_submap, put_backwards, tracked_frames
@@ -106,6 +106,7 @@ class Run:
         self.pipeline.fusion.coarser_beyond = self.plan.blocks
         self.pipeline.fusion.most_blocks = self.kept_maps.limits.blocks
         self.pipeline.mapper.limit(self.plan.observations)
+        keep_freed_arrays(at_the_end=False)
 
     def track(self, observers: tuple[Observer, ...], checkpoints: CheckpointWriter | None = None) -> None:
         """Pass all frames through the pipeline, those after the last checkpoint. Raises `RunStopped` of an observer."""
@@ -178,6 +179,7 @@ class Run:
         check_tracked(self.table, self.sequence.path, self.pipeline.preprocessing.estimators.masks)
         if self.pipeline.config.mapping.global_adjustment:
             self.progress("adjusting keyframes", 0, 0)
+        keep_freed_arrays(at_the_end=True)
         trim_memory()
         found = self.pipeline.adjust(tracked_frames(self.table), _InThreads(self))
         put_backwards(self.table, found.backwards)
