@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,6 +49,26 @@ def test_more_memory_is_more_of_everything_up_to_what_is_used_without_a_limit(fo
     large = _plan(folder, 4000, (640, 512))
     assert plans[2].blocks is not None
     assert large.blocks < plans[2].blocks
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="glibc's malloc is not used here")
+def test_after_the_last_frame_large_arrays_are_given_back() -> None:
+    code = """
+import sys
+from pathlib import Path
+import numpy as np
+from scopemap.runner.memory import keep_freed_arrays
+
+keep_freed_arrays(at_the_end=sys.argv[1] == "end")
+arrays = [np.ones(2**21, np.uint8) for _ in range(60)]
+del arrays[:-1]  # the last one is above the others, so that none of their memory is at the end of the heap
+print(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6)
+"""
+
+    def held_mb(when: str) -> float:
+        return float(subprocess.run([sys.executable, "-c", code, when], capture_output=True, check=True).stdout)
+
+    assert held_mb("tracking") - held_mb("end") > 100  # of 124
 
 
 def test_too_little_is_refused_with_the_least_that_works_before_anything_is_written(
