@@ -193,6 +193,11 @@ def test_glb_holds_the_texture(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.triangles, mesh.triangles, atol=1e-3)
     np.testing.assert_allclose(read.visual.uv, shown.visual.uv, atol=1e-6)
     assert np.median(_errors(read)) < 3
+    # Those of the surface, which is smooth across the seams of its texture, not those of the triangles of a piece.
+    leaning = np.tile([0.6, 0.0, -0.8], (len(shown.vertices), 1))
+    smooth = trimesh.Trimesh(shown.vertices, shown.faces, vertex_normals=leaning, visual=shown.visual, process=False)
+    save_mesh(mesh, glb_file=file, textured=smooth)
+    np.testing.assert_allclose(read_textured(file).vertex_normals, leaning, atol=1e-6)
     save_mesh(mesh, glb_file=file)
     assert read_textured(file) is None
     assert read_textured(tmp_path / "none.glb") is None
