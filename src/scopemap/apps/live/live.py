@@ -142,7 +142,7 @@ class LiveSession:
     def _until_reset(self) -> Iterator[Frame]:
         """Yield the newest frame when the pose of the one before is known; the source leaves out those between.
 
-        Two at once come twice as late, at about as many frames a second on two cores: the one is fused meanwhile.
+        Two at once come nearly twice as late, for at most a seventh more frames on two cores: one is fused meanwhile.
         """
         while not self._wants_reset:
             self._place.acquire(timeout=_WITHOUT_STEP_S)
