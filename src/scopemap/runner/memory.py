@@ -20,12 +20,16 @@ from scopemap.input.sequence import Sequence
 from scopemap.runner.depth_networks import needs_weights
 
 _MB = 1_000_000
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
+_M_TRIM_THRESHOLD = -1  # of glibc's malloc.h
+_M_MMAP_THRESHOLD = -3  # the same
+_M_ARENA_MAX = -8  # the same
 _ARENAS = 2  # measured on 60 frames of 1080p on two cores: with one for each thread the peak is higher by a tenth
 # Up to what size the memory of a freed array is kept for the next one. While frames come: what glibc comes to by
-# itself; less takes 3 to 6 % more time, since the system has to clear it. After the last one: on 276 frames of
-# cecum_t1_a the peak, that of the texture, is 602 MB, with 4 MiB 645, without a limit 710.
-_KEPT_BYTES, _KEPT_AT_THE_END_BYTES = 32 * 2**20, 1 * 2**20
+# itself; less takes 3 to 6 % more time, since the system has to clear it.
+_KEPT_BYTES = 32 * 2**20
+# After the last frame: on 276 frames of cecum_t1_a the peak, that of the texture, is 602 MB; with 4 MiB it is 645,
+# without a limit 710.
+_KEPT_AT_THE_END_BYTES = 2**20
 # Python with its libraries, the embedded network, kernels; with kernels that are compiled.
 _BASE_BYTES = 480 * _MB
 # Of the working size: in all stages, and for each frame that a stage is ahead of the next; of the input's pictures.
